@@ -49,6 +49,8 @@ _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
 _CLEARLY_BETTER = 1.1
 # Evidence below which the first sweeps without rings are held along a direction: their strokes seldom cross.
 _STROKES_EVIDENCE = 10.0
+# Evidence below which a direction is held at an IMU's prediction.
+_HELD_EVIDENCE = 4.0
 # Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
 # kept along a direction that the scan does not constrain, metres.
 _HELD_CELLS, _KNOWN_M = 0.5, 0.3
@@ -230,7 +232,7 @@ class ScanMatcher:
         if attempt.registration is None or attempt.fit.weakest is None:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
-        if not attempt.fit.is_constrained and start.is_known_along(direction, _KNOWN_M):
+        if evidence < _HELD_EVIDENCE and start.is_known_along(direction, _KNOWN_M):
             if (found := self._found_along(prediction, start, direction, keypoints)) is not None:
                 return found
             held = self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
