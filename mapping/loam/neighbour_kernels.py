@@ -31,7 +31,7 @@ _SHARED = 120.0
 # Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
 # ring, five points make planes of any direction, and these move with the rings.
 _MOST_TILT = 0.05
-# Below this, no plane of coarser voxels is asked.
+# From this on, a plane of coarser voxels is asked for.
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
@@ -73,11 +73,11 @@ def match_features(
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
     `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
-    normal, are moved to its beginning, and a thinner plane replaces that. The normal of a plane faces the sensor (3,),
-    the first of a line points from that to the point.
+    normal, are moved to its beginning. A plane that is known better takes the place of another. The normal of a plane
+    faces the sensor (3,), the first of a line points from that to the point.
 
     Returns:
-        Number of these points.
+        Number of the points that were moved.
     """
     left, scale = 0, 1.0 / voxels.cell_m
     around, near = np.empty(27, dtype=np.int64), np.empty(NEIGHBOURS, dtype=np.int64)

@@ -14,11 +14,23 @@ from lidarslam.core.state.stateful import Shape
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import MotionState
 
-# Share of a difference by which the correction changes with a sweep.
+# Share of a difference by which the correction changes with a sweep, and the largest difference that counts, rad/s and
+# m/s: a sudden acceleration makes a larger one, and is no bias.
 _GAIN = 0.3
 _MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
 # Sweeps follow one another where they cover this share of the interval between their stamps.
 _COVERED = 0.8
+
+
+def velocity_error(last: MotionState, state: MotionState, share: float) -> FloatArray:
+    """Velocity (6,) of the motion between two sweeps' poses, less their mean velocity.
+
+    Args:
+        last, state: of the two.
+        share: of the interval, in which the sensor moves with the first sweep's velocity.
+    """
+    motion = body_velocity(inverse(last.T_world_lidar) @ state.T_world_lidar, state.stamp - last.stamp)
+    return np.asarray(motion - (share * last.velocity + (1.0 - share) * state.velocity), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +50,9 @@ class VelocityBias:
         interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
         if not covered_s > _COVERED * interval_s > 0.0:
             return VelocityBias()
-        now = state.velocity + self.correction
-        mean = (last.seen_until_s * last.velocity + seen_from_s * now) / covered_s
-        motion = body_velocity(inverse(last.T_world_lidar) @ state.T_world_lidar, interval_s)
-        return VelocityBias(self.correction + _GAIN * np.clip(motion - mean, -_MOST_CHANGE, _MOST_CHANGE))
+        now = replace(state, velocity=state.velocity + self.correction)
+        error = velocity_error(last, now, last.seen_until_s / covered_s)
+        return VelocityBias(self.correction + _GAIN * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE))
 
     def corrected(self, state: MotionState) -> MotionState:
         """The state with the corrected velocity, and the pose that is most likely given that."""

@@ -20,11 +20,9 @@ _LEAST_HEIGHT_M = 0.05
 _FEWEST_POINTS = 6
 # The plane of a surfel is as uncertain as if so many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
-# Largest standard deviation of a normal with which no coarser plane is asked: of grass, the finest cells have normals
-# of any direction.
+# Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
+# direction.
 _CERTAIN_TILT = 0.02
-# It takes the place only if its points are spread about as little, by this factor: across steps, they are not.
-_SAME_SPREAD = 1.2
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5
 
@@ -34,14 +32,15 @@ def match_planes(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray, sensor: FloatArray,
     spread_m: FloatArray, found: Surfaces,
 ) -> int:  # fmt: skip
-    """Write the surface of every unmatched point (N, 3) whose cell has a plane, unless it has a thinner one already.
+    """Write the surface of every unmatched point (N, 3) whose cell has a plane, unless it has a better one already.
 
+    A better one is known better and its points are spread less: across steps, a coarse plane's are spread more.
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
     without a plane, or with one of an uncertain normal, are moved to the beginning of `unmatched`. `spread_m` (N,) has
-    the standard deviations of each plane's own points across it.
+    the standard deviations of each plane's points across it, and is written.
 
     Returns:
-        Number of these points.
+        Number of the points that were moved.
     """
     left = 0
     for w in range(len(unmatched)):
@@ -54,9 +53,8 @@ def match_planes(
             faced, behind = is_steep(-along, distance), is_steep(along, distance)
             if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
-                spread = p[9] * math.sqrt(p[13] / (p[13] - 3.0))  # three residuals make the plane
-                is_known_better = spread < _SAME_SPREAD * spread_m[n] and _thickness_m(p, 0) < found.thickness_m[n, 0]
-                if found.counts[n] == 0 or is_known_better:
+                spread = p[9] * math.sqrt(p[13] / (p[13] - 3.0))  # three points make the plane
+                if found.counts[n] == 0 or (spread < spread_m[n] and _thickness_m(p, 0) < found.thickness_m[n, 0]):
                     found.counts[n], spread_m[n] = 0, spread
                     _write(found, n, p, 0, p[3], p[4], p[5], tilt)
                 if tilt < _CERTAIN_TILT:

@@ -19,8 +19,8 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
-from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
+from lidarslam.mapping.motion.velocity_bias import velocity_error
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.surfels.sampling import SurfelSampler
@@ -191,11 +191,8 @@ class Mapper(Stateful):
             motion = inverse(last.T_world_lidar) @ mapped.state.T_world_lidar
             if not mapped.registered or displacement_m(log(motion), scan.range_m) < local_map.cell_m:
                 break
-            # The sensor moved partly with the first sweep's velocity and partly with the second's.
-            interval_s = scan.stamp - last.stamp
-            share = min(1.0, last.seen_until_s / interval_s)
-            mean = share * last.velocity + (1.0 - share) * mapped.state.velocity
-            last = replace(last, velocity=last.velocity + (body_velocity(motion, interval_s) - mean))
+            share = min(1.0, last.seen_until_s / (scan.stamp - last.stamp))
+            last = replace(last, velocity=last.velocity + velocity_error(last, mapped.state, share))
             local_map = self._new_map(first, last)
             self._tracker.rewind(before)
             mapped = self._track(scan, prior, last, local_map)

@@ -130,7 +130,7 @@ def on_plane(rng: np.random.Generator, count: int, noise_m: float = 0.0) -> Floa
 
 
 def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng: np.random.Generator) -> None:
-    points = on_plane(rng, 20_000, 0.005)
+    points = on_plane(rng, 20_000, 0.01)
     feature_map, asked = map_of(NONE, points), on_plane(rng, 200)[:, :]
     found = feature_map.match(asked, np.eye(4))
     np.testing.assert_array_equal(found.index, np.arange(200))

@@ -31,7 +31,7 @@ def test_motions_of_a_sensor_without_rings_are_true(start: int) -> None:
     assert list(smoothed) == [scan.stamp for scan in scans[1:SMOOTHED]]
     for motion, T_true in zip(smoothed.values(), truth, strict=False):
         error = inverse(T_true) @ motion.T_prev_curr
-        assert np.linalg.norm(error[:3, 3]) < 0.06
+        assert np.linalg.norm(error[:3, 3]) < 0.04
         assert motion.interval_s == pytest.approx(0.1)
 
 
