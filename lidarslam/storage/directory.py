@@ -166,6 +166,11 @@ def remove_files(path: Path) -> None:
     _remove_empty(path)
 
 
+def files_in(path: Path) -> list[str]:
+    """The files of a run that lie in a directory."""
+    return [*(name for name in FILES if (path / name).exists()), *tile_names(path)]
+
+
 def tile_names(path: Path) -> list[str]:
     """The index of a map's tiles, and then the tiles, as far as they lie in the directory of a run itself."""
     folder = path / MAP_TILES
@@ -202,7 +207,7 @@ def remove_run(path: Path) -> None:
 
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
-    present = [*(name for name in FILES if (path / name).exists()), *tile_names(path)]
+    present = files_in(path)
     if (path / ABOUT).exists():  # the other files are of that run or merge, even without a config.yaml
         if not overwrite and not resume:
             raise OutputError(

@@ -15,7 +15,8 @@ from lidarslam.core.state.npy import ONE_READER
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.text.json_text import ANY_OBJECT, parse_json
 
-# An .npz file holds a checksum of each of its members, and is refused without its end.
+# An .npz file holds a checksum of each of its members, and is refused without its end. They are not compressed: the
+# size of the file bounds what it takes to read it.
 _TREE, _ARRAY = "tree", "array"
 _DAMAGE = (
     OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, NotImplementedError, RuntimeError,
@@ -48,6 +49,8 @@ def read_state(path: Path) -> Saved:
     """
     try:
         with ONE_READER, np.load(path, allow_pickle=False) as file:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in file.zip.infolist()):
+                raise ValueError("its arrays are compressed")
             values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT, any_number=True), file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

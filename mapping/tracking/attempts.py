@@ -47,6 +47,8 @@ _MOST_CONSTRAINING = 600
 # the quality must be better.
 _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
 _CLEARLY_BETTER = 1.1
+# Distance of another optimum, cells.
+_APART_CELLS = 1.0
 # Evidence below which the first sweeps without rings are held along a direction: their strokes seldom cross.
 _STROKES_EVIDENCE = 10.0
 # Evidence below which a direction is held at an IMU's prediction.
@@ -153,6 +155,22 @@ class ScanMatcher:
             if away_m < _MOST_ALONG_CELLS * self._map.cell_m and other.quality > _CLEARLY_BETTER * near.quality:
                 best = max(best, other, key=lambda attempt: attempt.quality)
         return best
+
+    def or_from_odometry(self, near: Attempt, prior: Prior) -> Attempt:
+        """An attempt, or a clearly better one from the odometry's motion where the prediction is uncertain.
+
+        Of several optima along the weakest direction, as on stairs, the prediction's may be the next step's.
+        """
+        if prior.T_prev_curr is None or near.fit.weakest is None or not near.fit.is_constrained:
+            return near
+        direction, apart_m = np.array(near.fit.weakest), _APART_CELLS * self._map.cell_m
+        T_world_lidar = self.last.T_world_lidar @ prior.T_prev_curr
+        away_m = abs(float(direction @ (T_world_lidar - near.T_world_lidar)[:3, 3]))
+        if near.prediction.sigma_along(direction) < apart_m or away_m < apart_m:
+            return near
+        start = replace(near.prediction, T_world_lidar=T_world_lidar)
+        other = self._attempt(near.prediction, start, coarse_first=False)
+        return other if other.quality > _CLEARLY_BETTER * near.quality else near
 
     def search(self, prediction: Prediction, whole_map: bool) -> Steps[Attempt | None]:
         """Relocalise by yaw search and, if that finds nothing and it is wanted, anywhere; None where neither does."""

@@ -201,6 +201,7 @@ class Tracker(Stateful):
             rotations = prediction.T_world_lidar, matcher.last.T_world_lidar
             displaced = self._budget.run(matcher.register_displaced(rotations))
             best = best if displaced is None else self._or_displaced(best, displaced[0])
+        best = best if self._budget.is_spent else matcher.or_from_odometry(best, prior)
         return best if self._budget.is_spent else matcher.or_along_weakest(best)
 
     def _or_turning(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2.reader import zstd
+from rosbags.rosbag2.storage_mcap import zstd
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
@@ -457,6 +457,15 @@ def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, mo
     with pytest.raises(InputError) as caught:
         list(open_recording(file if storage == "bag" else folder).scans())
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_compressed_as_a_whole_that_unpacks_to_too_much_is_refused(write_drive, monkeypatch):
+    monkeypatch.setattr("lidarslam.datasets.ros.decompression.MOST_BYTES", 1_000)
+    _, folder, _ = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
+    (file,) = folder.glob("*.zstd")
+    file.write_bytes(zstd.compress(bytes(10_000_000)))
+    with pytest.raises(InputError, match="unpacks to more than 100 times its size"):
+        open_recording(folder)
 
 
 @pytest.mark.parametrize("table", ["messages", "topics"])

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -382,10 +383,11 @@ for kill_at in kills:
 """
 
 
-def killed_merges(root: Path, kills: list[int], rooms: list[Path]) -> str:
+def killed_merges(root: Path, kills: list[int], rooms: list[Path], *more: str) -> str:
     """Merge into root/K for every K, each killed as it is about to do the Kth thing there; what was said."""
     arguments = [argument for setting in (*SETTINGS, *MAPPED) for argument in ("--set", setting)]
-    command = [sys.executable, "-c", KILLED_MERGE, str(root), ",".join(map(str, kills)), *map(str, rooms), *arguments]
+    kill = ",".join(map(str, kills))
+    command = [sys.executable, "-c", KILLED_MERGE, str(root), kill, *map(str, rooms), *arguments, *more]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
 
@@ -420,6 +422,33 @@ def test_a_killed_merge_is_refused_and_resumed_or_made_again(
     merge(request(reversed_out, *rooms[::-1], overwrite=True, settings=MAPPED), quiet)
     assert not list(reversed_out.rglob("unfinished"))
     assert sorted(path.name for path in reversed_out.iterdir() if path.is_dir()) == ["01_in_room_1", "02_in_room_0"]
+
+
+def test_what_a_killed_overwrite_of_a_merge_was_to_replace_is_given_back(
+    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
+) -> None:
+    """Killed on its way, and among its final results."""
+    rooms, root, counted = rooms[:2], tmp_path / "killed", tmp_path / "counted" / "1000000"
+    merge(request(counted, *rooms, settings=(*MAPPED, "global_map.voxel_size_m=0.5")), quiet)
+    shutil.copytree(counted, tmp_path / "earlier")
+    things = int(killed_merges(counted.parent, [1_000_000], rooms, "--overwrite").splitlines()[-1])
+    kills = [round(share * things) for share in (0.5, 0.9)]
+    for kill_at in kills:
+        shutil.copytree(tmp_path / "earlier", root / str(kill_at))
+    killed_merges(root, kills, rooms, "--overwrite")
+    for kill_at in kills:
+        out, parts = root / str(kill_at), sorted((root / str(kill_at)).glob("0*"))
+        assert (out / "unfinished" / "run.json").exists()
+        if kill_at == kills[0]:
+            earlier = timeless(tmp_path / "earlier")
+            assert {name: content for name, content in timeless(out).items() if name in earlier} == earlier
+            assert len(load_map(out).points)
+            assert [len(load_run(part).trajectory) for part in parts] == [5, 5]
+        else:
+            with pytest.raises(InputError, match="did not finish"):
+                load_map(out)
+        merge(request(out, *rooms, resume=True, settings=MAPPED), quiet)
+        assert timeless(out) == timeless(counted)
 
 
 def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms: list[Path], tmp_path: Path) -> None:

@@ -80,6 +80,15 @@ def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
         read_state(path)
 
 
+def test_compressed_arrays_are_not_opened(tmp_path: Path) -> None:
+    """A kilobyte of them may hold a gigabyte."""
+    write_state(tmp_path / "state.npz", STATE)
+    with np.load(tmp_path / "state.npz") as file:
+        np.savez_compressed(tmp_path / "state.npz", **dict(file))
+    with pytest.raises(InputError, match="its arrays are compressed"):
+        read_state(tmp_path / "state.npz")
+
+
 def test_objects_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Object arrays cannot be saved"):
         write_state(tmp_path / "state.npz", {"a": np.array([object()])})

@@ -32,7 +32,7 @@ from lidarslam.run.resuming import WITHOUT_EFFECT
 from lidarslam.storage.about import About
 from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.unfinished import Unfinished, replace_earlier
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -67,6 +67,7 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
                 if request.overwrite:
                     CheckpointFiles(run.out).remove()
                 own = stack.enter_context(RunDirectory.create(run.out, request.overwrite, request.resume))
+                own.before_change = partial(_replace_earlier, directory, run.out)
                 parts.append(Part(replace(run, config=config), recording, own))
             graph = begin_graph(request.config, request.out)
             assert graph is not None
@@ -88,6 +89,12 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
                     part.request.out.rmdir()
         unfinished.end(interrupted)
     return outcome
+
+
+def _replace_earlier(directory: RunDirectory, part: Path) -> None:
+    """Before the results of a recording are replaced: those of the earlier merge are not whole either."""
+    directory.before_change()
+    replace_earlier(part)
 
 
 def _on_common_voxels(config: Config, recordings: Sequence[Recording]) -> Config:

@@ -23,7 +23,7 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import NoScanError, Progress, track
 from lidarslam.storage.about import About
 from lidarslam.storage.checkpoint_files import CheckpointFiles
-from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.directory import RunDirectory, files_in
 from lidarslam.storage.state_file import read_state
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
@@ -85,7 +85,7 @@ def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
         stack.enter_context(only_writer(files.folder, _PATIENCE_S))
         description = describe_computed(task.request, recording) | task.merge
         is_begun = About.read(out) is not None
-        unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out), description, is_begun))
+        unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out, files_in(out)), description, is_begun))
         if unfinished.files.tracked.is_file():
             earlier = read_part(read_state(unfinished.files.tracked))
             if not earlier.interrupted:
