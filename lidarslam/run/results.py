@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import inverse
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.text.trajectory_io import format_kitti, format_tum
@@ -69,22 +70,29 @@ def write_results(
     drawn: DrawnMap,
     map_formats: Sequence[MapFormat] = (),
 ) -> RunOutcome:
-    """Write everything; the poses are final.
+    """Write everything; the poses are final. A map that cannot be written costs no other file.
 
     Args:
         directory: of the run.
         config, described: the settings, and what was run, for config.yaml.
         tracked, closed, drawn: the results.
         map_formats: further formats of the map.
+
+    Raises:
+        OutputError: a file cannot be written.
     """
-    log = tracked.log
+    log, failed = tracked.log, None
     logger.info("writing the results of %s", count(len(log), "scan"))
     directory.write_text(files.CONFIG, dump_yaml(config, described))
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))
     directory.write_text(files.SCANS_CSV, log.format_csv())
     metrics = _write_trajectories(directory, tracked)
-    written = write_map(directory, drawn, map_formats)
+    try:
+        written = write_map(directory, drawn, map_formats)
+    except OutputError as error:
+        written, failed = WrittenMap(0, drawn.voxel_size_m, drawn.moved), error
+        log.warn(f"there is no map: {error}")
     log.warnings.extend(tracked.faults.warnings())
     if drawn.warning is not None:
         log.warn(drawn.warning)
@@ -94,6 +102,8 @@ def write_results(
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
     summary = summarise(log, written, skipped, closed, contradictions, tracked.elevation)
     directory.write_json(files.SUMMARY, summary.to_json())
+    if failed is not None:
+        raise OutputError(f"{failed}; the other results are there") from failed
     return RunOutcome(summary, metrics, tracked.stopped)
 
 

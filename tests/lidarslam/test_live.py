@@ -166,6 +166,9 @@ def test_interrupted_it_writes_what_came(
     np.testing.assert_allclose([position.x, position.y, position.z], expected, atol=1e-8)
 
 
+NOW = 1_700_000_000 * 10**9  # of publication
+
+
 def message_at(
     stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8, axes: tuple[int, int, int] = (0, 1, 2)
 ) -> bytes:
@@ -195,7 +198,7 @@ def message_at(
 
 
 def test_point_times_are_inferred_from_the_first_cloud() -> None:
-    live = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(1000.5, "os"), 0)
+    live = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(1000.5, "os"), NOW)
     assert live is not None
     assert (live.stamp_ns, live.frame_id, live.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
     np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
@@ -206,7 +209,7 @@ def test_clouds_are_turned_as_set() -> None:
     scans = []
     for axes, mounting in (((0, 1, 2), "upright"), ((1, 2, 0), (90.0, 0.0, 90.0))):
         config = ReaderConfig.model_validate({"mounting": mounting})
-        live = CloudDecoder(config, "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(100.0, axes=axes), 0)
+        live = CloudDecoder(config, "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(100.0, axes=axes), NOW)
         assert live is not None
         scans.append(live.scan)
     np.testing.assert_array_equal(scans[1].points, scans[0].points)
@@ -217,7 +220,7 @@ def test_a_time_field_without_times_is_a_warning() -> None:
     faults = Faults()
     decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
     for number in range(12):
-        live = decoder.scan(message_at(1000.0 + 0.1 * number, last_time=0.0), 0)
+        live = decoder.scan(message_at(1000.0 + 0.1 * number, last_time=0.0), NOW)
         assert live is not None
         assert live.scan.time_offsets is None
     assert [warning for warning in faults.warnings() if "holds one value alone (0)" in warning]
@@ -227,7 +230,7 @@ def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() 
     faults = Faults()
     decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
     messages = [message_at(100.0), message_at(99.0), message_at(100.1, "rear"), message_at(100.2)[:200], b"\0\1"]
-    scans = [decoder.scan(raw, 0) for raw in [*messages, message_at(100.3)]]
+    scans = [decoder.scan(raw, NOW) for raw in [*messages, message_at(100.3)]]
     assert [scan is not None for scan in scans] == [True, False, False, False, False, True]
     assert faults.left_out == 4
     assert "not after" in faults.warnings()[0]
@@ -243,10 +246,20 @@ def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few() -> None:
     stamps[2] = 2e9
     stamps[10:] = [stamp + 3600.0 for stamp in stamps[10:]]
     scans = [
-        decoder.scan(message_at(stamp), round(1e9 * time_s)) for stamp, time_s in zip(stamps, published, strict=True)
+        decoder.scan(message_at(stamp), NOW + round(1e9 * time_s))
+        for stamp, time_s in zip(stamps, published, strict=True)
     ]
     assert [scan is not None for scan in scans] == [number not in (2, *range(10, 15)) for number in range(20)]
     assert "ahead of the time that has passed" in faults.warnings()[0]
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 37.0])
+def test_a_stray_stamp_at_the_very_beginning_costs_one_scan(ahead_s: float) -> None:
+    """Also where the sensor's clock is ahead, as that of TAI; there the first scan decides nothing by itself."""
+    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults())
+    stamps = [2.1e9, *(NOW / 1e9 + ahead_s + 0.1 * number for number in range(1, 5))]
+    scans = [decoder.scan(message_at(stamp), NOW + number * 10**8) for number, stamp in enumerate(stamps)]
+    assert [scan is not None for scan in scans] == [False, ahead_s == 0.0, True, True, True]
 
 
 def test_headers_without_stamps_have_the_time_of_publication() -> None:

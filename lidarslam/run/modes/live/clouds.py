@@ -49,6 +49,7 @@ class CloudDecoder:
         self._faults = faults
         self._frame_id = config.frame_id
         self._last_ns: int | None = None
+        self._doubtful: tuple[int, int] | None = None  # stamp and publication of a first message from the future
         self._last_published_ns = self._ahead = 0  # and how many stamps in a row were ahead of it
         self._has_header_stamps = True
         self._clouds: list[TimedCloud] = []
@@ -87,7 +88,7 @@ class CloudDecoder:
             self._faults.leave_out(_OTHER_SENSOR, f"{frame_id!r} instead of {self._frame_id!r}")
             return False
         if self._last_ns is None:
-            return True
+            return self._begins(stamp_ns, published_ns)
         step_ns = stamp_ns - self._last_ns
         if step_ns <= 0:
             self._faults.leave_out(_NOT_AFTER, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
@@ -98,6 +99,13 @@ class CloudDecoder:
             self._faults.leave_out(_AHEAD, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
             return False
         return True
+
+    def _begins(self, stamp_ns: int, published_ns: int) -> bool:
+        """Whether scans begin here; a stamp ahead of its publication is of another clock only if the next one is."""
+        before, self._doubtful = self._doubtful, (stamp_ns, published_ns)
+        if stamp_ns - published_ns < _AHEAD_NS:
+            return True
+        return before is not None and 0 < stamp_ns - before[0] < published_ns - before[1] + _AHEAD_NS
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         """Decode the points.
