@@ -30,6 +30,9 @@ class ReaderConfig(BaseModel):
         "auto",
         description="per-point time: relative to the scan's stamp, a reading of a clock, from the azimuth, or none",
     )
+    time_scale: float = Field(
+        1.0, ge=-100.0, le=100.0, description="factor on the per-point times, counted from the scan's stamp"
+    )
     mounting: Mounting = Field(
         "auto",
         description="where the recorded z axis points: upright, upside-down, left, right, forward, backward, camera, or"

@@ -184,4 +184,4 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     raised_deg = setting if isinstance(setting, float) else READERS[name].elevation_deg
     if config.mounting == "upright" and not raised_deg:
         return recording
-    return MountedRecording(recording, config.mounting, raised_deg)
+    return MountedRecording(recording, config.mounting, raised_deg, config.time_scale)

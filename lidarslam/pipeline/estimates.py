@@ -86,6 +86,7 @@ class Localised:
     is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
     gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not
     cell_m: float | None = None  # of the local map's surfels; None where there are none
+    turn_rate: FloatArray | None = None  # (3,) rad/s as the sweep alone shows it, in the LiDAR frame; None: unknown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -188,6 +188,7 @@ class ScanToMap(Stateful):
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
             cell_m=None if self.mapper is None else self.mapper.cell_m,
+            turn_rate=mapped.turn_rate,
         )
 
     def _prior(self, estimated: Estimated, following: Estimated | None) -> Prior:

@@ -33,7 +33,7 @@ COLUMNS = (
 )
 
 _STATUSES = tuple(Status)
-# The numbers of a scan, 409 bytes; NaN where there is none.
+# The numbers of a scan, 433 bytes; NaN where there is none.
 _ROW = np.dtype(
     [
         ("stamp", "f8"),
@@ -44,13 +44,14 @@ _ROW = np.dtype(
         ("residual_m", "f8"),
         ("inlier_ratio", "f8"),
         ("sigmas", "f8", len(SIGMAS)),
+        ("turn_rate", "f8", 3),
         ("total_ms", "f8"),
         ("stage_ms", "f8", len(STAGES)),
         ("T_world_lidar", "f8", (4, 4)),
         ("T_odom_lidar", "f8", (4, 4)),
     ]
 )
-_MAY_BE_NAN = ("residual_m", "inlier_ratio", "sigmas")
+_MAY_BE_NAN = ("residual_m", "inlier_ratio", "sigmas", "turn_rate")
 _POSES = ("T_world_lidar", "T_odom_lidar")
 # What is checked of a restored row.
 _VALUES = {name: Values(TRANSFORM if name in _POSES else None) for name in _ROW.names or () if name != "status"}
@@ -81,6 +82,7 @@ class ScanLog(Stateful):
             np.nan if result.residual_m is None else result.residual_m,
             np.nan if result.inlier_ratio is None else result.inlier_ratio,
             np.full(len(SIGMAS), np.nan) if result.covariance is None else np.sqrt(np.diag(result.covariance)),
+            np.full(3, np.nan) if result.turn_rate is None else result.turn_rate,
             total_ms,
             [result.stage_ms.get(stage, 0.0) for stage in STAGES],
             result.T_world_lidar,
@@ -135,6 +137,11 @@ class ScanLog(Stateful):
     def stamps(self) -> FloatArray:
         """(N,) seconds."""
         return self._table()["stamp"]
+
+    @property
+    def turn_rates(self) -> FloatArray:
+        """(N, 3) rad/s within the sweeps; NaN where unknown."""
+        return self._table()["turn_rate"]
 
     @property
     def total_ms(self) -> FloatArray:

@@ -25,4 +25,5 @@ class MappedScan:
     added: bool = False  # whether the scan is good enough for the map, and was inserted
     # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
     is_connected: bool = True
+    turn_rate: FloatArray | None = None  # (3,) rad/s within the sweep, in the LiDAR frame; None without point times
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU

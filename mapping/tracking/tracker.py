@@ -119,6 +119,7 @@ class Tracker(Stateful):
         """Judge a registration, and update noise and tracking state with it."""
         registration, jumped = attempt.registration, attempt.has_jumped
         assert registration is not None
+        is_timed = scan.sweep.times is not None and self._config.continuous_time
         T_world_lidar, velocity, covariance = registration.T_world_lidar, registration.velocity, registration.covariance
         state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
         self._state.registered(attempt.status, attempt.relocalised, attempt.quality, scan.stamp)
@@ -126,7 +127,7 @@ class Tracker(Stateful):
             self._end_search()
         if attempt.relocalised or jumped or not self._state.velocity_known or prior.inertial is not None:
             self._velocity_bias = VelocityBias()
-        elif scan.sweep.times is not None and self._config.continuous_time:
+        elif is_timed:
             self._velocity_bias = self._velocity_bias.updated(last, state, scan.seen_from_s)
             state = self._velocity_bias.corrected(state)
         if not attempt.relocalised:
@@ -153,6 +154,7 @@ class Tracker(Stateful):
             iterations=registration.iterations,
             added=fits and not jumped and not self._state.is_unconfirmed,
             is_connected=not attempt.relocalised,
+            turn_rate=registration.velocity[:3] if is_timed and prior.inertial is None else None,
         )
 
     def lose(self, local_map: LocalMap, has_points: bool) -> bool:

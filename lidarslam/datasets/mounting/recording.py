@@ -1,4 +1,4 @@
-"""A recording in upright axes, with its elevations corrected."""
+"""A recording in upright axes, with its elevations and the times of its points corrected."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,11 +29,15 @@ class MountedRecording:
         recorded: in its own axes.
         mounting: of these; auto: guessed from the first scans, when it is needed.
         raised_deg: added to the elevations of all points, above the recorded x-y plane.
+        time_scale: factor on the points' times from their scan's stamp.
     """
 
-    def __init__(self, recorded: Recording, mounting: Mounting, raised_deg: float = 0.0) -> None:
+    def __init__(
+        self, recorded: Recording, mounting: Mounting, raised_deg: float = 0.0, time_scale: float = 1.0
+    ) -> None:
         self.recorded = recorded
         self.raised_deg = raised_deg
+        self._time_scale = time_scale
         self._mounting = mounting
 
     @cached_property
@@ -98,9 +102,12 @@ class MountedRecording:
         """The scans with the indices of `range(start, stop, step)`, in upright axes."""
         _ = self.T_upright_recorded  # guessed before the first scan: two passes through one file may not alternate
         scans = self.recorded.scans(start, stop, step, faults)
-        return map(self._upright, scans) if self._is_turned or self.raised_deg else scans
+        is_as_recorded = not (self._is_turned or self.raised_deg) and self._time_scale == 1.0
+        return scans if is_as_recorded else map(self._upright, scans)
 
     def _upright(self, scan: Scan) -> Scan:
+        if self._time_scale != 1.0 and scan.time_offsets is not None:
+            scan = replace(scan, time_offsets=self._time_scale * scan.time_offsets)
         if self.raised_deg:
             scan = replace(scan, points=correct_elevation(scan.points, self.raised_deg))
         return turned(scan, self.T_upright_recorded)

@@ -17,6 +17,7 @@ from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.elevation import Elevation, elevation_json
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary.time_scale import time_scale, time_scale_warning
 from lidarslam.run.summary.timing import Milliseconds, SlowestScan
 from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.storage.directory import SCANS_CSV
@@ -224,6 +225,9 @@ def _warnings(
             f"{unconstrained_m:.1f} m of the way of {length_m:.1f} m lie along directions that hardly any surface"
             " constrains: the length is uncertain, as in an even corridor"
         )
+    is_tracked = np.array([status is Status.OK for status in log.statuses])
+    if (wrong := time_scale_warning(time_scale(log.trajectory, log.turn_rates, is_tracked))) is not None:
+        yield wrong
     if contradictions:
         clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)
         more = f"; {len(contradictions) - 1} more such stretches" if len(contradictions) > 1 else ""
