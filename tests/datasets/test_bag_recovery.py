@@ -485,6 +485,17 @@ def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_wh
         open_recording(folder if is_whole else file)
 
 
+@pytest.mark.parametrize("column", ["name", "type"])
+def test_a_topic_without_a_name_is_left_out(write_drive, column):
+    file, _, points = write_drive("db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        (columns,) = database.execute("SELECT group_concat(name) FROM pragma_table_info('topics')").fetchone()
+        values = ",".join(f"cast({name} AS BLOB)" if name == column else name for name in columns.split(","))
+        values = values.replace("id,", "9,", 1)
+        database.execute(f"INSERT INTO topics({columns}) SELECT {values} FROM topics LIMIT 1")
+    assert_first_scans(open_recording(file), points, len(points))
+
+
 def test_metadata_that_names_a_file_over_and_over_is_left_aside(write_drive):
     file, folder, points = write_drive("mcap")
     metadata = folder / "metadata.yaml"

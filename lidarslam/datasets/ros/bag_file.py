@@ -64,6 +64,8 @@ class BagFile:
         with self._opened() as reader, self._damage("its index cannot be read"):
             self._messages_are_compressed = getattr(reader, "compression_mode", None) == "message"
             for connection in reader.connections:
+                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                    raise ValueError("a topic without a name or type")  # a database may hold anything there
                 counts[connection.topic, connection.msgtype] += connection.msgcount
         return counts
 

@@ -26,6 +26,7 @@ Connections = Mapping[int, tuple[str, str]]
 _LONGEST_RECORD = 1 << 30
 # Opcodes of MCAP.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+_TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
 # By the table itself, because the pages of its index lie at the end.
 _ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id"
 
@@ -184,7 +185,10 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
     with closing(_connected(path)) as database:
         # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
         database.execute("PRAGMA writable_schema=ON")
-        topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
+        rows = database.execute(
+            "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+        )
+        topics = {number: (name, message_type) for number, name, message_type in rows}
         # Pages that are missing at the end (sqlite.org/fileformat2.html, 1.3) SQLite may take for zeros.
         page, pages = struct.unpack_from(">H10xI", header, 16)
         is_cut = path.stat().st_size < pages * (page if page > 1 else 65536)

@@ -15,7 +15,9 @@ _EVEN = 0.5
 _RIGHT = (0.75, 1.4)
 
 
-def time_scale(trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]) -> tuple[float, int] | None:
+def time_scale(
+    trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]
+) -> tuple[float, int] | None:
     """Ratio of the turn rates within sweeps to those from scan to scan; one where the points' times are right.
 
     Args:

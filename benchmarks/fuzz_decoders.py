@@ -1,0 +1,144 @@
+"""Coverage-guided fuzzing (Atheris) of the decoders: an input ends in a result or in one of the errors for the user.
+
+    python benchmarks/fuzz_decoders.py mcap --runs 100000
+
+What fails is kept as `crash-*` in the folder of the corpus and is tried first from then on.
+"""
+
+import argparse
+import logging
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import atheris
+
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # which compiles no function that is instrumented
+
+with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"]):
+    import numpy as np
+
+    from lidarslam.config.settings import load_config
+    from lidarslam.core.errors import LidarSlamError
+    from lidarslam.core.scan import Scan
+    from lidarslam.core.text.trajectory_io import read_tum
+    from lidarslam.datasets.config import ReaderConfig
+    from lidarslam.datasets.faults import Faults
+    from lidarslam.datasets.registry import open_recording
+    from lidarslam.mapping.global_map.global_map import PointCloud
+    from lidarslam.mapping.global_map.map_io import write_cloud
+    from lidarslam.run.modes.live.clouds import CloudDecoder
+    from lidarslam.simulation.recorder import SimulatedScan
+    from lidarslam.simulation.writers.interface import Rig
+    from lidarslam.simulation.writers.ply import write_ply_scans
+    from lidarslam.simulation.writers.rosbag import write_mcap, write_rosbag1, write_rosbag2
+    from lidarslam.storage.about import About
+    from lidarslam.storage.summary_file import read_summary
+
+# Of memory, seconds for one input, and its bytes.
+_LIMITS = ("-rss_limit_mb=2048", "-timeout=20", "-max_len=65536")
+CLOUD = "sensor_msgs/msg/PointCloud2"
+
+
+def scans(path: Path) -> None:
+    """All scans of a recording, twice: a bag's topics are found before they are read."""
+    recording = open_recording(path, ReaderConfig())
+    recording.describe()
+    list(recording.scans(faults=Faults()))
+
+
+def live(path: Path) -> None:
+    """The same message at two times."""
+    decoder, raw = CloudDecoder(ReaderConfig(), CLOUD, Faults()), path.read_bytes()
+    for published_ns in (10**18, 10**18 + 10**8):
+        decoder.scan(raw, published_ns)
+
+
+# Of each decoder: the name of its file, and what reads that, or the folder in which it lies.
+TARGETS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "ply": ("0.ply", lambda path: scans(path.parent)),
+    "pcd": ("0.pcd", lambda path: scans(path.parent)),
+    "npy": ("0.npy", lambda path: scans(path.parent)),
+    "mcap": ("0.mcap", scans),
+    "bag": ("0.bag", scans),
+    "db3": ("0.db3", scans),
+    "message": ("message", live),
+    "tum": ("trajectory.tum", read_tum),
+    "yaml": ("config.yaml", lambda path: load_config(path, [])),
+    "summary": ("summary.json", lambda path: read_summary(path.parent)),
+    "about": ("unfinished/run.json", lambda path: About.read(path.parent.parent)),
+}
+
+
+def write_seeds(corpus: Path, name: str) -> None:
+    """A small whole file of each kind."""
+    rng = np.random.default_rng(0)
+    times = np.linspace(0.0, 0.1, 40)
+    sweeps = [Scan(rng.normal(size=(40, 3)), stamp, times) for stamp in (0.1, 0.2, 0.3)]
+    simulated = [SimulatedScan(sweep, np.ones(40, dtype=np.float32)) for sweep in sweeps]
+    rig = Rig("ouster", 0.1, lambda stamps: np.tile(np.eye(4), (len(stamps), 1, 1)), None)
+    with tempfile.TemporaryDirectory() as folder:
+        made, writers = Path(folder) / "made", {"mcap": write_mcap, "bag": write_rosbag1, "db3": write_rosbag2}
+        if name == "pcd":
+            made.mkdir()
+            write_cloud(made / "0.pcd", PointCloud(sweeps[0].points, np.tile([0.0, 0.0, 1.0], (40, 1))))
+        elif name == "npy":
+            made.mkdir()
+            np.save(made / "0.npy", sweeps[0].points)
+        elif name in (*writers, "ply"):
+            writers.get(name, write_ply_scans)(made, simulated, rig)
+        elif name == "message":
+            made.mkdir()
+            (made / "0.message").write_bytes(_message(Path(folder) / "bag", simulated, rig))
+        else:
+            made.mkdir()
+            text = {
+                "tum": "1.0 0 0 0 0 0 0 1\n1.1 1 0 0 0 0 0 1\n",
+                "yaml": "odometry: {method: learned}\nmapping:\n  method: loam\n",
+                "summary": '{"scans": 3, "length_m": 1.0, "warnings": []}',
+                "about": '{"description": {"merge": "all"}, "standing": "stopped", "resumed_after": [1]}',
+            }[name]
+            (made / f"0.{name}").write_text(text)
+        for number, path in enumerate(made.rglob(f"*.{name}")):
+            (corpus / f"seed-{number}").write_bytes(path.read_bytes())
+
+
+def _message(folder: Path, simulated: list[SimulatedScan], rig: Rig) -> bytes:
+    from rosbags.rosbag2 import Reader
+
+    write_mcap(folder, simulated, rig)
+    with Reader(folder) as reader:
+        return next(bytes(raw) for connection, _, raw in reader.messages() if connection.msgtype == CLOUD)
+
+
+def main() -> None:
+    """Fuzz one decoder."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("target", choices=TARGETS)
+    parser.add_argument("--runs", type=int, default=10_000)
+    parser.add_argument("--seconds", type=int, default=60, help="at most")
+    parser.add_argument("--corpus", type=Path, help="kept from one time to the next")
+    arguments = parser.parse_args()
+    logging.disable(logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as folder:
+        name, read = TARGETS[arguments.target]
+        corpus, path = arguments.corpus or Path(folder) / "corpus", Path(folder) / "here" / name
+        corpus.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True)
+        write_seeds(corpus, arguments.target)
+
+        def one(data: bytes) -> None:
+            path.write_bytes(data)
+            with suppress(LidarSlamError):
+                read(path)
+
+        limits = [f"-runs={arguments.runs}", f"-max_total_time={arguments.seconds}", *_LIMITS]
+        atheris.Setup([sys.argv[0], *limits, f"-artifact_prefix={corpus}/", str(corpus)], one)
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()
