@@ -485,6 +485,24 @@ def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_wh
         open_recording(folder if is_whole else file)
 
 
+def test_rows_of_a_damaged_page_are_not_passed_over_without_an_end(write_drive):
+    """Where numbers of rows are damaged, the next one may be as many rows away as numbers can count."""
+    file, _, points = write_drive("db3", count=60)
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute(
+            "UPDATE messages SET id = id + 9000000000000000000 WHERE id > (SELECT max(id) / 2 FROM messages)"
+        )
+        (size,) = database.execute("PRAGMA page_size").fetchone()
+    data = file.read_bytes()
+    pages = [data[at : at + size] for at in range(0, len(data), size)]
+    leaves = [number for number, page in enumerate(pages) if page[0] == 0x0D and b"lidar" in page[100:]]
+    for leaf in leaves[len(leaves) // 2 : -1]:
+        overwrite(file, leaf * size, bytes(size))
+    recording = open_recording(file)
+    assert len(recording) < len(points)
+    assert_first_scans(recording, points, len(recording))
+
+
 @pytest.mark.parametrize("column", ["name", "type"])
 def test_a_topic_without_a_name_is_left_out(write_drive, column):
     file, _, points = write_drive("db3")

@@ -27,6 +27,8 @@ _LONGEST_RECORD = 1 << 30
 # Opcodes of MCAP.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 _TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+# Rows in a row that are passed over: a page has a hundred, and a damaged number of a row may be any.
+_MOST_DAMAGED = 1_000
 # By the table itself, because the pages of its index lie at the end.
 _ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id"
 
@@ -204,12 +206,12 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
 
 def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:
     """The rows of the table of messages; those on damaged pages are passed over one by one."""
-    done, lost, first = -1, 0, ""
-    while True:
+    done, lost, in_a_row, first = -1, 0, 0, ""
+    while in_a_row < _MOST_DAMAGED:
         try:
             for number, *row in database.execute(_ROWS, (done,)):
                 yield tuple(row)
-                done = number
+                done, in_a_row = number, 0
             break
         except sqlite3.Error as error:
             first = first or f"after row {done:,} ({_reason(error)})"
@@ -218,7 +220,7 @@ def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object
         except sqlite3.Error:  # its end is gone too
             report(f"it breaks off {first}")
             return
-        done, lost = done + 1, lost + 1
+        done, lost, in_a_row = done + 1, lost + 1, in_a_row + 1
         if done >= last:
             break
     if lost:
