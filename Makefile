@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check audit docs install clean
+.PHONY: demo test check lowest audit docs install clean
 
 demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
@@ -22,6 +22,10 @@ check: install
 	$(BIN)/mypy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	$(PYTEST)
+
+# The lowest versions of libraries that pyproject.toml allows, which needs the network.
+lowest:
+	PYTHON=$(PYTHON) sh scripts/lowest_versions.sh
 
 # Known vulnerabilities of the installed libraries; asks the databases on the network.
 audit: install

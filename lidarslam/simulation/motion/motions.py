@@ -56,7 +56,7 @@ class Motion:
         return float(self.times[-1])
 
     @cached_property
-    def _spline(self) -> CubicSpline[np.float64]:
+    def _spline(self) -> "CubicSpline[np.float64]":
         if self.repeats and not self.rests:
             return _closed_spline(self.times, self.base)
         return CubicSpline(self.times, self.base, bc_type="clamped" if self.repeats else "natural")
@@ -74,7 +74,7 @@ class Motion:
         return make_transform(rotations(roll, pitch, yaw), position)
 
 
-def _closed_spline(times: FloatArray, values: FloatArray) -> CubicSpline[np.float64]:
+def _closed_spline(times: FloatArray, values: FloatArray) -> "CubicSpline[np.float64]":
     """Through values (K, D) at times (K,), with equal derivatives at either end: a periodic spline and a trend."""
     slope = (values[-1] - values[0]) / times[-1]
     level = values - np.multiply.outer(times, slope)
