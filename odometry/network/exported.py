@@ -1,12 +1,13 @@
 """An exported network in ONNX Runtime: inference without torch, which starts at once."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from threading import Thread
 from time import monotonic, sleep
 from typing import Any
-from weakref import WeakSet
+from weakref import ref
 
 import onnxruntime
 from pydantic import ValidationError
@@ -105,7 +106,7 @@ class _Graph:
         except Exception as error:  # of many kinds, all of ONNX Runtime's own
             raise self._unusable(error) from error
         self._inputs = [value.name for value in self._session.get_inputs()]
-        _running().add(self)
+        _watched().append(ref(self))
 
     def __call__(self, *inputs: Floats) -> list[Floats]:
         self.deadline_s = monotonic() + _MOST_S
@@ -131,19 +132,20 @@ def _bound_memory() -> None:
         "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
     )
     limits = dict.fromkeys(("arena_extend_strategy", "initial_chunk_size_bytes", "max_dead_bytes_per_chunk"), -1)
-    onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": _MOST_BYTES, **limits}))
+    with suppress(Exception):  # the process has one of its own already
+        onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": _MOST_BYTES, **limits}))
 
 
 @cache
-def _running() -> "WeakSet[_Graph]":
+def _watched() -> "list[ref[_Graph]]":
     """All graphs, which a thread of its own ends at their deadlines."""
-    graphs: WeakSet[_Graph] = WeakSet()
+    graphs: list[ref[_Graph]] = []
 
     def watch() -> None:
         while True:
             sleep(1.0)
-            for graph in list(graphs):
-                if monotonic() > graph.deadline_s:
+            for graph in (reference() for reference in tuple(graphs)):
+                if graph is not None and monotonic() > graph.deadline_s:
                     graph.end()
 
     Thread(target=watch, daemon=True, name="deadlines of graphs").start()
