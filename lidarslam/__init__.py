@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from lidarslam.core.trajectory import Trajectory
     from lidarslam.mapping.global_map.global_map import PointCloud
 
+    __version__: str
+
 __all__ = [
     "Config",
     "LidarSlamError",
@@ -48,6 +50,10 @@ _MODULES = {
 if not TYPE_CHECKING:  # a type checker would take any name for one of these
 
     def __getattr__(name):
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("lidarslam")
         if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib import import_module

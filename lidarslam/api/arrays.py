@@ -11,6 +11,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import Mounting
 from lidarslam.datasets.mounting.rotation import transform_of, turned
 
+# Three rows of more columns than any point has are the coordinates of many points.
+_TRANSPOSED, _MOST_COLUMNS = 3, 32
 # No sweep lasts longer, and no clock reading is smaller.
 _LONGEST_OFFSET_S = 10.0
 # Thousands of years are no time in seconds.
@@ -23,7 +25,7 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, mo
     """A scan, of copies, in upright axes, without the invalid points: NaN, at the origin, beyond 10 km.
 
     Args:
-        points: (N, 3) or more columns, of which the first three are x, y, z in metres.
+        points: (N, 3) or more columns, of which the first three are x, y, z in metres; or a cloud of Open3D.
         point_times: (N,) seconds from the stamp.
         stamp: seconds.
         mounting: of the points' axes; auto: upright.
@@ -31,11 +33,13 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, mo
     Raises:
         InputError: an array has another shape, or a time is not in seconds.
     """
-    table = _numbers("points", points)
+    table = _numbers("points", getattr(points, "points", points))
     if not table.size:
         table = np.empty((0, 3))
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"points must be (N, 3) or (N, 3 and more), x, y, z first; got the shape {table.shape}")
+    if len(table) == _TRANSPOSED and table.shape[1] > _MOST_COLUMNS:
+        raise InputError(f"points must be (N, 3), got the shape {table.shape}; give points.T")
     times = None if point_times is None else _times(point_times, len(table))
     scan = Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times)
     return turned(scan, transform_of(mounting))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, interpolate, inverse, is_rigid
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Poses of the LiDAR in a world frame."""
 
@@ -36,6 +36,9 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self):,} poses, {self.length_m:.1f} m in {self.duration_s:.1f} s)"
 
     @property
     def positions(self) -> FloatArray:

@@ -146,8 +146,11 @@ def choose_reader(source: Path, name: str | None = None) -> str:
         )
     if (other := unrecognised(source, recognise)) is not None:
         raise InputError(other)
-    layouts = "; ".join(reader.reads for reader in READERS.values())
-    raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
+    raise InputError(
+        f"{source}: not a recording that any reader recognises; expected a bag (.bag, .db3, .mcap, or the folder of a"
+        " rosbag2), a folder of .bin, .pcd, .ply or .npy scans, packets (.pcap, .osf), KITTI, or a data set of"
+        " `lidarslam datasets`"
+    )
 
 
 def is_recording(source: Path, name: str | None = None) -> bool:

@@ -82,7 +82,7 @@ def _tiles(tiled: TiledMap) -> str:
 
 
 def _loops(graph: GraphSummary) -> str:
-    moved = f", poses corrected by up to {graph.largest_correction_m:.2f} m" if graph.closed else ""
+    moved = f", poses corrected by up to {small_length(graph.largest_correction_m)}" if graph.closed else ""
     rejected = len(graph.loops) - graph.closed
     candidates = f" ({count(rejected, 'candidate')} rejected; {SUMMARY} gives the reasons)" if rejected else ""
     return f"{count(graph.keyframes, 'keyframe')}, {count(graph.closed, 'loop')} closed{moved}{candidates}"

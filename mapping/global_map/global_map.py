@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layou
 from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
 from lidarslam.mapping.surfels.hash_kernels import EMPTY
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
@@ -55,6 +59,14 @@ class PointCloud:
     def select(self, chosen: NDArray[np.bool_]) -> "PointCloud":
         """Some of the points, by a mask (N,)."""
         return PointCloud(self.points[chosen], self.normals[chosen], self.attributes.select(chosen))
+
+    def to_open3d(self) -> "o3d.geometry.PointCloud":
+        """The points and normals as a cloud of Open3D."""
+        import open3d as o3d
+
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.points))
+        cloud.normals = o3d.utility.Vector3dVector(self.normals)
+        return cloud
 
 
 class GlobalMap(Stateful):

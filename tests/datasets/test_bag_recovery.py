@@ -503,6 +503,13 @@ def test_rows_of_a_damaged_page_are_not_passed_over_without_an_end(write_drive):
     assert_first_scans(recording, points, len(recording))
 
 
+def test_an_mcap_of_another_name_is_told(write_drive, tmp_path):
+    file, _, _ = write_drive("mcap")
+    renamed = shutil.copy(file, tmp_path / "drive.bag")
+    with pytest.raises(InputError, match=r"is an MCAP file, by its first bytes; name it drive\.mcap"):
+        open_recording(renamed)
+
+
 @pytest.mark.parametrize("column", ["name", "type"])
 def test_a_topic_without_a_name_is_left_out(write_drive, column):
     file, _, points = write_drive("db3")

@@ -166,6 +166,17 @@ def test_points_as_drivers_give_them(slam: Slam, room_scans: list[Scan]) -> None
     assert np.linalg.norm(slam.map().points - [7.0, 7.0, 7.0], axis=1).min() > 0.5
 
 
+def test_clouds_of_open3d_go_in_and_out(slam: Slam, room_scans: list[Scan]) -> None:
+    import open3d as o3d
+
+    for scan in room_scans[:3]:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scan.points))
+        result = slam.register_frame(cloud, scan.time_offsets, scan.stamp)
+    assert result.status is Status.OK
+    found = slam.map()
+    np.testing.assert_array_equal(np.asarray(found.to_open3d().points), found.points)
+
+
 def test_results_are_read_only(slam: Slam, room_scans: list[Scan]) -> None:
     result = slam.register_frame(room_scans[0])
     with pytest.raises(ValueError, match="read-only"):
@@ -188,6 +199,7 @@ POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (60, 3))
     [
         (np.zeros((5, 2)), None, 0.2, r"must be \(N, 3\).* \(5, 2\)"),
         (np.zeros((2, 5, 3)), None, 0.2, r"must be \(N, 3\)"),
+        (POINTS.T, None, 0.2, r"\(3, 60\); give points\.T"),
         (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "got the fields x, y"),
         (np.array([["a", "b", "c"]]), None, 0.2, "array of numbers"),
         ([[1.0, 2.0], [1.0]], None, 0.2, "array of numbers"),
@@ -364,5 +376,7 @@ def test_the_names_are_those_that_are_said() -> None:
     assert set(lidarslam._MODULES) == set(lidarslam.__all__) <= set(dir(lidarslam))
     for name in lidarslam.__all__:
         assert getattr(lidarslam, name).__doc__, f"{name} is documented"
+    assert lidarslam.__version__.count(".") == 2
+    assert repr(Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))) == "Trajectory(3 poses, 0.0 m in 2.0 s)"
     with pytest.raises(AttributeError, match="has no attribute 'slam'"):
         _ = lidarslam.slam  # type: ignore[attr-defined]

@@ -27,6 +27,7 @@ _REPAIR = {
     ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
 }
 _METADATA = "metadata.yaml"
+_MCAP = b"\x89MCAP"
 # A file in the list of a rosbag2's.
 _LISTED = re.compile(r"\s*-\s+(\S+\.(?:db3|mcap)(?:\.zstd)?)\s*")
 
@@ -48,6 +49,8 @@ class BagFile:
         """
         if path.is_file() and not path.stat().st_size:
             raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
+        if path.suffix == ".bag" and path.is_file() and _begins_as_mcap(path):
+            raise InputError(f"{path}: is an MCAP file, by its first bytes; name it {path.with_suffix('.mcap').name}")
         self.path = path
         self.ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
         self._has_index = True
@@ -235,6 +238,11 @@ class BagFile:
         if command is None:
             return "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml"
         return f"try `{command.format(self.path)}`, or copy the bag again"
+
+
+def _begins_as_mcap(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_MCAP)) == _MCAP
 
 
 def _last(messages: Iterator[BagMessage]) -> BagMessage | None:

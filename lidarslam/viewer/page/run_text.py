@@ -43,7 +43,7 @@ def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
         closed = count(summary["loop_closures"], "loop")
         shown["pose graph"] = (
             f"{count(graph['keyframes'], 'keyframe')}, {closed} closed, poses corrected by up to"
-            f" {graph['largest_correction_m']:.2f} m"
+            f" {small_length(graph['largest_correction_m'])}"
         )
     return shown
 
