@@ -34,10 +34,10 @@ def match_planes(
 ) -> int:  # fmt: skip
     """Write the surface of every unmatched point (N, 3) whose cell has a plane, unless it has a better one already.
 
-    A better one is known better, and its points are not spread more: across steps, a coarse plane's are.
+    A better one is known better and its points are spread less: across steps, a coarse plane's are spread more.
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
     without a plane, or with one of an uncertain normal, are moved to the beginning of `unmatched`. `spread_m` (N,) has
-    the largest standard deviation that the points of another plane may have across it, and is written.
+    the standard deviations of each plane's points across it, and is written.
 
     Returns:
         Number of the points that were moved.
@@ -55,8 +55,7 @@ def match_planes(
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
                 spread = p[9] * math.sqrt(p[13] / (p[13] - 3.0))  # three points make the plane
                 if found.counts[n] == 0 or (spread < spread_m[n] and _thickness_m(p, 0) < found.thickness_m[n, 0]):
-                    # The standard deviation of so many residuals is itself uncertain by one in sqrt(2 n).
-                    found.counts[n], spread_m[n] = 0, spread * (1.0 + 1.0 / math.sqrt(2.0 * p[13]))
+                    found.counts[n], spread_m[n] = 0, spread
                     _write(found, n, p, 0, p[3], p[4], p[5], tilt)
                 if tilt < _CERTAIN_TILT:
                     continue

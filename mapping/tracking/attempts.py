@@ -161,7 +161,9 @@ class ScanMatcher:
 
         Of several optima along the weakest direction, as on stairs, the prediction's may be the next step's.
         """
-        if prior.T_prev_curr is None or near.fit.weakest is None or not near.fit.is_constrained:
+        if prior.T_prev_curr is None or near.prediction.is_inertial:  # an IMU knows better
+            return near
+        if near.fit.weakest is None or not near.fit.is_constrained:
             return near
         direction, apart_m = np.array(near.fit.weakest), _APART_CELLS * self._map.cell_m
         T_world_lidar = self.last.T_world_lidar @ prior.T_prev_curr
