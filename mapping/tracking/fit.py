@@ -24,7 +24,7 @@ _RIDGE = 0.001
 # Standard deviation of a range: thicker surfaces, as planes across an edge, count less.
 _RANGE_NOISE_M = 0.02
 # Along a direction, inliers constrain the translation by this many times what the noise of their normals would, or
-# hardly. In a corridor with little in it, that is 5 to 14 at true poses; at wrong ones in fields, 3 to 8; elsewhere
+# hardly. In a corridor with little in it, that is 3 to 14 at true poses; at wrong ones in fields, 3 to 8; elsewhere
 # over 20.
 _LEAST_EVIDENCE = 7.0
 
