@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +75,7 @@ class Unfinished:
             unfinished.files.clear()
         elif unfinished.files.state.is_file():
             unfinished.saved = read_state(unfinished.files.state)
-        directory.before_change = partial(replace_earlier, run)
+        directory.before_change = unfinished.replace_earlier
         try:
             yield unfinished
         except BaseException:
@@ -96,6 +95,12 @@ class Unfinished:
         self.about = replace(self.about, standing=standing, resumed_after=resumed)
         self.about.write(self.run)
 
+    def replace_earlier(self) -> None:
+        """Before the first result replaces one of an earlier run, mark these as not whole."""
+        if self.about.standing == "over an earlier run":
+            self.about = replace(self.about, standing="at work")
+            self.about.write(self.run)
+
     def end(self, stopped: bool) -> None:
         """The results are written; the checkpoint of a run that was stopped is kept."""
         if stopped:
@@ -107,13 +112,6 @@ class Unfinished:
         """All scans are tracked: nothing goes on from the state."""
         for path in (self.files.state, self.files.tiles):
             path.unlink(missing_ok=True)
-
-
-def replace_earlier(run: Path) -> None:
-    """Before the first result replaces one of an earlier run, mark these as not whole."""
-    about = About.read(run)
-    if about is not None and about.standing == "over an earlier run":
-        replace(about, standing="at work").write(run)
 
 
 def _holds_results(run: Path) -> bool:

@@ -32,7 +32,7 @@ from lidarslam.run.resuming import WITHOUT_EFFECT
 from lidarslam.storage.about import About
 from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished, replace_earlier
+from lidarslam.storage.unfinished import Unfinished
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -94,7 +94,9 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
 def _replace_earlier(directory: RunDirectory, part: Path) -> None:
     """Before the results of a recording are replaced: those of the earlier merge are not whole either."""
     directory.before_change()
-    replace_earlier(part)
+    about = About.read(part)
+    if about is not None:
+        Unfinished(part, about).replace_earlier()
 
 
 def _on_common_voxels(config: Config, recordings: Sequence[Recording]) -> Config:
