@@ -44,7 +44,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 def scans(path: Path) -> None:
-    """All scans of a recording, twice: a bag's topics are found before they are read."""
+    """The description and all scans of a recording."""
     recording = open_recording(path, ReaderConfig())
     recording.describe()
     list(recording.scans(faults=Faults()))
@@ -73,37 +73,43 @@ TARGETS: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
+# Small whole files of text.
+TEXTS = {
+    "tum": "1.0 0 0 0 0 0 0 1\n1.1 1 0 0 0 0 0 1\n",
+    "yaml": "odometry: {method: learned}\nmapping:\n  method: loam\n",
+    "summary": '{"scans": 3, "length_m": 1.0, "warnings": []}',
+    "about": '{"description": {"merge": "all"}, "standing": "stopped", "resumed_after": [1]}',
+}
+RECORDINGS = {"mcap": write_mcap, "bag": write_rosbag1, "db3": write_rosbag2, "ply": write_ply_scans}
+
+
 def write_seeds(corpus: Path, name: str) -> None:
-    """A small whole file of each kind."""
+    """Small whole files of a kind."""
     rng = np.random.default_rng(0)
     times = np.linspace(0.0, 0.1, 40)
     sweeps = [Scan(rng.normal(size=(40, 3)), stamp, times) for stamp in (0.1, 0.2, 0.3)]
     simulated = [SimulatedScan(sweep, np.ones(40, dtype=np.float32)) for sweep in sweeps]
     rig = Rig("ouster", 0.1, lambda stamps: np.tile(np.eye(4), (len(stamps), 1, 1)), None)
+    seed = corpus / "seed-0"
+    if name in TEXTS:
+        seed.write_text(TEXTS[name])
+        return
     with tempfile.TemporaryDirectory() as folder:
-        made, writers = Path(folder) / "made", {"mcap": write_mcap, "bag": write_rosbag1, "db3": write_rosbag2}
-        if name == "pcd":
-            made.mkdir()
-            write_cloud(made / "0.pcd", PointCloud(sweeps[0].points, np.tile([0.0, 0.0, 1.0], (40, 1))))
-        elif name == "npy":
-            made.mkdir()
-            np.save(made / "0.npy", sweeps[0].points)
-        elif name in (*writers, "ply"):
-            writers.get(name, write_ply_scans)(made, simulated, rig)
+        made = Path(folder) / "made"
+        if name in RECORDINGS:
+            RECORDINGS[name](made, simulated, rig)
+            for number, path in enumerate(made.rglob(f"*.{name}")):
+                (corpus / f"seed-{number}").write_bytes(path.read_bytes())
         elif name == "message":
-            made.mkdir()
-            (made / "0.message").write_bytes(_message(Path(folder) / "bag", simulated, rig))
+            seed.write_bytes(_message(made, simulated, rig))
+        elif name == "npy":
+            with seed.open("wb") as file:
+                np.save(file, sweeps[0].points)
         else:
-            made.mkdir()
-            text = {
-                "tum": "1.0 0 0 0 0 0 0 1\n1.1 1 0 0 0 0 0 1\n",
-                "yaml": "odometry: {method: learned}\nmapping:\n  method: loam\n",
-                "summary": '{"scans": 3, "length_m": 1.0, "warnings": []}',
-                "about": '{"description": {"merge": "all"}, "standing": "stopped", "resumed_after": [1]}',
-            }[name]
-            (made / f"0.{name}").write_text(text)
-        for number, path in enumerate(made.rglob(f"*.{name}")):
-            (corpus / f"seed-{number}").write_bytes(path.read_bytes())
+            write_cloud(
+                cloud := Path(folder) / "0.pcd", PointCloud(sweeps[0].points, np.tile([0.0, 0.0, 1.0], (40, 1)))
+            )
+            seed.write_bytes(cloud.read_bytes())
 
 
 def _message(folder: Path, simulated: list[SimulatedScan], rig: Rig) -> bytes:

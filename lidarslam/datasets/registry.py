@@ -185,6 +185,6 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     recording = cast(Recording, import_module(READERS[name].module).open_recording(source, config))
     setting = config.elevation_correction_deg
     raised_deg = setting if isinstance(setting, float) else READERS[name].elevation_deg
-    if config.mounting == "upright" and not raised_deg:
+    if config.mounting == "upright" and not raised_deg and config.time_scale == 1.0:
         return recording
     return MountedRecording(recording, config.mounting, raised_deg, config.time_scale)

@@ -204,6 +204,15 @@ def test_point_times_are_inferred_from_the_first_cloud() -> None:
     np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
 
 
+def test_point_times_are_scaled_as_set() -> None:
+    raw = message_at(1000.5)
+    decoders = (CloudDecoder(ReaderConfig(time_scale=s), "sensor_msgs/msg/PointCloud2", Faults()) for s in (1.0, -0.5))
+    as_sent, scaled = (decoder.scan(raw, NOW) for decoder in decoders)
+    assert as_sent is not None
+    assert scaled is not None
+    np.testing.assert_array_equal(scaled.scan.time_offsets, -0.5 * as_sent.scan.time_offsets)
+
+
 def test_clouds_are_turned_as_set() -> None:
     """y, z, x of the upright axes are x, y, z of the recorded ones."""
     scans = []

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.registry import open_recording
 from lidarslam.run.summary.time_scale import time_scale, time_scale_warning
 
 STAMPS = 100.0 + 0.1 * np.arange(60)
@@ -64,3 +66,11 @@ def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: 
     warnings = [text for text in json.loads((out / "summary.json").read_text())["warnings"] if "points' times" in text]
     assert len(warnings) == (fault is not None)
     assert all(f"times are {fault}" in text for text in warnings)
+
+
+@pytest.mark.parametrize("mounting", ["auto", "upright", "left"])
+def test_the_scale_holds_for_any_mounting(walk: Path, mounting: str) -> None:
+    configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))
+    (recorded,), (scaled,) = (list(open_recording(walk, config).scans(stop=1)) for config in configs)
+    assert recorded.time_offsets is not None
+    np.testing.assert_array_equal(scaled.time_offsets, -0.5 * recorded.time_offsets)

@@ -106,8 +106,7 @@ class MountedRecording:
         return scans if is_as_recorded else map(self._upright, scans)
 
     def _upright(self, scan: Scan) -> Scan:
-        if self._time_scale != 1.0 and scan.time_offsets is not None:
-            scan = replace(scan, time_offsets=self._time_scale * scan.time_offsets)
+        scan = scan.with_times_scaled(self._time_scale)
         if self.raised_deg:
             scan = replace(scan, points=correct_elevation(scan.points, self.raised_deg))
         return turned(scan, self.T_upright_recorded)

@@ -15,7 +15,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
-from lidarslam.datasets.ros.bag_recovery import Connections, recover, require_tables
+from lidarslam.datasets.ros.bag_recovery import MCAP_MAGIC, Connections, recover, require_tables
 from lidarslam.datasets.ros.decompression import unpacked_message
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
@@ -27,7 +27,6 @@ _REPAIR = {
     ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
 }
 _METADATA = "metadata.yaml"
-_MCAP = b"\x89MCAP"
 # A file in the list of a rosbag2's.
 _LISTED = re.compile(r"\s*-\s+(\S+\.(?:db3|mcap)(?:\.zstd)?)\s*")
 
@@ -49,8 +48,6 @@ class BagFile:
         """
         if path.is_file() and not path.stat().st_size:
             raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
-        if path.suffix == ".bag" and path.is_file() and _begins_as_mcap(path):
-            raise InputError(f"{path}: is an MCAP file, by its first bytes; name it {path.with_suffix('.mcap').name}")
         self.path = path
         self.ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
         self._has_index = True
@@ -203,8 +200,7 @@ class BagFile:
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
-            if self.ros2:
-                _require_bounded(self.path)
+            (_require_bounded if self.ros2 else _require_rosbag1)(self.path)
             reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
         try:
@@ -240,9 +236,16 @@ class BagFile:
         return f"try `{command.format(self.path)}`, or copy the bag again"
 
 
-def _begins_as_mcap(path: Path) -> bool:
+def _require_rosbag1(path: Path) -> None:
+    """Refuse an MCAP file of another name.
+
+    Raises:
+        InputError: it is one.
+        OSError: the file cannot be read.
+    """
     with path.open("rb") as file:
-        return file.read(len(_MCAP)) == _MCAP
+        if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
+            raise InputError(f"{path}: is an MCAP file, by its first bytes; name it {path.with_suffix('.mcap').name}")
 
 
 def _last(messages: Iterator[BagMessage]) -> BagMessage | None:

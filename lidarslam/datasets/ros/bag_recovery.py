@@ -26,6 +26,8 @@ Connections = Mapping[int, tuple[str, str]]
 _LONGEST_RECORD = 1 << 30
 # Opcodes of MCAP.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+# A damaged database may hold anything for a name.
 _TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
 # Rows in a row that are passed over: a page has a hundred, and a damaged number of a row may be any.
 _MOST_DAMAGED = 1_000
@@ -123,7 +125,7 @@ class _Rosbag1Records(_Records):
 class _McapRecords(_Records):
     """Records of an opcode, a length and their content; chunks hold schemas, channels and messages."""
 
-    magic = b"\x89MCAP0\r\n"
+    magic = MCAP_MAGIC
 
     def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
         opcode, size = struct.unpack("<BQ", read_exact(file, 9))
@@ -187,10 +189,7 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
     with closing(_connected(path)) as database:
         # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
         database.execute("PRAGMA writable_schema=ON")
-        rows = database.execute(
-            "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
-        )
-        topics = {number: (name, message_type) for number, name, message_type in rows}
+        topics = {number: (name, kind) for number, name, kind in database.execute(_TOPICS)}
         # Pages that are missing at the end (sqlite.org/fileformat2.html, 1.3) SQLite may take for zeros.
         page, pages = struct.unpack_from(">H10xI", header, 16)
         is_cut = path.stat().st_size < pages * (page if page > 1 else 65536)

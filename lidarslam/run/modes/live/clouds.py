@@ -75,6 +75,7 @@ class CloudDecoder:
         model = self._point_time
         offsets = None if model is None else field_offsets(cloud, model, stamp)
         scan = timed_scan(cloud, offsets, stamp, model is not None, self._faults)
+        scan = scan.with_times_scaled(self._config.time_scale)
         return LiveScan(turned(scan, self.T_upright_recorded), stamp_ns, frame_id)
 
     def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
