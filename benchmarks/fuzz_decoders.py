@@ -53,7 +53,7 @@ def scans(path: Path) -> None:
 def live(path: Path) -> None:
     """The same message at two times."""
     decoder, raw = CloudDecoder(ReaderConfig(), CLOUD, Faults()), path.read_bytes()
-    for published_ns in (10**18, 10**18 + 10**8):
+    for published_ns in (2 * 10**18, 2 * 10**18 + 10**8):
         decoder.scan(raw, published_ns)
 
 
