@@ -19,6 +19,7 @@ _SINGULAR = (
     ("scans are", "scan is"),
     ("scans have", "scan has"),
     ("scans look", "scan looks"),
+    ("scans turn", "scan turns"),
     ("places in the bag were", "place in the bag was"),
     ("they co", "it co"),
     ("it come", "it comes"),

@@ -11,6 +11,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting.recording import recorded_axes
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.stamp_order import in_stamp_order
 
@@ -31,6 +32,8 @@ _FEW_POINTS = 50
 _SAMPLE = 4096
 # No LiDAR makes a thousand scans a second.
 _LEAST_INTERVAL_S = 0.999e-3
+# A whole turn of one laser, degrees, and how much its elevation may vary, which that of a scanning mirror does more.
+_TURN_DEG, _SAME_ELEVATION_DEG = (330.0, 390.0), 0.5
 
 _THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most so many, one in a cell of 2 cm"
 _TOO_FAST = (
@@ -40,6 +43,10 @@ _NOT_METRES = "scans look like centimetres or millimetres, where metres are expe
 _AT_ONCE = (
     "scans have times of their points that span less than a millisecond: motion during a sweep is not compensated; if"
     " the sensor turns, the times are wrong or in another unit (reader.time_unit, reader.time_reference=azimuth)"
+)
+_COUNTER_CLOCKWISE = (
+    "scans turn counter-clockwise as seen from above, as few sensors do unless upside down: otherwise their axes are"
+    " mirrored, and so is the map, or the times of their points run backwards (reader.time_scale=-1)"
 )
 _UNTIMED = "scans have points without a time, which were given one between those of their neighbours"
 _REPEATED = "scans were left out: they have the points of the scan before, as from a driver that hangs"
@@ -65,6 +72,8 @@ def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Sca
         InputError: the recording is damaged where no scan can be left out, or its clock was set back.
     """
     scans = recording.scans(chosen.start, chosen.stop, chosen.step, faults)
+    if np.array_equal(recorded_axes(recording)[1], np.eye(4)):
+        scans = _with_turns_checked(scans, faults)
     ordered = in_stamp_order((look_at(scan, faults) for scan in scans), lambda scan: scan.stamp, faults)
     return _with_paces_checked(_without_repeats(ordered, faults), faults)
 
@@ -91,6 +100,26 @@ def _with_paces_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]
             faults.note(_TOO_FAST, f"{1e6 * (scan.stamp - latest):.3g} microseconds at {scan.stamp:.9f}")
         latest = scan.stamp
         yield scan
+
+
+def _with_turns_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
+    for scan in scans:
+        if _TURN_DEG[0] < (turned_deg := _turned_deg(scan)) < _TURN_DEG[1]:
+            faults.note(_COUNTER_CLOCKWISE, f"by {turned_deg:.0f} degrees at {scan.stamp:.9f}")
+        yield scan
+
+
+def _turned_deg(scan: Scan) -> float:
+    """How far one laser of a spinning sensor turns about z within a sweep, counter-clockwise; 0 where unknown."""
+    if scan.rings is None or scan.time_offsets is None or not len(scan):
+        return 0.0
+    ring = np.flatnonzero(scan.rings == scan.rings[len(scan) // 2])
+    points = scan.points[ring[np.argsort(scan.time_offsets[ring], kind="stable")]]
+    elevations = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    if len(points) < _FEW_POINTS or np.degrees(elevations.std()) > _SAME_ELEVATION_DEG:
+        return 0.0
+    steps = np.diff(np.arctan2(points[:, 1], points[:, 0]))
+    return float(np.degrees(((steps + np.pi) % (2.0 * np.pi) - np.pi).sum()))
 
 
 def look_at(scan: Scan, faults: Faults) -> Scan:

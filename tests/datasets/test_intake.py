@@ -1,11 +1,14 @@
 """What is seen of every scan before it is worked on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at, take_in
+from lidarslam.datasets.mounting.recording import MountedRecording
 
 
 def seen(points, **fields):
@@ -125,3 +128,52 @@ def test_a_driver_that_hangs_repeats_a_scan_which_counts_once(rng):
         "2 scans were left out: they have the points of the scan before, as from a driver that hangs;"
         " the first: at 0.200000000",
     )
+
+
+def spinning(times_sign=1.0, mirror=1.0):
+    """A sweep of a VLP-16 in a round room, clockwise as seen from above, with the ground 1 m below the sensor."""
+    azimuths, elevations = -np.deg2rad(np.arange(0.0, 360.0, 0.2)), np.deg2rad(np.arange(-15.0, 16.0, 2.0))
+    azimuth, elevation = (grid.ravel() for grid in np.meshgrid(azimuths, elevations, indexing="ij"))
+    directions = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=1)
+    reach = np.minimum(8.0, 1.0 / np.maximum(-directions[:, 2], 1e-9))
+    offsets = times_sign * np.linspace(0.0, 0.1, len(azimuth))
+    points = directions * reach[:, None] * [1.0, mirror, 1.0]
+    return Scan(points, 1.0, time_offsets=offsets, rings=np.tile(np.arange(16, dtype=np.int32), len(azimuths)))
+
+
+class OneScan:
+    def __init__(self, scan):
+        self.scan = scan
+
+    def __len__(self):
+        return 1
+
+    def scans(self, *_, **__):
+        return iter([self.scan])
+
+
+@pytest.mark.parametrize(
+    ("scan", "told"),
+    [(spinning(), False), (spinning(mirror=-1.0), True), (spinning(times_sign=-1.0), True)],
+    ids=["clockwise", "mirrored", "reversed"],
+)
+def test_mirrored_axes_and_reversed_times_turn_the_other_way(scan, told):
+    faults = Faults()
+    list(take_in(OneScan(scan), range(1), faults))
+    assert len(faults.warnings()) == told
+    if told:
+        assert faults.warnings()[0].startswith("1 scan turns counter-clockwise as seen from above")
+
+
+def test_a_sensor_upside_down_turns_the_other_way_and_is_right():
+    faults = Faults()
+    list(take_in(MountedRecording(OneScan(spinning()), "upside-down"), range(1), faults))
+    assert faults.warnings() == ()
+
+
+def test_the_strokes_of_a_scanning_mirror_are_no_turn():
+    scan = spinning(mirror=-1.0)
+    bent = scan.points + [0.0, 0.0, 2.0] * np.sin(9.0 * np.arctan2(scan.points[:, 1], scan.points[:, 0]))[:, None]
+    faults = Faults()
+    list(take_in(OneScan(replace(scan, points=bent)), range(1), faults))
+    assert faults.warnings() == ()
