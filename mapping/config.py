@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
@@ -29,12 +29,6 @@ class TrackingConfig(BaseModel):
     def _lost_is_worse_than_degraded(self) -> Self:
         require_lost_worse(self.lost_below, self.degraded_below)
         return self
-
-
-class _EarlierSwitch(BaseModel):
-    """The setting that `method` replaces; configurations of earlier versions have it."""
-
-    enabled: bool
 
 
 class MappingConfig(BaseModel):
@@ -88,18 +82,11 @@ class MappingConfig(BaseModel):
         """Whether scans are registered to a map."""
         return self.method != "off"
 
-    @model_validator(mode="before")
+    @field_validator("method", mode="before")
     @classmethod
-    def _takes_earlier_names(cls, values: Any) -> Any:
-        """`enabled: false` is the method off, unless a method is given; so is the false that YAML makes of off."""
-        if not isinstance(values, dict):
-            return values
-        values = dict(values)
-        if values.get("method") is False:
-            values["method"] = "off"
-        if "enabled" in values and not _EarlierSwitch(enabled=values.pop("enabled")).enabled:
-            values.setdefault("method", "off")
-        return values
+    def _off_is_a_word(cls, value: Any) -> Any:
+        """YAML makes false of off."""
+        return "off" if value is False else value
 
     @model_validator(mode="after")
     def _ranges_leave_points(self) -> Self:

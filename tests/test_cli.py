@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -177,8 +176,6 @@ def test_mistakes_get_one_line(
         (["--mapping", "off"], "off"),
         (["--no-mapping"], "off"),
         (["--no-mapping", "--mapping", "off"], "off"),
-        (["--set", "mapping.enabled=false"], "off"),
-        (["--set", "mapping.enabled=false", "--mapping"], "surfels"),
         (["--set", "mapping.method=loam"], "loam"),
         (["--set", "mapping.method=loam", "--no-mapping"], "off"),
     ],
@@ -192,17 +189,6 @@ def test_the_command_line_offers_the_mappings_that_there_are() -> None:
     (option,) = [one for one in run.params if one.name == "mapping"]
     assert isinstance(option.type, click.Choice)
     assert tuple(option.type.choices) == get_args(MappingName)
-
-
-def test_a_run_of_an_earlier_version_is_recognised_as_finished(recording: Path, tmp_path: Path) -> None:
-    command = ("run", recording, "--out", tmp_path / "run", "--stop", 2)
-    assert lidarslam(*command).exit_code == 0
-    config = tmp_path / "run" / "config.yaml"
-    text = re.sub(r"method: surfels.*", "enabled: true", config.read_text())
-    assert "surfels " not in re.sub(r"#.*", "", text)
-    config.write_text(text)
-    assert "is finished already" in lidarslam(*command, "--resume").stdout
-    assert "holds another finished run" in lidarslam(*command, "--resume", "--mapping", "off").stderr
 
 
 def test_an_earlier_run_is_replaced_only_when_asked(recording: Path, tmp_path: Path) -> None:

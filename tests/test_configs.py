@@ -45,25 +45,11 @@ def test_settings_win_over_the_file(tmp_path: Path) -> None:
         ("mapping: {method: loam}", [], "loam"),
         ("mapping: {method: off}", [], "off"),
         ("mapping: {method: 'off'}", [], "off"),
-        ("mapping: {enabled: true}", [], "surfels"),
-        ("mapping: {enabled: false}", [], "off"),
-        ("mapping: {enabled: 'no'}", [], "off"),
-        ("mapping: {enabled: false, method: loam}", [], "loam"),
-        ("mapping: {enabled: true, method: off}", [], "off"),
-        ("", ["mapping.enabled=false"], "off"),
         ("", ["mapping.method=off"], "off"),
-        ("", ["mapping.enabled=false", "mapping.method=loam"], "loam"),
-        ("", ["mapping.method=loam", "mapping.enabled=false"], "loam"),
-        ("mapping: {enabled: false}", ["mapping.method=loam"], "loam"),
-        ("mapping: {enabled: false}", ["mapping.enabled=true"], "surfels"),
-        ("mapping: {method: loam}", ["mapping.enabled=false"], "off"),
-        ("mapping: {method: loam}", ["mapping.enabled=true"], "loam"),
-        ("mapping: {method: off}", ["mapping.enabled=true"], "surfels"),
+        ("mapping: {method: off}", ["mapping.method=loam"], "loam"),
     ],
 )
-def test_the_switch_of_earlier_versions_gives_way_to_a_method_beside_it(
-    tmp_path: Path, text: str, settings: list[str], method: str
-) -> None:
+def test_a_mapping_is_named_and_off_is_a_word(tmp_path: Path, text: str, settings: list[str], method: str) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(text)
     mapping = load_config(file, settings).mapping
@@ -117,8 +103,6 @@ def test_the_readers_options_stay_text(text: str) -> None:
             r"kiss_icp: min_range_m=6 must be less",
         ),
         (["mapping.tracking.lost_below=0.8"], r"tracking: lost_below=0\.8 must not exceed degraded_below=0\.6,"),
-        (["mapping.enabled=maybe"], r"mapping\.enabled='maybe': input should be a valid boolean"),
-        (["mapping.enabled=3", "mapping.method=loam"], r"mapping\.enabled=3: input should be a valid boolean"),
         (["mapping.method=icp"], r"mapping\.method='icp': input should be 'surfels', 'loam' or 'off'"),
         (["mapping.method=true"], r"mapping\.method=True: input should be 'surfels', 'loam' or 'off'"),
         (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),

@@ -24,9 +24,6 @@ from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, PoseGraphCo
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.storage.directory import RUN_SECTION
 
-# The switch of earlier versions that mapping.method replaces.
-_MAPPING_SWITCH = "mapping.enabled"
-
 # Sections of config.yaml that are not settings: what was run, and what was trained on.
 SOURCES_SECTION = "trained_on"
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
@@ -79,13 +76,10 @@ class Config(BaseModel):
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """The defaults, changed by a YAML file and then by settings such as `odometry.kiss_icp.voxel_size_m=0.5`.
 
-    Among the settings, `mapping.enabled` of earlier versions overrules the file's `mapping.method`, not one beside it.
-
     Raises:
         ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
     """
-    switches_first = sorted(settings, key=lambda one: not _is_switch(one.partition("=")[0]))
-    return load_model(Config, path, switches_first, "odometry.kiss_icp.voxel_size_m=0.5")
+    return load_model(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
 
 
 def make_config(given: Config | PathLike[str] | str | Mapping[str, Any] | None) -> Config:
@@ -175,15 +169,11 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
         if not error.is_syntax:
             raise ConfigError(f"--set {_short(setting)}: {error}") from error
         value = text
-    tree = _put(tree, dotted.strip(), value, f"--set {_short(setting)}")
-    if _is_switch(dotted) and value in (False, "off"):
-        tree["method"] = "off"
-    elif _is_switch(dotted) and tree.get("method") in (False, "off"):
-        del tree["method"]
+    _put(tree, dotted.strip(), value, f"--set {_short(setting)}")
 
 
-def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> dict[str, Any]:
-    """Put a value into the tree, a section beside what is there; the section that holds it."""
+def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> None:
+    """Put a value into the tree, a section beside what is there."""
     *sections, last = dotted.split(".")
     for key in sections:
         branch = tree.setdefault(key, {})
@@ -196,11 +186,6 @@ def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> dict[str, 
             _put(section, str(key), part, what)
     else:
         tree[last] = value
-    return tree
-
-
-def _is_switch(dotted: str) -> bool:
-    return dotted.strip() == _MAPPING_SWITCH
 
 
 def _origin(path: Path | None, settings: Sequence[str]) -> str:

@@ -15,8 +15,8 @@ def test_a_plain_name_sets_the_odometry_and_switches_mapping_off() -> None:
 
 
 def test_map_overrules_a_configuration_either_way() -> None:
-    assert load_config(None, ["mapping.enabled=false", *parse_method("kiss-icp+map").settings]).mapping.enabled
-    assert not load_config(None, ["mapping.enabled=true", *parse_method("kiss-icp").settings]).mapping.enabled
+    assert load_config(None, ["mapping.method=off", *parse_method("kiss-icp+map").settings]).mapping.enabled
+    assert not load_config(None, ["mapping.method=loam", *parse_method("kiss-icp").settings]).mapping.enabled
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def with_run(result: MethodResult, run: Path) -> MethodResult:
             map_entropy=summary["map_entropy"],
             ms_per_scan_median=ms.pop("total"),
             ms_per_scan_p95=summary["ms_per_scan"]["total"]["p95"],
-            ms_per_scan_p99=summary["ms_per_scan"]["total"].get("p99"),  # absent from runs of earlier versions
+            ms_per_scan_p99=summary["ms_per_scan"]["total"]["p99"],
             stage_ms=ms,
         )
     except (KeyError, TypeError, AttributeError) as error:
