@@ -74,7 +74,7 @@ def edit_map(sources: Sequence[Path], out: Path, asked: MapEdits) -> Iterator[st
             how = (
                 "from everywhere" if fit.method == GLOBAL else f"moved by {fit.moved_m:.2f} m, {fit.moved_deg:.2f} deg"
             )
-            yield f"{source}: registered, {how}; {100.0 * fit.fitness:.0f} % of it within {fit.inlier_m:g} m"
+            yield f"{source}: registered, {how}; {100.0 * fit.fitness:.0f} % of it within {fit.inlier_m:.2f} m"
         maps[number] = maps[number].moved(T)
     cloud = edits.joined([one.cloud for one in maps])
     whole = _Map(cloud, np.concatenate([one.positions for one in maps]))

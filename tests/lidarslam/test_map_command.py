@@ -143,7 +143,7 @@ def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
     cloud, _ = edited(tmp_path / "given.ply", *sources, "--transform", tmp_path / "T.txt")
     np.testing.assert_allclose(cloud.points, expected, atol=1e-5)
     cloud, said = edited(tmp_path / "registered.ply", *sources, "--register")
-    assert "other.ply: registered, from everywhere; 100 % of it within 0.2 m" in said
+    assert "other.ply: registered, from everywhere; 100 % of it within 0.20 m" in said
     np.testing.assert_allclose(cloud.points, expected, atol=0.03)
     cloud, _ = edited(tmp_path / "plain.ply", *sources)
     np.testing.assert_allclose(

@@ -12,10 +12,10 @@ from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.normals import estimate_normals
 
-# Least z of the normals of points that may be ground.
-_UPWARDS = float(np.cos(np.deg2rad(45.0)))
-# Distance of the ground's points from its plane, and triples of points that RANSAC tries.
-_GROUND_M, _TRIALS = 0.1, 2000
+# Angles about the present direction within which normals are averaged to the next.
+_NARROWING = np.deg2rad([45.0, 30.0, 20.0, 10.0, 5.0, 5.0])
+# Distance of the ground's points from its plane, and how often this is fitted.
+_GROUND_M, _REFITS = 0.1, 10
 _FEWEST = 100
 
 
@@ -70,22 +70,39 @@ def _chosen(cloud: PointCloud, indices: Sequence[int]) -> PointCloud:
 
 
 def ground_plane(cloud: PointCloud) -> GroundPlane | None:
-    """The largest plane through points that face upwards, by RANSAC; None if there is none within 45 degrees of z."""
-    import open3d as o3d
+    """The level with the most points that face upwards; None if few do, within 45 degrees of z.
 
-    heights = cloud.normals[:, 2]
-    if not np.ptp(cloud.normals, axis=0).any():  # a file without normals
-        heights = np.abs(estimate_normals(cloud.points)[:, 2])
-    points = cloud.points[heights > _UPWARDS]
+    The most frequent normal comes first, for which the treads of stairs are level, then the plane of the points there.
+    """
+    normals = cloud.normals
+    if len(cloud) and not np.ptp(normals, axis=0).any():  # a file without normals
+        normals = estimate_normals(cloud.points)
+        normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
+    facing = normals[:, 2] > np.cos(_NARROWING[0])
+    points, normals = cloud.points[facing], normals[facing]
     if len(points) < _FEWEST:
         return None
-    o3d.utility.random.seed(0)
-    given = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    on_plane = points[np.asarray(given.segment_plane(_GROUND_M, 3, _TRIALS)[1])]
-    middle = on_plane.mean(axis=0)
-    up = np.linalg.svd(on_plane - middle, full_matrices=False)[2][2]
-    up = up * np.sign(up[2])
-    return GroundPlane(up, float(up @ middle), len(on_plane) / len(points)) if up[2] > _UPWARDS else None
+    up, alike = np.array([0.0, 0.0, 1.0]), np.ones(len(points), dtype=np.bool_)
+    for angle in _NARROWING:
+        chosen = normals @ up > np.cos(angle)
+        if chosen.sum() < _FEWEST:
+            break
+        alike = chosen
+        up = normals[alike].mean(axis=0)
+        up /= np.linalg.norm(up)
+    level = points[alike]
+    bins = np.floor(level @ up / _GROUND_M).astype(np.intp)
+    height_m = _GROUND_M * (float(bins.min() + np.bincount(bins - bins.min()).argmax()) + 0.5)
+    for _ in range(_REFITS):
+        ground = level[np.abs(level @ up - height_m) < _GROUND_M]
+        if len(ground) < _FEWEST:
+            return None
+        middle = ground.mean(axis=0)
+        up = np.linalg.svd(ground - middle, full_matrices=False)[2][2]
+        up *= np.sign(up[2])
+        height_m = float(up @ middle)
+    share = float(np.mean(np.abs(points @ up - height_m) < _GROUND_M))
+    return GroundPlane(up, height_m, share) if up[2] > np.cos(_NARROWING[0]) else None
 
 
 def levelling(up: FloatArray) -> FloatArray:
