@@ -18,6 +18,7 @@ from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
 from lidarslam.commands.exports.geo import export_geo
 from lidarslam.commands.exports.grid import export_grid
+from lidarslam.commands.exports.map import edit
 from lidarslam.commands.exports.mesh import export_mesh
 from lidarslam.commands.live import live
 from lidarslam.commands.localise import localise
@@ -141,6 +142,7 @@ for _command in (
     evaluate,
     view,
     compare,
+    edit,
     export_bag,
     export_grid,
     export_mesh,

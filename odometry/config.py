@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
+from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.limits import require_range_left
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
@@ -84,6 +85,16 @@ class OdometryConfig(BaseModel):
     def uses_imu(self) -> bool:
         """Whether the recording needs an IMU."""
         return self.method in ("imu", "learned+imu")
+
+    @property
+    def T_recorded_imu(self) -> FloatArray | None:
+        """(4, 4) in the LiDAR's recorded axes, as given; None where it is not."""
+        from scipy.spatial.transform import Rotation  # takes a while to load
+
+        if self.imu_rotation_deg is None:
+            return None
+        R = Rotation.from_euler("xyz", self.imu_rotation_deg, degrees=True).as_matrix()
+        return make_transform(R, self.imu_position_m)
 
 
 class ImageConfig(BaseModel):

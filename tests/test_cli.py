@@ -129,6 +129,23 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
             1,
             "timestamps.txt: is no safetensors file; expected weights",
         ),
+        (["run", "{recording}", "--out", "{out}", "--loop", "2", "2"], 2, "take two scans, not 2 twice"),
+        (["run", "{recording}", "--out", "{out}", "--loop", "-1", "2"], 2, "-1 is not in the range x>=0"),
+        (
+            ["run", "{recording}", "--out", "{out}", "--no-loop", "1", "5"],
+            1,
+            "--no-loop 1 5: the run has 5 scans, from 0",
+        ),
+        (
+            ["run", "{recording}", "--out", "{out}", "--loop", "1", "4", "--no-loop", "4", "1"],
+            2,
+            "exclude one another",
+        ),
+        (
+            ["run", "{recording}", "--out", "{out}", "--loop", "1", "4", "--no-pose-graph"],
+            2,
+            "leave --no-pose-graph out",
+        ),
         (["run", "{recording}", "--out", "{out}", "--start", "9"], 1, "none of its 5 scans is left"),
         (["run", "{recording}", "--out", "{out}", "--set", "odometry.kiss=1"], 1, "did you mean kiss_icp?"),
         (

@@ -9,6 +9,7 @@ import click
 from lidarslam.commands.shared.options import (
     FILE,
     GNSS,
+    LOOPS,
     OVERWRITE,
     POSE_GRAPH,
     REPORT,
@@ -24,6 +25,7 @@ from lidarslam.commands.shared.options import (
     reader_options,
     scan_options,
     take_config,
+    take_loops,
     take_map_formats,
 )
 from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
@@ -45,6 +47,7 @@ from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, s
 @mapping_options
 @POSE_GRAPH
 @GNSS
+@LOOPS
 @scan_options
 @RERUN
 @map_options
@@ -70,8 +73,9 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
             from lidarslam.storage.directory import RERUN
 
             config, map_formats = take_config(options, source), take_map_formats(options)
+            given = take_loops(options)
             out = out or _default_out(source, config.reader.sequence, options["resume"])
-            request = RunRequest(source, out, config, map_formats=map_formats, **options)
+            request = RunRequest(source, out, config, given=given, map_formats=map_formats, **options)
             if request.resume and (lost := lost_when_finished(request)) is not None:
                 say(f"{out}: is finished already")
                 ctx.exit(EXIT_LOST if lost else 0)

@@ -12,7 +12,7 @@ from lidarslam.mapping.global_map.products.mesh import Mesh, reconstruct
 from lidarslam.storage.finished_run import load_map
 from lidarslam.storage.summary_file import read_summary
 
-SUFFIXES = (".ply", ".obj", ".glb")
+SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 _DEFAULT_CELL_M = 0.1
 
 

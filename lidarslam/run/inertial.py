@@ -19,7 +19,6 @@ from lidarslam.datasets.mounting.rotation import transform_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.odometry.config import OdometryConfig
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.inertial.comparison import Comparison
@@ -79,7 +78,7 @@ def open_inertial(
     if (wrong := no_gravity(samples)) is not None:
         raise InputError(f"{recording.name}: {wrong}; correct the IMU's data, or {_INSTEAD}")
     T_lidar_imu = samples.T_lidar_imu
-    if (T_recorded_imu := given_extrinsics(config.odometry)) is not None:
+    if (T_recorded_imu := config.odometry.T_recorded_imu) is not None:
         T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
     poses = _Poses(config, recording, chosen)
     lever_sigma_m = KNOWN_LEVER_M
@@ -88,16 +87,6 @@ def open_inertial(
         T_lidar_imu, lever_sigma_m = _found(poses, recording.name, samples), UNKNOWN_LEVER_M
     logger.info("comparing the IMU with the first scans")
     return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn), lever_sigma_m)
-
-
-def given_extrinsics(config: OdometryConfig) -> FloatArray | None:
-    """T_recorded_imu (4, 4) of the configuration, in the LiDAR's recorded axes; None where it has none."""
-    from scipy.spatial.transform import Rotation
-
-    if config.imu_rotation_deg is None:
-        return None
-    R = Rotation.from_euler("xyz", config.imu_rotation_deg, degrees=True).as_matrix()
-    return make_transform(np.asarray(R, dtype=np.float64), np.array(config.imu_position_m))
 
 
 def make_imu_stream(
@@ -114,7 +103,7 @@ def make_imu_stream(
         return None
     from lidarslam.pipeline.imu_stream import ImuStream
 
-    if (T_recorded_imu := given_extrinsics(config.odometry)) is not None:
+    if (T_recorded_imu := config.odometry.T_recorded_imu) is not None:
         T_lidar_imu = transform_of(config.reader.mounting) @ T_recorded_imu
     return ImuStream(T_lidar_imu, warn)
 

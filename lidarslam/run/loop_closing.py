@@ -1,7 +1,7 @@
 """The pose graph of a run: begun with it, and in the end trajectory and map corrected by it."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state.stateful import Saved
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.loops.given import GivenLoops
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.viewer.viewer import Viewer
 
@@ -43,7 +44,7 @@ class LoopReport:
             "second_scan": self.scans[1],
             "accepted": self.accepted,
             "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
-            "found_by": "appearance" if closure.by_appearance else "nearby",
+            "found_by": "given" if closure.given else "appearance" if closure.by_appearance else "nearby",
             "overlap": round(closure.overlap, 4),
             "residual_m": round(closure.residual_m, 4) if np.isfinite(closure.residual_m) else None,
             "inlier_ratio": round(closure.inlier_ratio, 4),
@@ -69,9 +70,15 @@ class GraphOutcome:
 
 
 def begin_graph(
-    config: Config, directory: Path | None = None, file: Path | None = None, takes_gnss: bool = False
+    config: Config,
+    directory: Path | None = None,
+    file: Path | None = None,
+    takes_gnss: bool = False,
+    given: GivenLoops | None = None,
 ) -> "SlamGraph | None":
     """A pose graph, when the configuration asks for one; its submaps lie in the directory, or in the file.
+
+    Loop closures may be given or forbidden.
 
     Raises:
         ConfigError: it asks for GNSS positions where none are taken.
@@ -83,16 +90,16 @@ def begin_graph(
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
     local_radius_m = config.mapping.radius_m if config.mapping.enabled else 0.0
-    return SlamGraph(config.pose_graph, directory, file, local_radius_m)
+    return SlamGraph(config.pose_graph, directory, file, local_radius_m, given)
 
 
-def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph | None":
+def restore_graph(config: Config, saved: Saved, file: Path, given: GivenLoops | None = None) -> "SlamGraph | None":
     """A pose graph with a state, whose submaps lie in the file.
 
     Raises:
         InputError: one of them is damaged.
     """
-    graph = begin_graph(config, file=file, takes_gnss=True)
+    graph = begin_graph(config, file=file, takes_gnss=True, given=given)
     if graph is not None:
         graph.restore(saved)
     return graph
@@ -114,10 +121,22 @@ def close_loops(
     logger.info("optimising the pose graph")
     result = graph.finish() if track is None else _placed(graph, log, track)
     closed = _corrected(graph, result, global_map, log)
+    for warning in _not_closed(graph, () if closed is None else closed.loops, len(log)):
+        log.warn(warning)
     if closed is not None:
         pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
     return closed
+
+
+def _not_closed(graph: "SlamGraph", loops: Sequence[LoopReport], scans: int) -> Iterator[str]:
+    """Why loop closures that were given are not in the graph."""
+    tried = {loop.closure.given: loop for loop in loops}
+    for first, second in graph.given.closed:
+        loop = tried.get((first, second))
+        if loop is None or not loop.accepted:
+            untried = f"there are only {scans} scans" if second >= scans else "no keyframe lies between the scans"
+            yield f"--loop {first} {second} was not closed: {untried if loop is None else loop.closure.reason}"
 
 
 def _placed(graph: "SlamGraph", log: ScanLog, track: "ProjectedTrack") -> "Corrected | None":

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.text.plain_text import count
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.mapping.config import MapFormat
+from lidarslam.mapping.loops.given import GivenLoops
 from lidarslam.viewer.viewer import RerunMode
 
 logger = logging.getLogger(__name__)
@@ -33,6 +34,7 @@ class RunRequest:
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
     resumable: bool = True  # whether checkpoints are saved
+    given: GivenLoops = field(default_factory=GivenLoops)  # loop closures by hand
     report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
@@ -56,6 +58,7 @@ def log_choices(request: RunRequest, scans: range, recorded: int) -> None:
 
 def describe_run(request: RunRequest) -> dict[str, Any]:
     """The section of config.yaml about what was run."""
+    given = {"loops": request.given.closed, "no_loops": request.given.forbidden}
     return {
         "version": version("lidarslam"),
         "source": str(resolved(request.source)),
@@ -63,4 +66,5 @@ def describe_run(request: RunRequest) -> dict[str, Any]:
         "stop": request.stop,
         "step": request.step,
         "prior": None if request.prior is None else str(request.prior.resolve()),
+        **{name: [list(pair) for pair in pairs] for name, pairs in given.items() if pairs},
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config, ViewerConfig
-from lidarslam.core.errors import ConfigError, OutputError
+from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.recording import Recording
@@ -63,7 +63,7 @@ def execute(
     config = request.config
     phase("opening the recording")
     recording = open_recording(request.source, config.reader)
-    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
+    chosen = _choose(request, recording)
     log_choices(request, chosen, len(recording))
     imu_samples(config, recording)
     track_of_gnss = gnss_track(request)
@@ -78,7 +78,7 @@ def execute(
             if request.resumable:
                 description = describe_computed(request, recording)
                 unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
-            log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+            log, graph = ScanLog(), _open_graph(request, directory, unfinished)
             if config.mapping.budget_ms is not None:
                 log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
             if graph is not None:
@@ -116,18 +116,34 @@ def _draw_report(request: RunRequest, outcome: RunOutcome, phase: Callable[[str]
     leave_report(request.out, Accuracy(outcome.metrics))
 
 
-def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished | None) -> "SlamGraph | None":
+def _choose(request: RunRequest, recording: Recording) -> range:
+    """The scans of a run.
+
+    Raises:
+        InputError: there are none, or not those of a loop closure that is given or forbidden.
+    """
+    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
+    scans = len(chosen)
+    for option, pairs in (("--loop", request.given.closed), ("--no-loop", request.given.forbidden)):
+        for first, second in pairs:
+            if second >= scans:
+                raise InputError(f"{option} {first} {second}: the run has {scans} scans, from 0 to {scans - 1}")
+    return chosen
+
+
+def _open_graph(request: RunRequest, directory: RunDirectory, unfinished: Unfinished | None) -> "SlamGraph | None":
     """The pose graph, if there is one: new, or as it was saved.
 
     Raises:
         InputError: the checkpoint is damaged.
     """
+    config, given = request.config, request.given
     if unfinished is None:
-        return begin_graph(config, directory.path, takes_gnss=True)
-    saved = unfinished.saved
+        return begin_graph(config, directory.path, takes_gnss=True, given=given)
+    saved, file = unfinished.saved, unfinished.files.submaps
     if saved is None:
-        return begin_graph(config, file=unfinished.files.submaps, takes_gnss=True)
-    return restore_graph(config, saved.part("graph"), unfinished.files.submaps) if saved.has("graph") else None
+        return begin_graph(config, file=file, takes_gnss=True, given=given)
+    return restore_graph(config, saved.part("graph"), file, given) if saved.has("graph") else None
 
 
 @contextmanager

@@ -32,6 +32,8 @@ _ENOUGH_POINTS = 24_000
 # Farther points are narrower than a pixel of so many voxels; near ones count all the same.
 _PIXEL_OF_VOXEL = 3.0
 _LEAST_REACH_M = 5.0
+# Views that see through a dynamic point, at least.
+_LEAST_THROUGH = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +126,10 @@ class Views(Stateful):
         return PlacedViews(images, np.tile(self._grid, (len(images), 1)), T_world_lidar[np.array(self._numbers)[known]])
 
 
-def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) -> NDArray[np.bool_]:
-    """(M,) which points (M, 3) of a map, in the world, are dynamic.
+def seen_through(
+    points: FloatArray, views: PlacedViews, voxel_size_m: float, least_through: int = _LEAST_THROUGH
+) -> NDArray[np.bool_]:
+    """(M,) which points (M, 3) of a map, in the world, are dynamic: at least so many images see through them.
 
     An image with gaps between its beams counts half. Where more than 64 images see a point, as many are asked, from the
     whole time.
@@ -139,7 +143,7 @@ def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) ->
         order = order[np.einsum("ij,ij->i", off, off) <= (reach_m + voxel_size_m) ** 2]
     T_lidar_world = np.ascontiguousarray(inverse(views.T_world_lidar[order]))
     images, grids = views.images[order], views.grids[order]
-    judge(np.ascontiguousarray(points), T_lidar_world, images, grids, reach_m, voxel_size_m, moved)
+    judge(np.ascontiguousarray(points), T_lidar_world, images, grids, reach_m, voxel_size_m, least_through, moved)
     return moved
 
 

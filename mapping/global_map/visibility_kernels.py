@@ -21,9 +21,8 @@ _LEAST_RETURNS = 6
 # A return is at a point's range within this margin and a voxel: noise, errors of poses, and a surface seen at a slant.
 _MARGIN_M = 0.1
 _MARGIN_OF_RANGE = 0.01
-# A dynamic point is seen through by so many views, and by at least as many as support it. Of lasers with gaps between
-# them most pass a thin board, which single ones meet: such views count half.
-_LEAST_THROUGH = 3
+# A dynamic point is seen through by at least as many views as support it. Of lasers with gaps between them most pass a
+# thin board, which single ones meet: such views count half.
 _WITH_GAPS = 0.5
 # Half the height of a row: views whose beams pass this far from its centre have no gaps.
 NO_GAPS = 0.5
@@ -59,6 +58,7 @@ def judge(
     grids: FloatArray,
     reach_m: float,
     voxel_size_m: float,
+    least_through: int,
     moved: NDArray[np.bool_],
 ) -> None:
     """Classify the points (M, 3): dynamic or static.
@@ -69,6 +69,7 @@ def judge(
         images, grids: (V, rows, columns) and (V, 3), the views, in random order.
         reach_m: farther points get no vote.
         voxel_size_m: of the map that the points are of.
+        least_through: of a dynamic point, how many views see through it at least.
         moved: (M,) written.
     """
     views = len(images)
@@ -84,10 +85,10 @@ def judge(
                 support += 1
             # Most points are static: stop once the views that are left cannot turn the balance.
             left = views - 1 - v
-            outvoted = through + left < _LEAST_THROUGH or weight + left < support
+            outvoted = through + left < least_through or weight + left < support
             if outvoted or through + support >= _ENOUGH:
                 break
-        moved[m] = through >= _LEAST_THROUGH and weight >= support
+        moved[m] = through >= least_through and weight >= support
 
 
 @compiled_part

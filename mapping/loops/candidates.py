@@ -31,6 +31,8 @@ _RADIUS_PER_RANGE = 4.0
 _YAW_SIGMAS = 2.0
 _YAW_MIN = np.deg2rad(6.0)
 _YAW_TRIES = 5
+# Turns of a closure that is given, all around, and sectors of them that each make a start.
+_ALL_YAWS, _SECTORS = 72, 12
 # Keyframes closer to one another than this count as one candidate.
 _APART = 3
 # Standard deviation of a guess from two views: radians, and of the median range.
@@ -123,15 +125,16 @@ class KeyframeDatabase(Stateful):
             track.drift_rates,
         )
 
-    def candidates(self, index: int) -> Iterator[Candidate]:
-        """Candidates for a keyframe, the likeliest first."""
+    def candidates(self, index: int, barred: NDArray[np.bool_] | None = None) -> Iterator[Candidate]:
+        """Candidates for a keyframe, the likeliest first, without those of a mask (K,)."""
         track = self.track
         min_way_m = self._config.min_way_m
         if min_way_m is None:
             min_way_m = max(_MIN_WAY_M, _MIN_WAY_RANGES * self.submaps[index].range_m)
         others = np.arange(index)
         elsewhere = track.segment[others] != track.segment[index]
-        others = others[elsewhere | (track.way_m[index] - track.way_m[others] > min_way_m)]
+        chosen = elsewhere | (track.way_m[index] - track.way_m[others] > min_way_m)
+        others = others[chosen if barred is None else chosen & ~barred[:index]]
         if len(others):
             yield from self._nearby(index, others)
             yield from self._alike(index, others)
@@ -151,19 +154,36 @@ class KeyframeDatabase(Stateful):
         if not within.any():
             return
         others, rotation, translation, distance = (v[within] for v in (others, rotation, translation, distance))
-        source = BirdEyeView.of(submap)
-        similarity, _ = self._compare(source, others)
+        similarity, _ = self._compare(BirdEyeView.of(submap), others)
         # The nearest as long as drift is little, the most similar when it is much.
         cost = distance / (submap.range_m + translation) - similarity
         for k in _spread(others, cost, _NEARBY_CANDIDATES):
-            estimate = track.between(int(others[k]), index)
-            target = BirdEyeView.of(self.submaps[others[k]])
-            level = target.R_level_lidar @ estimate[:3, :3] @ source.R_level_lidar.T
-            half = max(_YAW_MIN, _YAW_SIGMAS * float(rotation[k]))
-            yaws = np.arctan2(level[1, 0], level[0, 0]) + np.linspace(-half, half, _YAW_TRIES)
-            expected_xy = (target.R_level_lidar @ estimate[:3, 3])[:2]
-            guess, _ = align(target, source, yaws, self.radius_m, expected_xy, 2.0 * float(translation[k]))
+            guess = self._near_estimate(int(others[k]), index, float(rotation[k]), float(translation[k]))
             yield Candidate(int(others[k]), False, guess)
+
+    def _near_estimate(self, first: int, second: int, rotation: float, translation: float) -> FloatArray:
+        """`T_first_second` (4, 4) by aligning the views, within standard deviations of the drift."""
+        estimate = self.track.between(first, second)
+        target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
+        level = target.R_level_lidar @ estimate[:3, :3] @ source.R_level_lidar.T
+        half = max(_YAW_MIN, _YAW_SIGMAS * rotation)
+        yaws = np.arctan2(level[1, 0], level[0, 0]) + np.linspace(-half, half, _YAW_TRIES)
+        expected_xy = (target.R_level_lidar @ estimate[:3, 3])[:2]
+        return align(target, source, yaws, self.radius_m, expected_xy, 2.0 * translation)[0]
+
+    def starts(self, first: int, second: int) -> list[FloatArray]:
+        """`T_first_second` (4, 4) to begin with for two keyframes of one place.
+
+        The estimate, the views aligned within its drift, and aligned anywhere, in each sector of headings.
+        """
+        rotation, translation = self.track.drift(np.array([first]), second)
+        target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
+        sectors = np.linspace(-np.pi, np.pi, _ALL_YAWS, endpoint=False).reshape(_SECTORS, -1)
+        return [
+            self.track.between(first, second),
+            self._near_estimate(first, second, float(rotation[0]), float(translation[0])),
+            *(align(target, source, yaws, self.radius_m)[0] for yaws in sectors),
+        ]
 
     def _alike(self, index: int, others: NDArray[np.intp]) -> list[Candidate]:
         """Earlier keyframes with similar descriptors; sensors of other segments may be mounted upside down."""

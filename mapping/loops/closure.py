@@ -32,6 +32,7 @@ class LoopClosure(RelativePose):
     by_appearance: bool  # found by its descriptor, not near the estimate
     consistent: int  # number of other closures that agree
     reason: str  # why it was rejected; empty for one that was accepted
+    given: tuple[int, int] | None = None  # the scans that it was given by; None for one that was found
 
     @property
     def accepted(self) -> bool:

@@ -10,12 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
+from lidarslam.mapping.loops.registration import GUESS_SIGMAS
 from lidarslam.mapping.loops.verification import MIN_INLIERS, Verification, verify
 
 logger = logging.getLogger(__name__)
@@ -63,7 +65,14 @@ class LoopDetector(Stateful):
         """The size of detail that suits a keyframe's submap."""
         return self._database.submaps[index].cell_m
 
-    def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> list[LoopClosure]:
+    def add(
+        self,
+        points: FloatArray,
+        way_m: float,
+        segment: int,
+        poses: FloatArray,
+        barred: NDArray[np.bool_] | None = None,
+    ) -> list[LoopClosure]:
         """Take the next keyframe, and return the closures that are accepted or rejected by now.
 
         Args:
@@ -71,12 +80,31 @@ class LoopDetector(Stateful):
             way_m: path length from the recording's start.
             segment: stretch of continuous tracking; keyframes of one follow one another.
             poses: (K, 4, 4) `T_world_lidar` of all keyframes, this one last, as they are estimated now.
+            barred: (K,) which of them it is not to be closed with; None: any may be.
         """
         self._database.add(points, way_m, segment, poses)
         decided = self._drop_old(way_m, segment)
         if len(self._database.submaps[-1]) >= MIN_INLIERS and not self._is_soon(way_m, segment):
-            decided += self._look(len(self._database) - 1)
+            decided += self._look(len(self._database) - 1, barred)
         return decided
+
+    def close(self, first: int, second: int, given: tuple[int, int]) -> LoopClosure:
+        """A closure of two keyframes that is given by two scans: accepted where the submaps fit from some start.
+
+        Neither drift nor other closures object to it.
+        """
+        target, source = self._database.cloud(first), self._database.cloud(second)
+        starts, least = self._database.starts(first, second), self._config.min_overlap
+        found = [one for start in starts if (one := verify(target, source, start)) is not None]
+        if not found:
+            far = np.diag(GUESS_SIGMAS**2)
+            return LoopClosure(first, second, starts[0], far, 0.0, np.inf, 0.0, False, 0, "nothing in common", given)
+        best = max(found, key=lambda one: (not one.objection(least), one.information))
+        closure = _closure(Candidate(first, False, best.T_target_source), second, best)
+        closure = replace(closure, reason=best.objection(least), given=given)
+        if closure.accepted:
+            self._accepted.append(closure)
+        return closure
 
     def finish(self) -> list[LoopClosure]:
         """Closures that no other agreed with to the end, as rejected."""
@@ -93,11 +121,11 @@ class LoopDetector(Stateful):
         spacing_m = max(_SPACING_M, range_m) if are_many else _SPACING_M
         return bool(track.segment[self._accepted[-1].second] == segment and since_m[-1] < spacing_m)
 
-    def _look(self, index: int) -> list[LoopClosure]:
+    def _look(self, index: int, barred: NDArray[np.bool_] | None) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""
         decided: list[LoopClosure] = []
         source = self._database.cloud(index)
-        for candidate in self._database.candidates(index):
+        for candidate in self._database.candidates(index, barred):
             found = verify(self._database.cloud(candidate.index), source, candidate.T_first_second)
             if found is None:
                 continue

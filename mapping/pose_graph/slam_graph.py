@@ -11,6 +11,7 @@ those that are connected end up in one frame.
 
 import logging
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -25,8 +26,9 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
+from lidarslam.mapping.loops.given import GivenLoops
 from lidarslam.mapping.loops.refinement import refine
 from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
@@ -54,6 +56,7 @@ class SlamGraph(KeyframeGraph):
         directory: where submaps are kept meanwhile, in a file without a name; None: where temporary files are.
         file: where they are kept instead, for `restore`.
         local_radius_m: of the local map that scans were registered to; 0 without one.
+        given: loop closures that are given or forbidden, where one recording is followed.
     """
 
     _detector: LoopDetector
@@ -71,9 +74,10 @@ class SlamGraph(KeyframeGraph):
         directory: Path | None = None,
         file: Path | None = None,
         local_radius_m: float = 0.0,
+        given: GivenLoops | None = None,
     ) -> None:
         super().__init__(config.keyframes, directory, file)
-        self._config = config
+        self._config, self.given = config, given or GivenLoops()
         self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
         self._first_scans, self._poses, self._closures, self._unrefined = [], [], [], []
         self._relaxing = RelaxSchedule()
@@ -136,6 +140,7 @@ class SlamGraph(KeyframeGraph):
             return None
         self._close_submap()
         self._closures += self._detector.finish()
+        self._take(self._close_given(self.keyframes[-1].scan, len(self.scan_poses) - 1))
         self._refine_closures(until=len(self.keyframes))
         return self._corrected(self._closures, placed)
 
@@ -153,20 +158,20 @@ class SlamGraph(KeyframeGraph):
         self, closures: Sequence[LoopClosure], placed: tuple[FloatArray, ProjectedTrack] | None = None
     ) -> Corrected:
         """All poses, optimised with these loop closures, of which rejected ones are only listed."""
-        accepted = [closure for closure in closures if closure.accepted]
-        optimised = optimise(np.array(self._poses), self.edges, accepted, self.attitudes)
+        edges, uncertain = self._constraints(closures)
+        optimised = optimise(np.array(self._poses), edges, uncertain, self.attitudes)
         if placed is not None:
-            optimised = self._placed(optimised.poses, accepted, *placed)
+            optimised = self._placed(optimised.poses, edges, uncertain, *placed)
         kept = iter(optimised.inliers.tolist())
-        inliers = tuple(closure.accepted and next(kept) for closure in closures)
+        inliers = tuple(closure.accepted and (closure.given is not None or next(kept)) for closure in closures)
         loops = [closure for closure, inlier in zip(closures, inliers, strict=True) if inlier]
         scans, firsts = np.array([keyframe.scan for keyframe in self.keyframes]), np.array(self._first_scans or [0])
         of = recordings_of(scans, firsts)
         frames = first_connected(len(firsts), [(int(of[loop.first]), int(of[loop.second])) for loop in loops])
         registered = np.array(self.scan_poses)
         poses = in_frames(optimised.poses, frames[of], registered[scans])
-        corrected, edges = corrected_recordings(registered, firsts, scans, poses), (*self.edges, *loops)
-        return Corrected(corrected, scans, poses, tuple(closures), inliers, edges, firsts, frames)
+        corrected, measured = corrected_recordings(registered, firsts, scans, poses), (*self.edges, *loops)
+        return Corrected(corrected, scans, poses, tuple(closures), inliers, measured, firsts, frames)
 
     def draw_map(
         self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None, most: int | None = None
@@ -179,7 +184,12 @@ class SlamGraph(KeyframeGraph):
         return drawn
 
     def _placed(
-        self, poses: FloatArray, loops: Sequence[LoopClosure], stamps: FloatArray, track: ProjectedTrack
+        self,
+        poses: FloatArray,
+        edges: Sequence[RelativePose],
+        loops: Sequence[LoopClosure],
+        stamps: FloatArray,
+        track: ProjectedTrack,
     ) -> Optimised:
         """Optimise the keyframes' poses (K, 4, 4) in the projection, with GNSS positions; the result is of the run."""
         scans = [keyframe.scan for keyframe in self.keyframes]
@@ -188,13 +198,33 @@ class SlamGraph(KeyframeGraph):
         T_map_world = track.aligned(Trajectory(stamps, T_world_lidar))
         attitudes = [replace(attitude, world=np.array([0.0, 0.0, 1.0])) for attitude in self.attitudes]
         positions = track.positions(registered, scans)
-        optimised = optimise(T_map_world @ poses, self.edges, loops, attitudes, positions)
+        optimised = optimise(T_map_world @ poses, edges, loops, attitudes, positions)
         T_world_map = poses[0] @ inverse(optimised.poses[0])
         logger.info("GNSS: %d of %d positions are inliers", optimised.position_inliers.sum(), len(positions))
         return replace(optimised, poses=T_world_map @ optimised.poses)
 
     def _accepted(self) -> list[LoopClosure]:
         return [closure for closure in self._closures if closure.accepted]
+
+    def _constraints(self, closures: Sequence[LoopClosure]) -> tuple[list[RelativePose], list[LoopClosure]]:
+        """What is no outlier, the edges and closures that are given, and closures that may be one."""
+        accepted = [closure for closure in closures if closure.accepted]
+        given = [closure for closure in accepted if closure.given is not None]
+        return [*self.edges, *given], [closure for closure in accepted if closure.given is None]
+
+    def _close_given(self, after: int, until: int) -> list[LoopClosure]:
+        """The given closures whose later scan is in a range, between the first keyframes from their scans on."""
+        scans = [keyframe.scan for keyframe in self.keyframes]
+        found = []
+        for pair in self.given.closed:
+            first, second = (min(bisect_left(scans, scan), len(scans) - 1) for scan in pair)
+            if after < pair[1] <= until and first < second:
+                found.append(self._detector.close(first, second, pair))
+        return found
+
+    def _take(self, found: Sequence[LoopClosure]) -> None:
+        self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
+        self._closures += found
 
     def _begin_keyframe(self, scan: GraphScan) -> None:
         super()._begin_keyframe(scan)
@@ -215,13 +245,15 @@ class SlamGraph(KeyframeGraph):
         """Keep the submap of the last keyframe, and look for loop closures with it."""
         super()._keep(means)
         index, keyframe = len(self.keyframes) - 1, self.keyframes[-1]
-        found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
-        self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
-        self._closures += found
+        barred = self.given.barred(np.array([one.scan for one in self.keyframes]))
+        track = keyframe.path_m, keyframe.segment, np.array(self._poses)
+        found = self._detector.add(means_points(means), *track, barred)
+        found += self._close_given(self.keyframes[-2].scan if index else -1, keyframe.scan)
+        self._take(found)
         refined = self._refine_closures(until=index - REACH)
         self._is_map_due = self._is_map_due or bool(refined)
         if self._relaxing.is_due([*found, *refined], self._poses):
-            self._poses = list(relax(np.array(self._poses), self.edges, self._accepted(), self.attitudes))
+            self._poses = list(relax(np.array(self._poses), *self._constraints(self._closures), self.attitudes))
 
     def _refine_closures(self, until: int) -> list[LoopClosure]:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""

@@ -9,13 +9,13 @@ import pytest
 
 from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
 from lidarslam.compare.assessment.inputs import read_estimate
-from lidarslam.compare.assessment.map_evaluation import MapOptions, evaluate_map, read_transform
+from lidarslam.compare.assessment.map_evaluation import MapOptions, evaluate_map
 from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
 from lidarslam.compare.assessment.text import format_evaluation
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
-from lidarslam.core.text.trajectory_io import format_kitti, write_tum
+from lidarslam.core.text.trajectory_io import format_kitti, read_transform, write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.mapping.global_map.global_map import PointCloud

@@ -143,3 +143,15 @@ def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
     nearest = np.linalg.norm(results[last].points, axis=1).min()
     assert placed.images[-1][placed.images[-1] > 0.0].min() == pytest.approx(nearest, rel=1e-3)
     assert T_world_lidar[last, 0, 3] == pytest.approx(placed.T_world_lidar[-1, 0, 3], abs=1e-6)
+
+
+def test_moved_points_are_removed_again_with_other_settings(source: Path, tmp_path: Path) -> None:
+    run(source, tmp_path / "run")
+    kept = {}
+    for views in (0, 3, 1000):
+        out = tmp_path / f"{views}.ply"
+        ended = CliRunner().invoke(main, ["map", str(tmp_path / "run"), "--out", str(out), "--moved", str(views)])
+        assert ended.exit_code == 0, ended.output
+        kept[views] = len(of_person(np.asarray(o3d.io.read_point_cloud(out).points)))
+    assert kept[0] == kept[1000] > 300
+    assert kept[3] < 0.2 * kept[0]

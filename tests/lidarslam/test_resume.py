@@ -158,7 +158,7 @@ METHODS = {
     "odometry alone": ["--odometry", "learned", "--no-mapping", "--stop", "10"],
     "pose graph": [
         "--odometry", "constant-velocity", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",
-        "--set", "pose_graph.loops.min_way_m=0.5",
+        "--set", "pose_graph.loops.min_way_m=0.5", "--loop", "2", "12", "--loop", "3", "33",
     ],
     "imu": [
         "--odometry", "imu", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",

@@ -14,6 +14,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angl
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.loops.given import NEAR_SCANS, GivenLoops
 from lidarslam.mapping.pose_graph import slam_graph
 from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
@@ -126,8 +127,13 @@ def _walk(world: FloatArray, ways: FloatArray, rng: np.random.Generator, T_own_b
     return Walk(truth, np.array(estimate), points)
 
 
-def follow(walk: Walk, scans: list[GraphScan] | None = None, config: PoseGraphConfig = CONFIG) -> SlamGraph:
-    graph = SlamGraph(config)
+def follow(
+    walk: Walk,
+    scans: list[GraphScan] | None = None,
+    config: PoseGraphConfig = CONFIG,
+    given: GivenLoops | None = None,
+) -> SlamGraph:
+    graph = SlamGraph(config, given=given)
     go_on(graph, scans if scans is not None else walk.scans())
     return graph
 
@@ -174,6 +180,42 @@ def test_a_closed_round_takes_the_drift_away(walk: Walk, closed: tuple[SlamGraph
     assert before.max() > 0.6
     assert np.sqrt(np.mean(after**2)) < 0.2 * np.sqrt(np.mean(before**2))
     assert sum(result.inliers) >= 2
+
+
+def test_a_forbidden_loop_is_not_found(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+    graph, free = closed
+    scans = [graph.keyframes[key].scan for key in range(len(graph.keyframes))]
+    near, far = (8, 170), (8 + NEAR_SCANS + 60, 170)
+    found = [(scans[one.first], scans[one.second]) for one in free.closures if one.accepted]
+    assert found
+    assert all(abs(i - near[0]) <= NEAR_SCANS and abs(j - near[1]) <= NEAR_SCANS for i, j in found)
+    result = follow(walk, given=GivenLoops(forbidden=(far, near))).finish()
+    assert result is not None
+    assert not result.closures
+    np.testing.assert_allclose(result.T_world_lidar, walk.estimate, atol=1e-6)
+    barred = GivenLoops(forbidden=((100, 300),)).barred(np.array([49, 50, 150, 151, 250]))
+    assert barred.tolist() == [False, True, True, False, False]
+
+
+def test_a_given_loop_is_closed_from_a_wrong_estimate(walk: Walk) -> None:
+    """No loop is tried by itself; the estimate is off by more than a room, without a word of it."""
+    T_off, lost = exp([0.0, 0.0, 1.2, 6.0, -4.0, 0.5]), 140
+    estimate = np.array([*walk.estimate[:lost], *(walk.estimate[0] @ T_off @ walk.estimate[lost:])])
+    wrong = Walk(walk.truth, estimate, walk.points)
+    given = GivenLoops(closed=((12, 172), (25, 80), (150, 151)), forbidden=((12, 172),))
+    config = CONFIG.model_copy(update={"loops": CONFIG.loops.model_copy(update={"min_way_m": 1000.0})})
+    graph = follow(wrong, config=config, given=given)
+    result = graph.finish()
+    assert result is not None
+    first, second = sorted(result.closures, key=lambda one: one.given or (0, 0))
+    assert (first.given, first.accepted, second.given, second.accepted) == ((12, 172), True, (25, 80), False)
+    assert second.reason
+    assert result.inliers.count(True) == 1
+    keys = [graph.keyframes[key].scan for key in (first.first, first.second)]
+    assert [scan - asked for scan, asked in zip(keys, (12, 172), strict=True)] == pytest.approx([2, 2], abs=2.5)
+    T_true = inverse(walk.truth[keys[0]]) @ walk.truth[keys[1]]
+    assert np.linalg.norm((inverse(first.T_first_second) @ T_true)[:3, 3]) < 0.05
+    assert walk.errors_m(result.T_world_lidar)[keys[1]] < 0.1 < walk.errors_m(estimate)[keys[1]]
 
 
 def test_loops_are_closed_on_the_way_and_nothing_changes(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:

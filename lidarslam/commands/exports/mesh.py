@@ -10,7 +10,7 @@ from lidarslam.commands.shared.terminal import say
 
 @click.command("export-mesh", cls=CommandWithExample, epilog="lidarslam export-mesh runs/office -o office.glb")
 @click.argument("run", type=PATH)
-@click.option("-o", "--out", type=PATH, required=True, metavar="FILE", help=".ply, .obj or .glb file.")
+@click.option("-o", "--out", type=PATH, required=True, metavar="FILE", help=".ply, .obj, .glb or .stl file.")
 @click.option(
     "--cell", "cell_m", type=POSITIVE, help="Edge of the smallest cells, m.  [default: two voxels of the map]"
 )

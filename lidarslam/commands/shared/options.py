@@ -12,6 +12,7 @@ from lidarslam.commands.shared.terminal import note, verbose_option
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
     from lidarslam.mapping.config import MapFormat
+    from lidarslam.mapping.loops.given import GivenLoops
 
 
 class CommandWithExample(click.Command):
@@ -74,6 +75,25 @@ GNSS = click.option(
     "--gnss/--no-gnss",
     default=None,
     help="Hold the pose graph by GNSS positions, and write map and trajectory in UTM, too.  [default: no-gnss]",
+)
+_SCANS = (click.IntRange(min=0), click.IntRange(min=0))
+LOOPS = _together(
+    click.option(
+        "--loop",
+        "loops",
+        type=_SCANS,
+        multiple=True,
+        metavar="I J",
+        help="Close a loop between scans I and J, by their indices in the run, from 0; may be repeated.",
+    ),
+    click.option(
+        "--no-loop",
+        "no_loops",
+        type=_SCANS,
+        multiple=True,
+        metavar="I J",
+        help="Find no loop between scans within 50 of I and of J; may be repeated.",
+    ),
 )
 RERUN = click.option(
     "--rerun",
@@ -155,6 +175,23 @@ def take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":
     return tuple(dict.fromkeys(formats))
 
 
+def take_loops(options: dict[str, Any]) -> "GivenLoops":
+    """The loop closures that are given and forbidden; the options they are made of are removed.
+
+    Raises:
+        UsageError: a pair is one scan, or is both.
+    """
+    from lidarslam.mapping.loops.given import GivenLoops
+
+    closed, forbidden = (dict.fromkeys((min(p), max(p)) for p in options.pop(name)) for name in ("loops", "no_loops"))
+    for first, second in (*closed, *forbidden):
+        if first == second:
+            raise click.UsageError(f"--loop and --no-loop take two scans, not {first} twice")
+    for first, second in closed.keys() & forbidden.keys():
+        raise click.UsageError(f"--loop {first} {second} and --no-loop {first} {second} exclude one another")
+    return GivenLoops(tuple(closed), tuple(forbidden))
+
+
 def out_option(what: str, default: str) -> _Decorator:
     """The option `--out`, and where `default_out` puts results without it."""
     return click.option("-o", "--out", type=PATH, metavar="DIR", help=f"{what}  [default: {default}]")
@@ -228,9 +265,9 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
     if mapping is not None:
         settings.append(f"mapping.method={mapping}")
     pose_graph, gnss = options.pop("pose_graph", None), options.pop("gnss", None)
-    if gnss:
+    if gnss or options.get("loops") or options.get("no_loops"):
         if pose_graph is False:
-            raise click.UsageError("--gnss holds the pose graph; leave --no-pose-graph out")
+            raise click.UsageError("--gnss, --loop and --no-loop are of the pose graph; leave --no-pose-graph out")
         pose_graph = True
     if gnss is not None:
         settings.append(f"pose_graph.gnss={str(gnss).lower()}")

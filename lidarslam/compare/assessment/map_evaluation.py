@@ -9,8 +9,8 @@ import numpy as np
 from lidarslam.compare.assessment.inputs import Estimate
 from lidarslam.compare.assessment.reference_map import ReferenceMap
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.geometry import FloatArray, inverse, is_rigid, orthonormalize, transform_points
-from lidarslam.core.text.trajectory_io import parse_numbers
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.text.trajectory_io import read_transform
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import MapErrors
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
@@ -150,15 +150,3 @@ def _align(
             guesses = {"file": read_transform(Path(file))}
     refine = options.alignment != "none" if options.refine is None else options.refine
     return align_map(points, reference.points, guesses, search, refine)
-
-
-def read_transform(path: Path) -> FloatArray:
-    """A rigid transform (4, 4) from a text file of four rows of four numbers.
-
-    Raises:
-        InputError: the file holds anything else.
-    """
-    T = parse_numbers(path, columns=4)
-    if T.shape != (4, 4) or not is_rigid(T, tolerance=1e-3):
-        raise InputError(f"{path}: expected a rigid transform of four rows of four numbers, the last 0 0 0 1")
-    return orthonormalize(T)

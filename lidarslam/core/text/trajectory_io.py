@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
+from lidarslam.core.geometry import FloatArray, is_rigid, make_transform, orthonormalize
 from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.core.trajectory import Trajectory
 
@@ -106,6 +106,18 @@ def read_kitti_poses(path: Path) -> FloatArray:
     if not np.isfinite(T).all() or (np.abs(np.linalg.det(T[:, :3, :3]) - 1.0) > 1e-2).any():
         raise InputError(f"{path}: holds rows that are no poses; expected the first three rows of a rigid transform")
     _require_near(path, T[:, :3, 3])
+    return orthonormalize(T)
+
+
+def read_transform(path: Path) -> FloatArray:
+    """A rigid transform (4, 4) from a text file of four rows of four numbers.
+
+    Raises:
+        InputError: the file holds anything else.
+    """
+    T = parse_numbers(path, columns=4)
+    if T.shape != (4, 4) or not is_rigid(T, tolerance=1e-3):
+        raise InputError(f"{path}: expected a rigid transform of four rows of four numbers, the last 0 0 0 1")
     return orthonormalize(T)
 
 

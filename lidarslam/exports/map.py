@@ -1,0 +1,157 @@
+"""Maps that people work with: runs and clouds joined, cleaned, levelled and cropped."""
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.files import make_directory, replacing
+from lidarslam.core.geometry import FloatArray, make_transform, transform_points
+from lidarslam.core.text.plain_text import count
+from lidarslam.core.text.trajectory_io import read_transform
+from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
+from lidarslam.exports.gravity import upwards
+from lidarslam.exports.redrawn import redrawn
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.products import edits
+from lidarslam.storage.finished_run import is_run, load_map, read_trajectory
+from lidarslam.storage.summary_file import read_summary
+
+SUFFIXES = (".ply", ".pcd", ".laz", ".e57")
+
+
+@dataclass(frozen=True)
+class MapEdits:
+    """What is done, in this order."""
+
+    # moved: range images that see through a moved point, 0: none is removed; None: maps as they are
+    moved: int | None = None
+    transforms: tuple[Path, ...] = ()  # files of `T_first_other` (4, 4) of the sources after the first
+    register: bool = False  # whether these are registered to the first
+    # statistical, radius: see `without_outliers`
+    statistical: tuple[int, float] | None = None
+    radius: tuple[int, float] | None = None
+    level: Literal["ground", "gravity"] | None = None
+    ground_at_zero: bool = False  # whether the ground below the origin gets z = 0
+    box: tuple[float, ...] | None = None  # low and high x, y, z
+    within_m: float | None = None  # farther points from the path are left out
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    cloud: PointCloud
+    positions: FloatArray  # (K, 3) of the sensor, none of a cloud
+
+    def moved(self, T: FloatArray) -> "_Map":
+        return _Map(edits.moved(self.cloud, T), transform_points(T, self.positions))
+
+
+def edit_map(sources: Sequence[Path], out: Path, asked: MapEdits) -> Iterator[str]:
+    """Write the edited map; lines about it.
+
+    Args:
+        sources: run directories and clouds; the first one's frame is that of all.
+        out: the file, with one of `SUFFIXES`.
+        asked: the edits.
+
+    Raises:
+        InputError: a source cannot be read, or an edit is not possible with it.
+        OutputError: the file cannot be written.
+    """
+    maps = []
+    for source in sources:
+        maps.append((yield from _read(source, asked.moved)))
+    for number, source in enumerate(sources[1:], 1):
+        file = asked.transforms[number - 1] if asked.transforms else None
+        T = np.eye(4) if file is None else read_transform(file)
+        if asked.register:
+            fit = _registered(maps[number].cloud, maps[0].cloud, T, source)
+            T = fit.T_reference_map
+            how = (
+                "from everywhere" if fit.method == GLOBAL else f"moved by {fit.moved_m:.2f} m, {fit.moved_deg:.2f} deg"
+            )
+            yield f"{source}: registered, {how}; {100.0 * fit.fitness:.0f} % of it within {fit.inlier_m:.2f} m"
+        maps[number] = maps[number].moved(T)
+    cloud = edits.joined([one.cloud for one in maps])
+    whole = _Map(cloud, np.concatenate([one.positions for one in maps]))
+    if asked.statistical is not None or asked.radius is not None:
+        whole = _Map(edits.without_outliers(cloud, asked.statistical, asked.radius), whole.positions)
+        yield f"outliers: {count(len(cloud) - len(whole.cloud), 'point')} of {len(cloud):,} removed"
+    whole = yield from _levelled(whole, sources[0], asked)
+    cloud = yield from _cropped(whole, asked)
+    make_directory(out.parent)
+    with replacing(out) as partial:
+        write_cloud(partial, cloud)
+    yield f"{count(len(cloud), 'point')} written to {out}"
+
+
+def _read(source: Path, moved: int | None) -> Generator[str, None, _Map]:
+    positions = read_trajectory(source).positions if is_run(source) else np.empty((0, 3))
+    if moved is not None:
+        if not is_run(source):
+            raise InputError(f"{source}: is a cloud; moved points are found in the scans of a run")
+        cloud, removed = redrawn(source, moved)
+        yield f"{source}: drawn again from the recording, {count(removed, 'point')} of moving objects removed"
+        return _Map(cloud, positions)
+    cloud = load_map(source)
+    if not len(cloud):
+        raise InputError(f"{source}: has no map")
+    tiles = read_summary(source).get("map_tiles") if source.is_dir() else None
+    if tiles is not None:
+        yield f"{source}: the overview of a map in tiles, {len(cloud):,} of {tiles['points']:,} points"
+    return _Map(cloud, positions)
+
+
+def _registered(cloud: PointCloud, first: PointCloud, T_guess: FloatArray, source: Path) -> MapAlignment:
+    try:
+        return align_map(cloud.points, first.points, {"given": T_guess}, search=True)
+    except InputError as error:
+        reason = "half of its points must lie where the first source has some, at one pose only"
+        raise InputError(f"{source}: could not be registered: {reason}; give its pose with --transform") from error
+
+
+def _levelled(whole: _Map, first: Path, asked: MapEdits) -> Generator[str, None, _Map]:
+    if asked.level is not None:
+        if asked.level == "gravity":
+            if not is_run(first):
+                raise InputError(f"{first}: is a cloud, which knows no gravity; use --level ground")
+            up, by = upwards(first), "gravity"
+        else:
+            ground = _ground(whole, first)
+            up, by = ground.up, f"the ground, {100.0 * ground.share:.0f} % of what faces upwards"
+        T = edits.levelling(up)
+        whole = whole.moved(T)
+        yield f"levelled by {edits.tilt_deg(T):.2f} degrees, to {by}"
+    if asked.ground_at_zero:
+        ground = _ground(whole, first)
+        z = ground.height_m / float(ground.up[2])
+        whole = whole.moved(make_transform(np.eye(3), [0.0, 0.0, -z]))
+        yield f"ground below the origin: from z = {z:.2f} m to 0"
+    return whole
+
+
+def _ground(whole: _Map, first: Path) -> edits.GroundPlane:
+    ground = edits.ground_plane(whole.cloud)
+    if ground is None:
+        raise InputError(f"{first}: no ground within 45 degrees of level; is z of the map upwards?")
+    return ground
+
+
+def _cropped(whole: _Map, asked: MapEdits) -> Generator[str, None, PointCloud]:
+    cloud, kept = whole.cloud, np.ones(len(whole.cloud), dtype=np.bool_)
+    if asked.box is not None:
+        bounds = np.array(asked.box).reshape(3, 2)
+        kept &= edits.in_box(cloud.points, bounds[:, 0], bounds[:, 1])
+    if asked.within_m is not None:
+        if not len(whole.positions):
+            raise InputError("--within needs the path of a run; name a run directory, or use --box")
+        kept &= edits.near_path(cloud.points, whole.positions, asked.within_m)
+    if not kept.any():
+        raise InputError("no point is left of the map; take a larger --box or --within")
+    if not kept.all():
+        yield f"cropped: {kept.sum():,} of {count(len(cloud), 'point')} kept"
+    return cloud.select(kept)

@@ -1,0 +1,127 @@
+"""Edits of a finished map: joined, cleaned, levelled, cropped."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lidarslam.core.geometry import FloatArray, exp, rotation_angle, transform_points
+from lidarslam.core.scan import PointAttributes
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.normals import estimate_normals
+
+# Angles about the present direction within which normals are averaged to the next.
+_NARROWING = np.deg2rad([45.0, 30.0, 20.0, 10.0, 5.0, 5.0])
+# Distance of the ground's points from its plane, and how often this is fitted.
+_GROUND_M, _REFITS = 0.1, 10
+_FEWEST = 100
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPlane:
+    """The plane of the ground, `up @ p = height_m`."""
+
+    up: FloatArray  # (3,) unit normal
+    height_m: float
+    share: float  # of the points that face upwards
+
+
+def moved(cloud: PointCloud, T: FloatArray) -> PointCloud:
+    """The cloud with its points and normals in another frame."""
+    return PointCloud(transform_points(T, cloud.points), cloud.normals @ T[:3, :3].T, cloud.attributes)
+
+
+def joined(clouds: Sequence[PointCloud]) -> PointCloud:
+    """Clouds of one frame, with the attributes that all of them have."""
+    present = [dict(cloud.attributes.present()) for cloud in clouds]
+    names = [name for name in present[0] if all(name in one for one in present)]
+    attributes = {name: np.concatenate([one[name] for one in present]) for name in names}
+    return PointCloud(
+        np.concatenate([cloud.points for cloud in clouds]),
+        np.concatenate([cloud.normals for cloud in clouds]),
+        PointAttributes(**attributes),
+    )
+
+
+def without_outliers(
+    cloud: PointCloud, sigmas: tuple[int, float] | None, radius: tuple[int, float] | None
+) -> PointCloud:
+    """The cloud without floaters, by Open3D.
+
+    Args:
+        cloud: the map.
+        sigmas: leave out points whose mean distance to so many neighbours exceeds the mean of all points by more than
+            so many standard deviations.
+        radius: leave out points with fewer than so many neighbours within a radius, metres.
+    """
+    if sigmas is not None:
+        cloud = _chosen(cloud, cloud.to_open3d().remove_statistical_outlier(*sigmas)[1])
+    if radius is not None:
+        cloud = _chosen(cloud, cloud.to_open3d().remove_radius_outlier(*radius)[1])
+    return cloud
+
+
+def _chosen(cloud: PointCloud, indices: Sequence[int]) -> PointCloud:
+    chosen = np.zeros(len(cloud), dtype=np.bool_)
+    chosen[np.asarray(indices, dtype=np.intp)] = True
+    return cloud.select(chosen)
+
+
+def ground_plane(cloud: PointCloud) -> GroundPlane | None:
+    """The level with the most points that face upwards; None if few do, within 45 degrees of z.
+
+    The most frequent normal comes first, for which the treads of stairs are level, then the plane of the points there.
+    """
+    normals = cloud.normals
+    if len(cloud) and not np.ptp(normals, axis=0).any():  # a file without normals
+        normals = estimate_normals(cloud.points)
+        normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
+    facing = normals[:, 2] > np.cos(_NARROWING[0])
+    points, normals = cloud.points[facing], normals[facing]
+    if len(points) < _FEWEST:
+        return None
+    up, alike = np.array([0.0, 0.0, 1.0]), np.ones(len(points), dtype=np.bool_)
+    for angle in _NARROWING:
+        chosen = normals @ up > np.cos(angle)
+        if chosen.sum() < _FEWEST:
+            break
+        alike = chosen
+        up = normals[alike].mean(axis=0)
+        up /= np.linalg.norm(up)
+    level = points[alike]
+    bins = np.floor(level @ up / _GROUND_M).astype(np.intp)
+    height_m = _GROUND_M * (float(bins.min() + np.bincount(bins - bins.min()).argmax()) + 0.5)
+    for _ in range(_REFITS):
+        ground = level[np.abs(level @ up - height_m) < _GROUND_M]
+        if len(ground) < _FEWEST:
+            return None
+        middle = ground.mean(axis=0)
+        up = np.linalg.svd(ground - middle, full_matrices=False)[2][2]
+        up *= np.sign(up[2])
+        height_m = float(up @ middle)
+    share = float(np.mean(np.abs(points @ up - height_m) < _GROUND_M))
+    return GroundPlane(up, height_m, share) if up[2] > np.cos(_NARROWING[0]) else None
+
+
+def levelling(up: FloatArray) -> FloatArray:
+    """The least rotation `T_level_world` (4, 4) that turns a unit vector (3,) to z."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    angle = np.arctan2(np.linalg.norm(axis), up[2])
+    return exp([*(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)), 0.0, 0.0, 0.0])
+
+
+def tilt_deg(T: FloatArray) -> float:
+    """The angle of a rotation, degrees."""
+    return float(np.rad2deg(rotation_angle(T)))
+
+
+def in_box(points: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+    """(N,) which points (N, 3) lie in a box, borders included."""
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
+
+
+def near_path(points: FloatArray, positions: FloatArray, radius_m: float) -> NDArray[np.bool_]:
+    """(N,) which points (N, 3) lie within a distance of a position (K, 3)."""
+    return np.isfinite(cKDTree(positions).query(points, distance_upper_bound=radius_m)[0])

@@ -1,0 +1,178 @@
+"""Maps that are joined, cleaned, levelled, cropped: clouds whose points are known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.scan import PointAttributes
+from lidarslam.core.text.trajectory_io import write_tum
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.products.edits import moved
+from lidarslam.storage.finished_run import load_map
+
+TILT = exp([np.deg2rad(7.0), 0.0, 0.0, 0.0, 0.0, 0.0])
+GROUND_M = -1.5
+FLOATERS = 40
+BACKWARDS, OUTSIDE = ("1", "-1", "0", "1", "0", "1"), ("90", "91", "0", "1", "0", "1")
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def edited(out: Path, *arguments: object) -> tuple[PointCloud, str]:
+    done = lidarslam("map", *arguments, "--out", out, "--overwrite")
+    assert done.exit_code == 0, done.output
+    return load_map(out), done.stdout
+
+
+def hall() -> PointCloud:
+    """A floor of 20 x 12 m on a grid of 0.1 m, a larger ceiling that faces down, and a wall."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-10.0, 10.0, 0.1), np.arange(-6.0, 6.0, 0.1)))
+    floor = np.column_stack([x, y, np.full(len(x), GROUND_M)])
+    ceiling = np.column_stack([1.3 * x, 1.3 * y, np.full(len(x), 2.0)])
+    wall = np.column_stack([np.full(len(y), 10.0), y, np.linspace(GROUND_M, 2.0, len(y))])
+    parts = ((floor, [0.0, 0.0, 1.0]), (ceiling, [0.0, 0.0, -1.0]), (wall, [-1.0, 0.0, 0.0]))
+    normals = np.concatenate([np.tile(normal, (len(points), 1)) for points, normal in parts])
+    return PointCloud(np.concatenate([points for points, _ in parts]), normals)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run in it, tilted, 4 m along its middle, with an IMU in its recording."""
+    out, source = tmp_path / "run", tmp_path / "room"
+    out.mkdir()
+    source.mkdir()
+    T = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
+    stamps = np.arange(41) / 10.0
+    write_tum(out / "trajectory.tum", Trajectory(stamps, T))
+    write_cloud(out / "map.ply", moved(hall(), TILT))
+    (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(source)}))
+    np.save(source / "000000.npy", np.eye(3))
+    accelerations = np.gradient(np.gradient(T[:, :3, 3], 0.1, axis=0), 0.1, axis=0)
+    force = np.einsum("nji,nj->ni", T[:, :3, :3], accelerations + TILT[:3, :3] @ [0.0, 0.0, 9.81])
+    rows = [",".join(map(str, [stamp, 0, 0, 0, *row])) for stamp, row in zip(stamps, force, strict=True)]
+    (source / "imu.csv").write_text("# T_lidar_imu: 1 0 0 0 0 1 0 0 0 0 1 0\n" + "\n".join(rows) + "\n")
+    return out
+
+
+@pytest.mark.parametrize("by", ["ground", "gravity"])
+def test_a_tilted_map_is_levelled(run: Path, tmp_path: Path, by: str) -> None:
+    cloud, said = edited(tmp_path / "level.ply", run, "--level", by, "--ground-at-zero")
+    assert float(said.split()[2]) == pytest.approx(7.0, abs=0.03)
+    assert "from z = -1.50 m to 0" in said
+    expected = hall().points - [0.0, 0.0, GROUND_M]
+    np.testing.assert_allclose(cloud.points, expected, atol=0.02)
+    np.testing.assert_allclose(cloud.normals, hall().normals, atol=2e-3)
+
+
+def test_a_cloud_without_normals_is_levelled_too(tmp_path: Path) -> None:
+    floor = hall().points[: len(hall()) // 3]
+    tilted = transform_points(TILT, floor)
+    np.savetxt(tmp_path / "points", tilted, fmt="%.4f")
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(tilted)}\n" + "".join(
+        f"property float {axis}\n" for axis in "xyz"
+    )
+    (tmp_path / "cloud.ply").write_text(header + "end_header\n" + (tmp_path / "points").read_text())
+    cloud, said = edited(tmp_path / "level.ply", tmp_path / "cloud.ply", "--level", "ground")
+    assert "levelled by 7.00 degrees" in said
+    assert np.ptp(cloud.points[:, 2]) < 0.02
+
+
+def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
+    whole = load_map(run / "map.ply").points
+    box = np.array([[-2.05, 3.0], [-1.0, 1.05], [-3.0, 0.0]])
+    cloud, said = edited(tmp_path / "box.ply", run, "--box", *box.ravel())
+    inside = ((whole >= box[:, 0]) & (whole <= box[:, 1])).all(axis=1)
+    assert f"cropped: {inside.sum():,} of {len(whole):,} points kept" in said
+    np.testing.assert_array_equal(cloud.points, whole[inside])
+    poses = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
+    distance = np.linalg.norm(whole[:, None] - poses[:, :3, 3], axis=2).min(axis=1)
+    cloud, _ = edited(tmp_path / "near.ply", run, "--within", 3.0)
+    np.testing.assert_array_equal(cloud.points, whole[distance < 3.0])
+    both, _ = edited(tmp_path / "both.ply", run, "--within", 3.0, "--box", *box.ravel())
+    np.testing.assert_array_equal(both.points, whole[inside & (distance < 3.0)])
+
+
+@pytest.mark.parametrize("method", [("--statistical", 8, 3.0), ("--radius", 3, 0.5)])
+def test_floaters_are_removed_and_nothing_else(tmp_path: Path, method: tuple[object, ...]) -> None:
+    rng = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(*[np.arange(-3.0, 3.0, 0.1)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    floaters = np.column_stack([3.0 * rng.permutation(FLOATERS), rng.uniform(5.0, 9.0, FLOATERS), np.full(FLOATERS, 8)])
+    points = np.concatenate([grid, floaters])
+    known = PointAttributes(intensity=np.arange(len(points), dtype=np.float32))
+    write_cloud(tmp_path / "cloud.ply", PointCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), known))
+    cloud, said = edited(tmp_path / "clean.ply", tmp_path / "cloud.ply", *method)
+    assert f"outliers: {FLOATERS} points of {len(points):,} removed" in said
+    np.testing.assert_allclose(cloud.points, grid, atol=1e-6)
+    np.testing.assert_array_equal(cloud.attributes.intensity, np.arange(len(grid)))
+
+
+def l_shaped(rng: np.random.Generator) -> PointCloud:
+    """The floor and walls of an L-shaped room with boxes, which looks alike from no two sides."""
+    corners = [
+        ((0, 0), (9, 0)),
+        ((9, 0), (9, 4)),
+        ((9, 4), (4, 4)),
+        ((4, 4), (4, 7)),
+        ((4, 7), (0, 7)),
+        ((0, 7), (0, 0)),
+    ]
+    walls = [np.add(a, rng.random((4000, 1)) * np.subtract(b, a)) for a, b in corners]
+    parts = [np.column_stack([wall, rng.uniform(0.0, 2.5, len(wall))]) for wall in walls]
+    floor = rng.uniform([0.0, 0.0], [9.0, 7.0], (8000, 2))
+    floor = floor[(floor[:, 0] < 4.0) | (floor[:, 1] < 4.0)]
+    points = np.concatenate([*parts, np.column_stack([floor, np.zeros(len(floor))])])
+    return PointCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+
+
+def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
+    room, T = l_shaped(np.random.default_rng(5)), exp([0.02, -0.03, 2.4, 2.0, -1.0, 0.3])
+    write_cloud(tmp_path / "first.ply", room)
+    write_cloud(tmp_path / "other.ply", moved(l_shaped(np.random.default_rng(6)), inverse(T)))
+    np.savetxt(tmp_path / "T.txt", T)
+    sources = tmp_path / "first.ply", tmp_path / "other.ply"
+    expected = np.concatenate([room.points, l_shaped(np.random.default_rng(6)).points])
+    cloud, _ = edited(tmp_path / "given.ply", *sources, "--transform", tmp_path / "T.txt")
+    np.testing.assert_allclose(cloud.points, expected, atol=1e-5)
+    cloud, said = edited(tmp_path / "registered.ply", *sources, "--register")
+    assert "other.ply: registered, from everywhere; 100 % of it within 0.20 m" in said
+    np.testing.assert_allclose(cloud.points, expected, atol=0.03)
+    cloud, _ = edited(tmp_path / "plain.ply", *sources)
+    np.testing.assert_allclose(
+        cloud.points[len(room) :], transform_points(inverse(T), expected[len(room) :]), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["{run}", "-o", "{out}.obj"], 2, "expected a file .ply, .pcd, .laz, .e57"),
+        (["{run}", "-o", "{out}.ply", "--box", *BACKWARDS], 2, "expected each from less than its to"),
+        (["{run}", "-o", "{out}.ply", "--box", *OUTSIDE], 1, "no point is left of the map"),
+        (["{run}", "-o", "{out}.ply", "--transform", "{run}/config.yaml"], 2, "each of the 0 further sources"),
+        (["{run}/map.ply", "-o", "{out}.ply", "--within", "3"], 1, "--within needs the path of a run"),
+        (["{run}/map.ply", "-o", "{out}.ply", "--level", "gravity"], 1, "use --level ground"),
+        (["{run}/map.ply", "-o", "{out}.ply", "--moved", "3"], 1, "found in the scans of a run"),
+        (["{run}/map.ply", "-o", "{run}/map.ply"], 1, "exists; name another file"),
+        (["{run}/none.ply", "-o", "{out}.ply"], 1, "no such file"),
+        (["{wall}", "-o", "{out}.ply", "--level", "ground"], 1, "no ground within 45 degrees of level"),
+        (["{run}", "{wall}", "-o", "{out}.ply", "--register"], 1, "wall.ply: could not be registered"),
+    ],
+)
+def test_mistakes_get_one_line(run: Path, tmp_path: Path, arguments: list[str], status: int, said: str) -> None:
+    wall: FloatArray = np.random.default_rng(0).uniform([40.0, 0.0, 0.0], [40.01, 9.0, 9.0], (2000, 3))
+    write_cloud(tmp_path / "wall.ply", PointCloud(wall, np.tile([1.0, 0.0, 0.0], (len(wall), 1))))
+    places = {"run": run, "out": tmp_path / "out", "wall": tmp_path / "wall.ply"}
+    ended = lidarslam("map", *(argument.format(**places) for argument in arguments))
+    assert ended.exit_code == status, ended.output
+    assert said in ended.stderr
+    assert status == 2 or len(ended.stderr.splitlines()) == 1
+    assert not list(tmp_path.glob("out*"))
