@@ -19,8 +19,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import is_rigid
+from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_kitti_poses, read_tum
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.folders.ply import read_ply
 
 FAST = ("--odometry", "constant-velocity", "--no-pose-graph", "--no-report")
