@@ -32,7 +32,7 @@ from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.stages import Stages
 from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.run import open_odometry, require_scan_by_scan
+from lidarslam.run.run import open_odometry, require_no_trajectory
 from lidarslam.run.scan_log import ScanLog
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class Slam:
 
     def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
         self._config = make_config(config)
-        require_scan_by_scan(self._config)
+        require_no_trajectory(self._config)
         with CompileAhead(parts_of(self._config)) as compiling, python_names():
             self._odometry = open_odometry(self._config, None)
             compiling.wait_for_all(logger.info)

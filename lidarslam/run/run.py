@@ -195,16 +195,11 @@ def require_overlap(odometry: Odometry, recording: Recording) -> Odometry:
     return odometry
 
 
-def require_scan_by_scan(config: Config) -> None:
-    """Refuse settings that take more of a recording than one scan after the other.
+def require_no_trajectory(config: Config) -> None:
+    """Refuse an odometry that takes more of a recording than what comes one after the other.
 
     Raises:
-        ConfigError: the odometry is a trajectory, or the error of the elevations is to be found beforehand.
+        ConfigError: it needs a trajectory.
     """
     if config.odometry.method == "external":
         raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
-    if config.reader.elevation_correction_deg == "auto":
-        raise ConfigError(
-            "reader.elevation_correction_deg=auto needs a recording beforehand: give the degrees, such as the"
-            " elevation_bias_deg of a run"
-        )

@@ -23,7 +23,7 @@ from lidarslam.run.modes.live.request import LiveRequest
 from lidarslam.run.modes.live.session import LiveSession, warm_up
 from lidarslam.run.modes.live.statistics import LiveCounts
 from lidarslam.run.results import RunOutcome, final_map, write_results
-from lidarslam.run.run import open_odometry, require_scan_by_scan, viewing
+from lidarslam.run.run import open_odometry, require_no_trajectory, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.viewer.rerun_program import require_window
@@ -62,7 +62,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     if request.rerun == "spawn":
         require_window("serve a browser with --rerun web, or write a file with --rerun save")
     config, log, faults = bounded(request.config), ScanLog(), Faults()
-    require_scan_by_scan(config)
+    require_no_trajectory(config)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
