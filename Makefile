@@ -41,14 +41,18 @@ install: $(VENV)/.installed
 
 # What users install: no PyTorch.
 $(VENV)/.base: pyproject.toml constraints.txt scripts/system_libraries.sh
+	@echo "installing lidarslam and its libraries (2 GB) into $(VENV), once: a few minutes, in which pip is silent"
 	sh scripts/system_libraries.sh
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.base
+	@echo "installing PyTorch (1 GB, with CUDA several), once: a few minutes"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	@echo "installing the libraries of the tests, once: a few minutes"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@echo "compiling loops, once"
 	$(BIN)/python -m lidarslam.pipeline.compile_ahead
 	touch $@
 

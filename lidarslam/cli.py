@@ -1,11 +1,13 @@
 """The command line; each command has a file in `lidarslam.commands`."""
 
+import contextlib
 import errno
 import io
 import logging
 import os
 import resource
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,13 @@ _LEAST_ADDRESSES = 1 << 30
 
 
 class _Group(click.Group):
-    """Turns errors that the user can mend into one line on standard error and exit status 1."""
+    """Turns errors that the user can mend into one line on standard error; exit status 1, or 2 of a wrong usage."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not args:  # the help
+            return super().parse_args(ctx, args)
+        with _usage_in_one_line():
+            return super().parse_args(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         _prepare_streams()
@@ -51,7 +59,7 @@ class _Group(click.Group):
             if not _has_current_folder():
                 raise InputError("the current folder was removed; change to another")
             _require_address_space()
-            with ended_like_interrupted():
+            with ended_like_interrupted(), _usage_in_one_line():
                 return super().invoke(ctx)
         except LidarSlamError as error:
             note(str(error))
@@ -70,6 +78,20 @@ class _Group(click.Group):
             note(f"{place}{error.strerror or error}")
             logger.info("raised here:", exc_info=True)
         raise click.exceptions.Exit(EXIT_MENDABLE)
+
+
+@contextlib.contextmanager
+def _usage_in_one_line() -> Iterator[None]:
+    """Print the error of a wrong usage as others; the usage itself is in the help."""
+    try:
+        yield
+    except click.UsageError as error:
+        message = " ".join(error.format_message().split()).removesuffix(".")
+        if message[1:2].islower():  # not the name of an option or argument
+            message = message[0].lower() + message[1:]
+        command = "lidarslam" if error.ctx is None else error.ctx.command_path
+        note(f"{message} (see {command} --help)")
+        raise click.exceptions.Exit(error.exit_code) from None
 
 
 def _prepare_streams() -> None:

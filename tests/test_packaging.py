@@ -37,6 +37,15 @@ def test_everything_below_the_package_is_in_the_wheel(wheel: ZipFile) -> None:
     assert "lidarslam/evaluation/report/templates/report.html.j2" in expected
 
 
+def test_an_editable_install_is_a_path_as_type_checkers_need(tmp_path: Path) -> None:
+    build = "import sys; from hatchling.build import build_editable; build_editable(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=REPOSITORY, check=True, capture_output=True, timeout=60)
+    built = ZipFile(next(tmp_path.glob("*.whl")))
+    (pointer,) = (name for name in built.namelist() if name.endswith(".pth"))
+    assert built.read(pointer).decode().split() == [str(REPOSITORY)]
+    assert (REPOSITORY / "lidarslam" / "py.typed").is_file()
+
+
 def test_links_of_the_description_are_absolute_and_lead_to_files(wheel: ZipFile) -> None:
     (metadata,) = (name for name in wheel.namelist() if name.endswith("/METADATA"))
     description = message_from_bytes(wheel.read(metadata)).get_payload()

@@ -8,27 +8,30 @@ from numpy.typing import ArrayLike, NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.config import Mounting
-from lidarslam.datasets.mounting.rotation import transform_of, turned
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.mounting.rotation import corrected, transform_of
 
 # Three rows of more columns than any point has are the coordinates of many points.
 _TRANSPOSED, _MOST_COLUMNS = 3, 32
 # No sweep lasts longer, and no clock reading is smaller.
 _LONGEST_OFFSET_S = 10.0
+# Of a cloud as KITTI stores it: x, y, z, intensity.
+_WITH_INTENSITY = 4
 # Thousands of years are no time in seconds.
 _LATEST_STAMP_S = 1e11
 # Stamps jitter; a sweep that is longer than so many intervals between stamps has other units.
 _MOST_INTERVALS = 4.0
 
 
-def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, mounting: Mounting = "auto") -> Scan:
+def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, config: ReaderConfig) -> Scan:
     """A scan, of copies, in upright axes, without the invalid points: NaN, at the origin, beyond 10 km.
 
     Args:
-        points: (N, 3) or more columns, of which the first three are x, y, z in metres; or a cloud of Open3D.
+        points: (N, 3) x, y, z in metres; (N, 4) with the intensity; more columns, of which only x, y, z are taken; or
+            a cloud of Open3D.
         point_times: (N,) seconds from the stamp.
         stamp: seconds.
-        mounting: of the points' axes; auto: upright.
+        config: mounting of the points' axes, of which auto is upright; elevation correction; scale of the times.
 
     Raises:
         InputError: an array has another shape, or a time is not in seconds.
@@ -41,8 +44,9 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, mo
     if len(table) == _TRANSPOSED and table.shape[1] > _MOST_COLUMNS:
         raise InputError(f"points must be (N, 3), got the shape {table.shape}; give points.T")
     times = None if point_times is None else _times(point_times, len(table))
-    scan = Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times)
-    return turned(scan, transform_of(mounting))
+    intensities = np.array(table[:, 3]) if table.shape[1] == _WITH_INTENSITY else None
+    scan = Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times, intensities=intensities)
+    return corrected(scan, transform_of(config.mounting), config.raised_deg(), config.time_scale)
 
 
 def make_vector(name: str, numbers: ArrayLike) -> FloatArray:

@@ -13,6 +13,8 @@ class RegisteredScan:
 
     stamp: float  # seconds
     T_world_lidar: FloatArray  # (4, 4) at the stamp; the world is the LiDAR frame of the first scan
+    # whether no later scan changes the pose: without a pose graph, whose loops correct the earlier ones
+    is_final: bool
     # status, message: ok, degraded or lost, and the reason unless it is ok; the pose of a lost scan is a prediction
     status: Status
     message: str
@@ -27,10 +29,11 @@ class RegisteredScan:
     inlier_ratio: float | None
 
     @classmethod
-    def of(cls, stamp: float, localised: Localised) -> "RegisteredScan":
+    def of(cls, stamp: float, localised: Localised, is_final: bool) -> "RegisteredScan":
         """Of a scan's pose."""
         return cls(
             stamp=stamp,
+            is_final=is_final,
             T_world_lidar=_read_only(localised.T_world_lidar),
             status=localised.status,
             message=localised.message,

@@ -85,9 +85,10 @@ class Slam:
         Points that are NaN, at the origin or beyond 10 km are left out. The arrays may be used again afterwards.
 
         Args:
-            points: (N, 3) or more columns, of which the first three are x, y, z: metres, in the LiDAR frame (x forward,
-                z up; others are turned by `reader.mounting`) of the instant each was measured at. Or a `Scan` in that
-                frame, which has times and stamp of its own, and whatever else goes into maps.
+            points: (N, 3) x, y, z: metres, in the LiDAR frame (x forward, z up; others are turned by
+                `reader.mounting`) of the instant each was measured at; (N, 4) with the intensity, which goes into the
+                map; of more columns only x, y, z are taken. Or a `Scan` in that frame, which has times and stamp of its
+                own and whatever else goes into maps, and which the settings of the reader leave as it is.
             point_times: (N,) seconds from the stamp at which each point was measured; None when the points are
                 motion compensated, or the times unknown.
             stamp: seconds, after that of the scan before; the pose belongs to this instant. None, then for all scans:
@@ -108,7 +109,7 @@ class Slam:
                 localised = self._stages.localise(estimated)
                 total_ms = 1e3 * (time.perf_counter() - started)
                 self._submit(estimated, localised, total_ms)
-            return RegisteredScan.of(scan.stamp, localised)
+            return RegisteredScan.of(scan.stamp, localised, self._graph is None)
 
     def register_imu(self, stamp: float, gyroscope: ArrayLike, acceleration: ArrayLike) -> None:
         """Take the next sample of the IMU; with `odometry.method` `learned+imu` or `imu`.
@@ -210,8 +211,7 @@ class Slam:
             raise InputError("give a stamp with every scan or with none")
         last = self._last_stamp
         seconds = check_stamp(self._count / self._config.reader.rate_hz if stamp is None else stamp, last)
-        mounting = self._config.reader.mounting
-        scan = points if isinstance(points, Scan) else make_scan(points, point_times, seconds, mounting)
+        scan = points if isinstance(points, Scan) else make_scan(points, point_times, seconds, self._config.reader)
         longest_s = 0.0 if last is None else max(self._longest_interval_s, seconds - last)
         if last is not None:
             check_sweep(scan, longest_s)

@@ -28,6 +28,7 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
     epilog="""lidarslam compare office.mcap
     lidarslam compare KITTI --sequence 04 -o compared/04 --methods learned,learned+map,kiss-icp
     lidarslam compare office.mcap --methods learned+map,learned+loam
+    lidarslam compare drive_0005_sync --methods learned+map,learned+imu+map
     lidarslam compare office.mcap --methods learned+map,kiss-icp-no-deskew,ct-icp,kiss-slam,small-gicp
     lidarslam compare office.mcap --methods kiss-icp,prior --prior wheel_odometry.tum
     lidarslam compare office.mcap --max learned+map:ate=0.1 --max lost=0
@@ -40,8 +41,8 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
     "--methods",
     metavar="NAME,...",
     help="BASE[@VOXEL][+map|+loam][+graph], BASE one of learned, kiss-icp, kiss-icp-no-deskew, constant-velocity, "
-    "imu, learned+imu and prior; or a peer such as ct-icp, kiss-slam, small-gicp (docs/comparison.md lists them).  "
-    "[default: learned+map,kiss-icp, or the benchmark's]",
+    "imu, learned+imu and prior, such as learned+imu+map; or a peer such as ct-icp, kiss-slam, small-gicp "
+    "(docs/comparison.md lists them).  [default: learned+map,kiss-icp, or the benchmark's]",
 )
 @click.option(
     "--benchmark",

@@ -31,6 +31,7 @@ _RRD = ".rrd"
     epilog="""lidarslam view
     lidarslam view runs/04 runs/wheels --web
     lidarslam view office.mcap --web
+    lidarslam view compared/04 --web
     lidarslam view runs/04/recording.rrd
     lidarslam view runs/04 --picture map.png
     lidarslam view compared/04 --picture maps.png""",
@@ -56,9 +57,9 @@ def view(
 ) -> None:
     """Show finished runs, the raw scans of a recording, or a Rerun recording.
 
-    RUN is a run directory; several are shown in one space, aligned with the ground truth if there is one.  [default:
-    the latest run in runs]  SOURCE is a recording; --start, --stop and --step choose its scans. With --picture, RUN may
-    also be the folder of a comparison, or a cloud (.ply or .pcd).
+    RUN is a run directory, or the folder of a comparison for its runs; several are shown in one space, aligned with the
+    ground truth if there is one.  [default: the latest run in runs]  SOURCE is a recording; --start, --stop and --step
+    choose its scans. With --picture, RUN may also be a cloud (.ply or .pcd).
     """
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
@@ -107,6 +108,7 @@ def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, An
     from lidarslam.compare.assessment.inputs import truth_of_run
     from lidarslam.config.settings import load_config
     from lidarslam.datasets.registry import is_recording
+    from lidarslam.storage.comparison_folder import run_directories
     from lidarslam.storage.finished_run import is_run, load_run
 
     if len(places) == 1 and not is_run(places[0]) and is_recording(places[0], options["reader"]):
@@ -115,10 +117,11 @@ def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, An
         if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT:
             raise click.UsageError(f"--{name} belongs to a recording, and {places[0]} is none")
     config = load_config(options["config_file"], options["settings"]).viewer
-    finished = [load_run(path) for path in places]
+    runs = [run for place in places for run in run_directories(place)]
+    finished = [load_run(path) for path in runs]
     from lidarslam.viewer.rerun_runs import show_runs
 
-    return show_runs(finished, truth_of_run(places[0]), config)
+    return show_runs(finished, truth_of_run(runs[0]), config)
 
 
 def _scans(source: Path, options: dict[str, Any]) -> Any:

@@ -1,11 +1,22 @@
 """A sequence of poses in time."""
 
 from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from lidarslam.core.errors import InputError
+from lidarslam.core.files import cannot_write
 from lidarslam.core.geometry import FloatArray, interpolate, inverse, is_rigid
+from lidarslam.core.pose_text import format_kitti, format_tum_poses, read_kitti_poses, read_tum_poses
+
+TextFormat = Literal["tum", "kitti"]
+
+# KITTI's LiDAR turns ten times a second.
+_KITTI_RATE_HZ = 10.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,6 +44,60 @@ class Trajectory:
             )
         if not is_rigid(self.T_world_lidar):
             raise ValueError("Trajectory.T_world_lidar must hold rigid transforms")
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], format: TextFormat | None = None) -> "Trajectory":
+        """Read a text file.
+
+        Args:
+            path: of the file.
+            format: `tum`, lines `stamp tx ty tz qx qy qz qw`; `kitti`, as `from_kitti`; None: `kitti` for the suffix
+                .kitti, else `tum`.
+
+        Raises:
+            InputError: the file is missing, or a line is not a pose.
+        """
+        if _format_of(path, format) == "kitti":
+            return cls.from_kitti(path)
+        return cls(*read_tum_poses(Path(path)))
+
+    @classmethod
+    def from_kitti(
+        cls, path: str | PathLike[str], stamps: ArrayLike | None = None, T_cam_lidar: FloatArray | None = None
+    ) -> "Trajectory":
+        """Read KITTI's text format: the first three rows of a pose matrix a line, without stamps.
+
+        Args:
+            path: of the file.
+            stamps: (N,) seconds; None: scans come at 10 Hz, from 0.
+            T_cam_lidar: (4, 4) where the poses are those of a camera, as in KITTI's ground truth: the extrinsic
+                calibration, which makes them those of the LiDAR. None: they are as they stand in the file.
+
+        Raises:
+            InputError: the file is missing, a line is not a pose, or there are not as many stamps as poses.
+        """
+        poses = read_kitti_poses(Path(path))
+        times = np.arange(len(poses)) / _KITTI_RATE_HZ if stamps is None else np.array(stamps, dtype=np.float64)
+        if times.shape != (len(poses),):
+            raise InputError(f"{path}: holds {len(poses):,} poses, and the stamps have the shape {times.shape}")
+        return cls(times, poses if T_cam_lidar is None else inverse(T_cam_lidar) @ poses @ T_cam_lidar)
+
+    def save(self, path: str | PathLike[str], format: TextFormat | None = None) -> None:
+        """Write a text file; one that is there is replaced.
+
+        Args:
+            path: of the file.
+            format: as of `load`; KITTI's has no stamps.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        is_kitti = _format_of(path, format) == "kitti"
+        text = format_kitti(self.T_world_lidar) if is_kitti else format_tum_poses(self.stamps, self.T_world_lidar)
+        try:
+            Path(path).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise cannot_write(Path(path), error) from error
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -92,6 +157,10 @@ class Trajectory:
         left = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self) - 2)
         fraction = (stamps - self.stamps[left]) / (self.stamps[left + 1] - self.stamps[left])
         return interpolate(self.T_world_lidar[left], self.T_world_lidar[left + 1], fraction)
+
+
+def _format_of(path: str | PathLike[str], format: TextFormat | None) -> TextFormat:
+    return format or ("kitti" if Path(path).suffix.lower() == ".kitti" else "tum")
 
 
 def chain(T_world_first: FloatArray, relative_motions: FloatArray) -> FloatArray:

@@ -43,3 +43,8 @@ class ReaderConfig(BaseModel):
         description="by how much all points are raised; null: 0.205 for KITTI, else 0; auto: that, and what `run` finds"
         " in a part of the recording beforehand",
     )
+
+    def raised_deg(self, of_reader: float = 0.0) -> float:
+        """By how much all points are raised, given what their reader does unless the settings have it."""
+        setting = self.elevation_correction_deg
+        return setting if isinstance(setting, float) else of_reader

@@ -183,8 +183,7 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
     recording = cast(Recording, import_module(READERS[name].module).open_recording(source, config))
-    setting = config.elevation_correction_deg
-    raised_deg = setting if isinstance(setting, float) else READERS[name].elevation_deg
+    raised_deg = config.raised_deg(READERS[name].elevation_deg)
     if config.mounting == "upright" and not raised_deg and config.time_scale == 1.0:
         return recording
     return MountedRecording(recording, config.mounting, raised_deg, config.time_scale)

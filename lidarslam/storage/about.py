@@ -59,7 +59,7 @@ class About:
         """
         path = run / ABOUT
         try:
-            values = read_json(path, _SHAPE)
+            values = read_json(path, _SHAPE, any_path=True)
             return cls({**values["description"]}, values["standing"], tuple(values["resumed_after"]))
         except (FileNotFoundError, NotADirectoryError):
             return None

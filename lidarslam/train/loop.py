@@ -163,11 +163,11 @@ class TrainingLoop:
                 result = validate(self._network, recordings.held_out, device=self._devices.device)
                 self._log.validation(progress.step, result)
                 # Without anything to compare with, the last is as good as any.
-                is_best = not result.pairs or progress.best is None or score(result) < progress.best
-                if is_best:
+                improves = progress.best is not None and score(result) < progress.best
+                if improves or not result.pairs or progress.best is None:
                     progress.best = score(result) if result.pairs else None
                     self._save_weights(files.WEIGHTS, result if result.pairs else None)
-                self._say(format_validation(progress.step, result, is_best))
+                self._say(format_validation(progress.step, result, improves))
             else:
                 self._save_weights(files.WEIGHTS, None)
             self._network.train()

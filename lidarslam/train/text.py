@@ -20,7 +20,7 @@ def format_step(step: int, steps: int, losses: Mapping[str, float], pairs_per_s:
     )
 
 
-def format_validation(step: int, result: Validation, is_best: bool) -> str:
+def format_validation(step: int, result: Validation, improves: bool) -> str:
     """Errors on held-out recordings."""
     after = f"validation after {count(step, 'step')}"
     if not result.pairs:
@@ -28,7 +28,7 @@ def format_validation(step: int, result: Validation, is_best: bool) -> str:
     covered = ", ".join(f"{percent:.0f}" for percent in result.covered_percent)
     return (
         f"{after}: {format_errors(result)} from scan to scan, over {count(result.pairs, 'pair')};"
-        f" {covered} % of the errors within 1, 2, 3 standard deviations{'; the best so far' if is_best else ''}"
+        f" {covered} % of the errors within 1, 2, 3 standard deviations{'; the best so far' if improves else ''}"
     )
 
 

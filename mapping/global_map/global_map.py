@@ -2,6 +2,8 @@
 
 import threading
 from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +13,7 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import State, Stateful
 from lidarslam.mapping.global_map import kernels
+from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.normals import estimate_normals
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
@@ -59,6 +62,17 @@ class PointCloud:
     def select(self, chosen: NDArray[np.bool_]) -> "PointCloud":
         """Some of the points, by a mask (N,)."""
         return PointCloud(self.points[chosen], self.normals[chosen], self.attributes.select(chosen))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a binary .ply, .pcd, .laz or .e57 file with the attributes, and normals but in .e57.
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            OutputError: the cloud is empty, the suffix is another, or the file cannot be written.
+        """
+        write_cloud(Path(path), self)
 
     def to_open3d(self) -> "o3d.geometry.PointCloud":
         """The points and normals as a cloud of Open3D."""

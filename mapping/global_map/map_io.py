@@ -12,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import OutputError
-from lidarslam.mapping.config import MapFormat
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.survey_formats import write_e57, write_laz
+from lidarslam.mapping.global_map.survey_formats import Cloud, write_e57, write_laz
 
 _POINTS_AT_A_TIME = 1_000_000
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
-def require_format(name: MapFormat) -> None:
+def require_format(name: str) -> None:
     """Check that maps can be written in a format.
 
     Raises:
@@ -30,20 +28,24 @@ def require_format(name: MapFormat) -> None:
         raise OutputError("E57 maps need pye57; type: pip install 'lidarslam[e57]'")
 
 
-def write_cloud(path: Path, cloud: PointCloud, brightest: float | None = None) -> None:
+def write_cloud(path: Path, cloud: Cloud, brightest: float | None = None) -> None:
     """Write a binary .ply, .pcd, .laz or .e57 file with points, normals and attributes; E57 holds no normals.
 
     Args:
-        path: of the file.
+        path: of the file, with one of these suffixes.
         cloud: with at least one point.
         brightest: the largest intensity of the map that the cloud is a part of, for .laz; None: it is the whole map.
 
     Raises:
-        OutputError: the file could not be written, or the cloud is empty.
+        OutputError: the file could not be written, has another suffix, or the cloud is empty.
     """
+    suffix = path.suffix.lower()
+    if suffix not in _WRITERS:
+        raise OutputError(f"{path}: expected a name that ends in {', '.join(_WRITERS)}")
+    require_format(suffix[1:])
     if not len(cloud):
         raise OutputError(f"{path.parent}: a map without points cannot be written")
-    write, failure = _WRITERS[path.suffix]
+    write, failure = _WRITERS[suffix]
     try:
         if brightest is None:
             write(path, cloud)
@@ -54,14 +56,14 @@ def write_cloud(path: Path, cloud: PointCloud, brightest: float | None = None) -
         raise OutputError(f"{path.parent}: the {path.suffix} map cannot be written there ({reason})") from error
 
 
-def _write_ply(path: Path, cloud: PointCloud) -> None:
+def _write_ply(path: Path, cloud: Cloud) -> None:
     columns = _columns(cloud)
     properties = "".join(f"property {_PLY_TYPES[values.dtype.str[1:]]} {name}\n" for name, values in columns.items())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n{properties}end_header\n"
     _write_table(path, header, columns)
 
 
-def _write_pcd(path: Path, cloud: PointCloud) -> None:
+def _write_pcd(path: Path, cloud: Cloud) -> None:
     columns = {name.replace("n", "normal_", 1) if name in _NORMALS else name: v for name, v in _columns(cloud).items()}
     if cloud.attributes.rgb is not None:  # the Point Cloud Library packs colours into the bits of a float
         red, green, blue = (columns.pop(name).astype(np.uint32) for name in _COLOURS)
@@ -81,7 +83,7 @@ _COLOURS = ("red", "green", "blue")
 _Columns = dict[str, NDArray[np.generic]]
 
 
-def _columns(cloud: PointCloud) -> _Columns:
+def _columns(cloud: Cloud) -> _Columns:
     """The columns (N,) of a table of the points, by the names of PLY properties."""
     known = cloud.attributes
     columns: _Columns = dict(zip("xyz", cloud.points.astype(np.float32).T, strict=True))
@@ -110,7 +112,7 @@ def _write_table(path: Path, header: str, columns: _Columns) -> None:
 
 
 # With what they raise where a file cannot be written; laspy, its compressor and libE57Format raise anything.
-_WRITERS: dict[str, tuple[Callable[[Path, PointCloud], None], type[Exception]]] = {
+_WRITERS: dict[str, tuple[Callable[[Path, Cloud], None], type[Exception]]] = {
     ".ply": (_write_ply, OSError),
     ".pcd": (_write_pcd, OSError),
     ".laz": (write_laz, Exception),

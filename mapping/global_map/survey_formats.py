@@ -1,10 +1,12 @@
 """Maps in the formats of surveyors: LAZ by laspy, E57 by pye57."""
 
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import PointAttributes
 
 # Metres; 32 bits of it reach 200 km to either side.
 _LAZ_STEP_M = 1e-4
@@ -14,7 +16,26 @@ _LAZ_NORMALS = ("NormalX", "NormalY", "NormalZ")
 _POINTS_AT_A_TIME = 1_000_000
 
 
-def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None, brightest: float | None = None) -> None:
+class Cloud(Protocol):
+    """What is written: points (N, 3), their normals (N, 3) and attributes."""
+
+    @property
+    def points(self) -> FloatArray:
+        """(N, 3) metres, in the world."""
+
+    @property
+    def normals(self) -> FloatArray:
+        """(N, 3) of unit length."""
+
+    @property
+    def attributes(self) -> PointAttributes:
+        """Of the points."""
+
+    def __len__(self) -> int:
+        """The number of points."""
+
+
+def write_laz(path: Path, cloud: Cloud, wkt: str | None = None, brightest: float | None = None) -> None:
     """Write a compressed LAS 1.4 file; normals and rings are extra dimensions, `wkt` is its coordinate system.
 
     Intensities and colours have 16 bits there: intensities up to 1 are scaled to 65535, others rounded. The cloud may
@@ -53,7 +74,7 @@ def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None, brightest: 
             file.write_points(record)
 
 
-def write_e57(path: Path, cloud: PointCloud) -> None:
+def write_e57(path: Path, cloud: Cloud) -> None:
     """Write an E57 file of one scan with coordinates, intensity and colour; pye57 writes no other fields."""
     import pye57
 

@@ -1,5 +1,6 @@
 """JSON of unknown origin."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,15 @@ def test_what_is_not_plain_is_a_value_error_of_one_line(name: str) -> None:
     with pytest.raises(ValueError, match=message) as refused:
         parse_json(text, ANY_OBJECT)
     assert "\n" not in str(refused.value)
+
+
+def test_paths_that_are_no_utf_8_are_read_where_they_may_be() -> None:
+    text = '{"a": "drive \\udcff"}'
+    assert parse_json(text, ANY_OBJECT, any_path=True) == {"a": os.fsdecode(b"drive \xff")}
+    with pytest.raises(ValueError, match="surrogates"):
+        parse_json(text, ANY_OBJECT)
+    with pytest.raises(ValueError, match="surrogates"):
+        parse_json('{"a": "\\ud800"}', ANY_OBJECT, any_path=True)
 
 
 def test_a_fault_of_shape_has_its_place() -> None:

@@ -5,16 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import exp, is_rigid
-from lidarslam.core.text.trajectory_io import (
-    format_kitti,
-    format_tum,
-    parse_numbers,
-    read_kitti_poses,
-    read_tum,
-    write_tum,
-)
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.geometry import exp, inverse, is_rigid
+from lidarslam.core.pose_text import format_kitti, parse_numbers, read_kitti_poses
+from lidarslam.core.text.trajectory_io import format_tum, read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
 
 # A quarter turn to the left about z; x looks along y.
@@ -138,6 +132,35 @@ def test_rounded_kitti_rotations_are_mended(written, random_trajectory):
 def test_what_is_wrong_with_a_kitti_file(text, words, written):
     with pytest.raises(InputError, match=words):
         read_kitti_poses(written(text))
+
+
+def test_trajectories_are_saved_and_loaded_as_both_texts(random_trajectory, tmp_path):
+    trajectory = random_trajectory(20)
+    trajectory.save(tmp_path / "t.tum")
+    assert (tmp_path / "t.tum").read_text() == format_tum(trajectory)
+    loaded = Trajectory.load(str(tmp_path / "t.tum"))
+    np.testing.assert_allclose(loaded.T_world_lidar, trajectory.T_world_lidar, atol=5e-9)
+    for name, format in (("t.kitti", None), ("t.txt", "kitti")):
+        trajectory.save(tmp_path / name, format)
+        assert (tmp_path / name).read_text() == format_kitti(trajectory.T_world_lidar)
+        loaded = Trajectory.load(tmp_path / name, format)
+        np.testing.assert_allclose(loaded.stamps, 0.1 * np.arange(20))
+        np.testing.assert_allclose(loaded.T_world_lidar, trajectory.T_world_lidar, rtol=1e-8, atol=1e-8)
+    with pytest.raises(InputError, match="which has no stamps"):
+        Trajectory.load(tmp_path / "t.txt")
+    with pytest.raises(OutputError, match=r"absent/t\.tum: cannot be written"):
+        trajectory.save(tmp_path / "absent" / "t.tum")
+
+
+def test_poses_of_kitti_s_camera_become_those_of_the_lidar(random_trajectory, tmp_path):
+    of_lidar, T_cam_lidar = random_trajectory(10), exp(np.array([1.2, -1.2, 1.2, 0.1, -0.2, 0.3]))
+    of_camera = T_cam_lidar @ of_lidar.T_world_lidar @ inverse(T_cam_lidar)
+    (tmp_path / "04.txt").write_text(format_kitti(of_camera))
+    loaded = Trajectory.from_kitti(tmp_path / "04.txt", of_lidar.stamps.tolist(), T_cam_lidar)
+    np.testing.assert_array_equal(loaded.stamps, of_lidar.stamps)
+    np.testing.assert_allclose(loaded.T_world_lidar, of_lidar.T_world_lidar, atol=1e-6)
+    with pytest.raises(InputError, match=r"holds 10 poses, and the stamps have the shape \(7,\)"):
+        Trajectory.from_kitti(tmp_path / "04.txt", of_lidar.stamps[:7])
 
 
 def test_numbers_of_an_empty_file_have_their_columns(written):

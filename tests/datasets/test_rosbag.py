@@ -259,6 +259,18 @@ def test_several_cloud_topics_are_listed(bag_kit, make_sweep):
     assert "/empty" not in str(caught.value)
 
 
+def test_a_topic_with_few_messages_beside_many_is_left_out(bag_kit, make_sweep):
+    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(20)])
+    path = bag_kit.write({"/points": clouds, "/map_points": clouds[-1:]})
+    told = "/points is read; /map_points (1) with few messages left out: choose with --topic."
+    recording = open_recording(path)
+    assert (len(recording), recording.describe().topic) == (20, "/points")
+    assert told in recording.warnings
+    assert told in describe_source(path, ReaderConfig())
+    asked = open_recording(path, ReaderConfig(topic="/map_points"))
+    assert (len(asked), asked.warnings) == (1, ())
+
+
 def test_info_lists_the_topics_to_choose_from(bag_kit, make_sweep):
     clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(2)])
     text = describe_source(

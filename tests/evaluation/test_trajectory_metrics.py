@@ -8,7 +8,7 @@ import pytest
 from kiss_icp.metrics import absolute_trajectory_error, sequence_error
 
 from lidarslam.core.geometry import exp
-from lidarslam.core.text.trajectory_io import read_kitti_poses
+from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 

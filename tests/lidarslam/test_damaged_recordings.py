@@ -19,9 +19,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import is_rigid
+from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_kitti_poses, read_tum
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.storage.about import About
+from lidarslam.storage.directory import UNFINISHED
 
 FAST = ("--odometry", "constant-velocity", "--no-pose-graph", "--no-report")
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")]
@@ -370,6 +373,10 @@ def test_a_name_that_no_terminal_can_show(tmp_path, tables):
     except OSError:
         pytest.skip("this file system has no such names")
     assert run(folder, asked=3)[0] == 0
+    about = About({"source": str(folder)}, "stopped", (2,))
+    (tmp_path / UNFINISHED).mkdir()
+    about.write(tmp_path)
+    assert About.read(tmp_path) == about, "such a run can be resumed"
 
 
 def test_what_is_no_recording_is_told_in_one_line(tmp_path, tables):

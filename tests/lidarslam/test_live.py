@@ -22,6 +22,7 @@ from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting.elevation import correct_elevation
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.mapping.config import MappingConfig
@@ -204,13 +205,14 @@ def test_point_times_are_inferred_from_the_first_cloud() -> None:
     np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
 
 
-def test_point_times_are_scaled_as_set() -> None:
-    raw = message_at(1000.5)
-    decoders = (CloudDecoder(ReaderConfig(time_scale=s), "sensor_msgs/msg/PointCloud2", Faults()) for s in (1.0, -0.5))
-    as_sent, scaled = (decoder.scan(raw, NOW) for decoder in decoders)
+def test_point_times_and_elevations_are_corrected_as_set() -> None:
+    raw, as_set = message_at(1000.5), ReaderConfig(time_scale=-0.5, elevation_correction_deg=0.2)
+    decoders = (CloudDecoder(config, "sensor_msgs/msg/PointCloud2", Faults()) for config in (ReaderConfig(), as_set))
+    as_sent, corrected = (decoder.scan(raw, NOW) for decoder in decoders)
     assert as_sent is not None
-    assert scaled is not None
-    np.testing.assert_array_equal(scaled.scan.time_offsets, -0.5 * as_sent.scan.time_offsets)
+    assert corrected is not None
+    np.testing.assert_array_equal(corrected.scan.time_offsets, -0.5 * as_sent.scan.time_offsets)
+    np.testing.assert_array_equal(corrected.scan.points, correct_elevation(as_sent.scan.points, 0.2))
 
 
 def test_clouds_are_turned_as_set() -> None:

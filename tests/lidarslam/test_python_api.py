@@ -17,6 +17,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.text.trajectory_io import read_tum, write_tum
+from lidarslam.datasets.mounting.elevation import correct_elevation
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.run import open_odometry
@@ -164,6 +165,39 @@ def test_points_as_drivers_give_them(slam: Slam, room_scans: list[Scan]) -> None
         buffer[:], times[:] = 7.0, 0.3
         np.testing.assert_allclose(result.T_world_lidar, same.T_world_lidar, atol=2e-3)
     assert np.linalg.norm(slam.map().points - [7.0, 7.0, 7.0], axis=1).min() > 0.5
+
+
+def test_a_fourth_column_is_the_intensity_of_the_map(slam: Slam, room_scans: list[Scan]) -> None:
+    for scan in room_scans[:3]:
+        left = scan.points[:, 1] > 0.0
+        slam.register_frame(np.column_stack([scan.points, np.where(left, 0.75, 0.25)]), scan.time_offsets, scan.stamp)
+    cloud = slam.map()
+    assert cloud.attributes.intensity is not None
+    sides = np.abs(cloud.points[:, 1]) > 0.5
+    np.testing.assert_allclose(
+        cloud.attributes.intensity[sides], np.where(cloud.points[sides, 1] > 0.0, 0.75, 0.25), atol=1e-6
+    )
+    with Slam(SETTINGS) as wider:
+        wider.register_frame(np.column_stack([room_scans[0].points, np.ones((len(room_scans[0]), 2))]))
+        assert wider.map().attributes.intensity is None
+
+
+def test_arrays_are_corrected_as_the_settings_of_the_reader_say(room_scans: list[Scan]) -> None:
+    reader = {"time_scale": 0.1, "elevation_correction_deg": 2.0}
+    with Slam(SETTINGS) as plain, Slam(SETTINGS | {"reader": reader}) as corrects:
+        for scan in room_scans[:4]:
+            expected = plain.register_frame(scan)
+            assert scan.time_offsets is not None
+            found = corrects.register_frame(correct_elevation(scan.points, -2.0), 10.0 * scan.time_offsets, scan.stamp)
+            np.testing.assert_allclose(found.T_world_lidar, expected.T_world_lidar, atol=1e-6)
+        as_it_is = corrects.register_frame(room_scans[4])
+        np.testing.assert_allclose(as_it_is.T_world_lidar, plain.register_frame(room_scans[4]).T_world_lidar, atol=1e-6)
+
+
+def test_only_a_pose_graph_changes_earlier_poses(room_scans: list[Scan]) -> None:
+    for settings, is_final in ((SETTINGS, True), (GRAPH, False)):
+        with Slam(settings) as slam:
+            assert slam.register_frame(room_scans[0]).is_final is is_final
 
 
 def test_clouds_of_open3d_go_in_and_out(slam: Slam, room_scans: list[Scan]) -> None:

@@ -110,6 +110,7 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder: Path
     console = Console(interrupt_at=4)
     assert not execute(request(room_folder, parts, ready), console)
     assert console.validated() == [0, 4]
+    assert not any("best so far" in line for line in console.lines if line.startswith("validation after 0 steps"))
     assert console.lines[-1].startswith("4 steps done; weights written to")
     assert "--resume" in console.lines[-1]
     assert execute(request(room_folder, parts, ready, resume=True), Console())

@@ -136,3 +136,13 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(map_io, "find_spec", lambda _name: None)
     with pytest.raises(OutputError, match=r"E57 maps need pye57; type: pip install 'lidarslam\[e57\]'$"):
         require_format("e57")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".PCD", ".laz"])
+def test_a_cloud_saves_itself(suffix, tmp_path):
+    cloud = PointCloud(np.eye(3), np.eye(3), PointAttributes(intensity=np.float32([1, 2, 3])))
+    cloud.save(str(tmp_path / f"saved{suffix}"))
+    write_cloud(tmp_path / f"written{suffix}", cloud)
+    assert (tmp_path / f"saved{suffix}").read_bytes() == (tmp_path / f"written{suffix}").read_bytes()
+    with pytest.raises(OutputError, match=r"map\.xyz: expected a name that ends in \.ply, \.pcd, \.laz, \.e57"):
+        cloud.save(tmp_path / "map.xyz")

@@ -22,8 +22,8 @@ _DEEPEST = 100
 _LARGEST_INTEGER = 1 << 63
 
 
-def read_json(path: Path, shape: TypeAdapter[T]) -> T:
-    """The content of a file in UTF-8.
+def read_json(path: Path, shape: TypeAdapter[T], any_path: bool = False) -> T:
+    """The content of a file in UTF-8; arguments as of `parse_json`.
 
     Raises:
         OSError: it cannot be read.
@@ -33,16 +33,17 @@ def read_json(path: Path, shape: TypeAdapter[T]) -> T:
         content = file.read(_LONGEST_BYTES + 1)
     if len(content) > _LONGEST_BYTES:
         raise ValueError(f"longer than {_LONGEST_BYTES >> 20} MB")
-    return parse_json(content, shape)
+    return parse_json(content, shape, any_path=any_path)
 
 
-def parse_json(text: str | bytes, shape: TypeAdapter[T], any_number: bool = False) -> T:
+def parse_json(text: str | bytes, shape: TypeAdapter[T], any_number: bool = False, any_path: bool = False) -> T:
     """The values of a text.
 
     Args:
         text: in UTF-8.
         shape: of the values.
         any_number: whether numbers may be infinite, NaN, or of any length.
+        any_path: whether texts may be paths that are not UTF-8, as Python has them: each such byte as half of a pair.
 
     Raises:
         ValueError: it is not JSON, is nested too deeply, has another shape, a number that is not finite, an integer
@@ -52,7 +53,7 @@ def parse_json(text: str | bytes, shape: TypeAdapter[T], any_number: bool = Fals
         values = json.loads(text if isinstance(text, str) else text.decode("utf-8"))
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    _require_plain(values, any_number)
+    _require_plain(values, any_number, "surrogateescape" if any_path else "strict")
     try:
         return shape.validate_python(values)
     except ValidationError as error:
@@ -61,7 +62,7 @@ def parse_json(text: str | bytes, shape: TypeAdapter[T], any_number: bool = Fals
         raise ValueError(one_line(f"{place}: {fault['msg']}" if place else fault["msg"])) from None
 
 
-def _require_plain(values: Any, any_number: bool) -> None:
+def _require_plain(values: Any, any_number: bool, errors: str) -> None:
     """Go through the values level by level."""
     level = [values]
     for _ in range(_DEEPEST):
@@ -73,7 +74,7 @@ def _require_plain(values: Any, any_number: bool) -> None:
             elif isinstance(value, list):
                 inner += value
             elif isinstance(value, str):
-                _require_text(value)
+                _require_text(value, errors)
             elif not any_number:
                 _require_number(value)
         if not inner:
@@ -82,10 +83,10 @@ def _require_plain(values: Any, any_number: bool) -> None:
     raise ValueError("nested too deeply")
 
 
-def _require_text(value: str) -> None:
+def _require_text(value: str, errors: str) -> None:
     if "\0" in value:
         raise ValueError("a text has a NUL character")
-    value.encode()  # half of a surrogate pair raises a ValueError
+    value.encode(errors=errors)  # half of a surrogate pair raises a ValueError
 
 
 def _require_number(value: Any) -> None:

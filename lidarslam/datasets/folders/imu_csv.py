@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.datasets.imu_samples import usable_samples
 
 IMU_FILE = "imu.csv"

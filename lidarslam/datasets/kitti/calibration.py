@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
-from lidarslam.core.text.bounded_lines import bounded_lines
 
 
 def read_calibration(path: Path) -> dict[str, FloatArray]:

@@ -13,9 +13,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.elevation import correct_elevation
 from lidarslam.datasets.mounting.guess import UPRIGHT, Guess, guess_mounting
-from lidarslam.datasets.mounting.rotation import transform_of, turned, written
+from lidarslam.datasets.mounting.rotation import corrected, transform_of, written
 from lidarslam.datasets.recording import Recording, RecordingInfo
 
 # Scans from one that a guess looks at to the next.
@@ -106,10 +105,7 @@ class MountedRecording:
         return scans if is_as_recorded else map(self._upright, scans)
 
     def _upright(self, scan: Scan) -> Scan:
-        scan = scan.with_times_scaled(self._time_scale)
-        if self.raised_deg:
-            scan = replace(scan, points=correct_elevation(scan.points, self.raised_deg))
-        return turned(scan, self.T_upright_recorded)
+        return corrected(scan, self.T_upright_recorded, self.raised_deg, self._time_scale)
 
     def describe(self) -> RecordingInfo:
         """The contents of the recording, and its mounting unless it is upright."""

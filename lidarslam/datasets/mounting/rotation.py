@@ -1,4 +1,4 @@
-"""Mountings by their names or angles, as rotations."""
+"""Mountings by their names or angles, as rotations, and scans corrected by them."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
+from lidarslam.datasets.mounting.elevation import correct_elevation
 
 # Roll, pitch, yaw in degrees of the recorded axes: which way the recorded z axis points, seen by who looks along x.
 _ANGLES_DEG: dict[MountingName, RollPitchYaw] = {
@@ -33,8 +34,18 @@ def transform_of(mounting: Mounting) -> FloatArray:
     return make_transform(whole if np.abs(R - whole).max() < 1e-12 else R, np.zeros(3))
 
 
-def turned(scan: Scan, T_upright_recorded: FloatArray) -> Scan:
-    """A scan of the recorded axes in upright ones, by a rotation (4, 4)."""
+def corrected(scan: Scan, T_upright_recorded: FloatArray, raised_deg: float, time_scale: float) -> Scan:
+    """A scan of the recorded axes in upright ones.
+
+    Args:
+        scan: as recorded.
+        T_upright_recorded: (4, 4), a rotation.
+        raised_deg: added to the elevations of all points, above the recorded x-y plane.
+        time_scale: factor on the points' times from the stamp.
+    """
+    scan = scan.with_times_scaled(time_scale)
+    if raised_deg:
+        scan = replace(scan, points=correct_elevation(scan.points, raised_deg))
     if np.array_equal(T_upright_recorded, np.eye(4)):
         return scan
     return replace(scan, points=np.ascontiguousarray(scan.points @ T_upright_recorded[:3, :3].T))

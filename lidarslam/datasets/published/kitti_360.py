@@ -12,8 +12,8 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform, orthonormalize
+from lidarslam.core.pose_text import parse_numbers
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import parse_numbers
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults

@@ -9,10 +9,12 @@ from lidarslam.datasets.ros.bag_message import CLOUD_TYPES, OUSTER_PACKET_TYPES,
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
+# Of the messages of one topic, what all others together have at most where they are no recordings: a map now and then.
+_NEGLIGIBLE = 0.05
 
 
 def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
-    """The wanted point cloud topic, or the only one with messages; without clouds, a topic of packets.
+    """The wanted point cloud topic, or the only one with many messages; without clouds, the only one of packets.
 
     Raises:
         SeveralTopicsError: there is more than one to choose from.
@@ -27,8 +29,9 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
         found = f"holds {_listing(named)}, which is no point cloud" if named else f"has no topic {wanted!r}"
         raise InputError(f"{source}: {found}; its point cloud topics: {_listing(clouds)}")
     clouds = clouds or packets
-    if len(clouds) == 1:
-        return clouds[0]
+    most = max(clouds, key=lambda topic: topic.messages, default=None)
+    if most is not None and sum(topic.messages for topic in clouds) <= (1.0 + _NEGLIGIBLE) * most.messages:
+        return most
     if clouds:
         message = f"{source}: several point cloud topics, choose one with --topic: {_listing(clouds)}"
         raise SeveralTopicsError(message, clouds, topics)
@@ -43,6 +46,13 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
         f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages."
         f"{hint.format(others[0].name) if others else ''} Its topics: {_listing(topics)}"
     )
+
+
+def others_left_out(topics: Sequence[Topic], chosen: Topic) -> str | None:
+    """A sentence where a bag has point clouds on other topics than the chosen one."""
+    others = [t for t in topics if t.message_type in CLOUD_TYPES and t.messages and t.name != chosen.name]
+    named = ", ".join(f"{topic.name} ({topic.messages})" for topic in others[:_TOPICS_LISTED])
+    return f"{chosen.name} is read; {named} with few messages left out: choose with --topic." if others else None
 
 
 def _has_packets(topic: Topic) -> bool:

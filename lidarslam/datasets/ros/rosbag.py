@@ -29,7 +29,7 @@ from lidarslam.datasets.ros.bag_message import (
     find_stamp_source,
 )
 from lidarslam.datasets.ros.bag_point_time import BagPointTime
-from lidarslam.datasets.ros.bag_topics import choose_topic, one_part
+from lidarslam.datasets.ros.bag_topics import choose_topic, one_part, others_left_out
 from lidarslam.datasets.ros.ouster_bag import OusterBag
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import timed_scan
@@ -106,9 +106,10 @@ class BagRecording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A lost index, headers without stamps, and what is wrong with the times of the points."""
+        """Other topics, a lost index, headers without stamps, and what is wrong with the times of the points."""
+        others = others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (self._bag.damage, unset, one_part(self._source), *self._point_time.warnings)
+        found = (others, self._bag.damage, unset, one_part(self._source), *self._point_time.warnings)
         return tuple(warning for warning in found if warning is not None)
 
     def scans(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.datasets.config import ReaderConfig
 
 # Clock readings count from 1970; a number outside these years is none.

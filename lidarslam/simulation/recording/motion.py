@@ -6,7 +6,8 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
-from lidarslam.core.text.trajectory_io import read_kitti_poses, read_tum
+from lidarslam.core.pose_text import read_kitti_poses
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion.carriers import Carrier, find_carrier
 from lidarslam.simulation.motion.given_motion import motion_along

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
+from lidarslam.core.pose_text import format_kitti
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import format_kitti
 from lidarslam.datasets.mounting.elevation import KITTI_DEG, correct_elevation
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig

@@ -6,7 +6,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.rotation import transform_of, turned
+from lidarslam.datasets.mounting.rotation import corrected, transform_of
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
@@ -75,8 +75,8 @@ class CloudDecoder:
         model = self._point_time
         offsets = None if model is None else field_offsets(cloud, model, stamp)
         scan = timed_scan(cloud, offsets, stamp, model is not None, self._faults)
-        scan = scan.with_times_scaled(self._config.time_scale)
-        return LiveScan(turned(scan, self.T_upright_recorded), stamp_ns, frame_id)
+        scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
+        return LiveScan(scan, stamp_ns, frame_id)
 
     def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
         """The header's stamp; the time of publication where the first header has none."""
