@@ -11,7 +11,7 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.viewer.drawing.annotations import INK, round_length
+from lidarslam.viewer.drawing.annotations import INK, START, round_length
 from lidarslam.viewer.drawing.shading import draw_layer, spacing_m
 from lidarslam.viewer.drawing.view import fit_view
 from lidarslam.viewer.picture import OBLIQUE, TOP, DrawnRun, Picture, draw_runs, height_colours, save_picture
@@ -137,7 +137,7 @@ def test_the_path_is_drawn_above_everything_with_its_ends_and_its_lost_stretch()
         (-6.0, (15, 15, 15)),
         (0.0, (255, 140, 0)),
         (6.0, (225, 0, 60)),
-        (-8.0, (0, 158, 115)),
+        (-8.0, START),
         (8.0, INK),
     ):
         assert is_like(near(picture, np.array([x, 0.0, 0.0])), colour), x

@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.report.bulk import in_bulk, leaves
 from lidarslam.evaluation.report.figures.figure import Figure, Panel, Styles, line_trace, thin_curve
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
@@ -16,8 +17,10 @@ ALIGNED = {
     "none": "without alignment",
 }
 _COMPONENTS = ("x, forward [m]", "y, left [m]", "z, up [m]", "roll [°]", "pitch [°]", "yaw [°]")
-# Largest errors that differ by this factor cannot be read on one linear axis.
+# Largest errors that differ by this factor cannot be read on one linear axis. A method whose errors are so much larger
+# than the others' leaves the picture, which ends at this multiple of the largest that stays.
 _LOG_RATIO = 10.0
+_BEYOND = 1.5
 
 Measured = Sequence[tuple[MethodResult, TrajectoryMetrics]]
 
@@ -36,6 +39,7 @@ def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
         f"Absolute trajectory error, {aligned_how(measured)}: distance between the estimated and the reference position"
         f" and angle between the orientations, over the distance travelled along the reference"
         f" ({sequence.reference_name}). Crosses mark scans on which tracking was lost."
+        f"{_leaving(measured, [metres for metres, _ in errors])}"
     )
     return Figure("Absolute errors", caption, panels, [method.name for method, _ in measured])
 
@@ -53,6 +57,7 @@ def deviation_figure(sequence: SequenceComparison, styles: Styles) -> Figure | N
     caption = (
         "Pose of the estimate in the frame of the reference's LiDAR (x forward, y left, z up),"
         f" {aligned_how(measured)}, over the distance travelled along the reference."
+        f"{_leaving(measured, [np.linalg.norm(components[:, :3], axis=1) for components in found])}"
     )
     return Figure("Error components", caption, panels, [method.name for method, _ in measured], columns=3)
 
@@ -87,11 +92,31 @@ def _panel(title: str, measured: Measured, curves: Sequence[FloatArray], styles:
             cross = {"symbol": "x", "size": 5, "color": style.colour}
             more = {"mode": "markers", "marker": cross, "hoverinfo": "skip"}
             traces.append(line_trace(method.name, style, travelled[lost], curve[lost], **more))
-    layout = {
+    layout: dict[str, Any] = {
         "xaxis": {"title": {"text": "distance travelled [m]"}, "hoverformat": ".1f"},
-        "yaxis": {},
+        "yaxis": {} if signed else {"rangemode": "tozero"},
         "hovermode": "x unified",
     }
-    if not signed:
-        layout["yaxis"] = {"rangemode": "tozero"}
-    return Panel(title, traces, layout, 190 if signed else 270, None if signed else needs_log(curves))
+    inside = _inside(curves)
+    kept = [curve for curve, is_kept in zip(curves, inside, strict=True) if is_kept]
+    log = None if signed else needs_log(kept)
+    end = _BEYOND * max(map(_largest, kept))
+    if not all(inside) and not log and end > 0.0:
+        layout["yaxis"]["range"] = [-end if signed else 0.0, end]
+    return Panel(title, traces, layout, 190 if signed else 270, log)
+
+
+def _largest(curve: FloatArray) -> float:
+    return float(np.nanmax(np.abs(curve), initial=0.0))
+
+
+def _inside(curves: Sequence[FloatArray]) -> list[bool]:
+    """Which of several curves the picture holds."""
+    return in_bulk([_largest(curve) for curve in curves], _LOG_RATIO)
+
+
+def _leaving(measured: Measured, distances_m: Sequence[FloatArray]) -> str:
+    """The sentences about methods that leave the picture."""
+    left = zip(measured, distances_m, _inside(distances_m), strict=True)
+    notes = [f" {leaves(m.name, _largest(far))}." for (m, _), far, inside in left if not inside]
+    return "".join([*notes, " A double click shows all."] if notes else notes)
