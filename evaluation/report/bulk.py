@@ -1,6 +1,6 @@
 """The bulk of several methods: one that diverges leaves the picture instead of flattening the others."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -38,9 +38,10 @@ def beyond_m(points: FloatArray, low: FloatArray, high: FloatArray) -> float:
     return float(np.maximum(np.maximum(low - points, points - high), 0.0).max(initial=0.0))
 
 
-def leaves(name: str, far_m: float) -> str:
-    """The note on a method of which a part is outside the picture."""
-    return f"{name} leaves the picture: up to {f'{far_m:,.0f}' if far_m >= 10.0 else f'{far_m:.2g}'} m"
+def leaves(name: str, far: Mapping[str, float]) -> str:
+    """The note on a method of which a part is outside the picture: its largest values by their units."""
+    texts = [f"{f'{value:,.0f}' if value >= 10.0 else f'{value:.2g}'}{unit}" for unit, value in far.items()]
+    return f"{name} leaves the picture: up to {' and '.join(texts)}"
 
 
 def _reach_m(path: FloatArray, centre: FloatArray) -> float:

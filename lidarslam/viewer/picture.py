@@ -286,7 +286,7 @@ def _entries(
     for run in runs:
         outside_m = beyond_m(run.positions @ view.axes[:2].T - view.centre, -half, half)
         if outside_m > 0.0:
-            yield Entry(f"{leaves(notes.short(_named(run, runs)), outside_m)} outside")
+            yield Entry(f"{leaves(notes.short(_named(run, runs)), {' m': outside_m})} outside")
 
 
 def _named(run: DrawnRun, runs: Sequence[DrawnRun]) -> str:

@@ -242,7 +242,9 @@ def test_a_runaway_leaves_the_pictures_instead_of_flattening_them(comparison, fi
     size_m = np.ptp(sequence.reference.positions[:, 0])
     assert np.ptp(top["layout"]["xaxis"]["range"]) < 1.5 * size_m
     wildest_m = wild.metrics.absolute_errors()[0].max()
-    assert f"wild leaves the picture: up to {wildest_m:,.0f} m. A double click shows all." in text_of(page)
+    wildest_deg = np.rad2deg(wild.metrics.absolute_errors()[1].max())
+    note = f"wild leaves the picture: up to {wildest_m:,.0f} m and {wildest_deg:,.0f}°. A double click shows all."
+    assert note in text_of(page)
     assert len(re.findall(r"wild leaves the picture: up to [\d,]+ m outside\.", text_of(page))) == 1
     assert "kiss-icp leaves the picture" not in text_of(page)
 
@@ -255,6 +257,8 @@ def test_methods_of_several_sizes_of_error_are_drawn_whole_on_a_logarithmic_axis
     assert plot["layout"]["yaxis"]["type"] == "log"
     assert "range" not in plot["layout"]["yaxis"]
     assert next(button.get("aria-pressed") for button in page.iter("button") if button.get("class") == "log") == "true"
+    (caption,) = (text_of(f.find("figcaption")) for f in page.iter("figure") if "Absolute errors" in text_of(f))
+    assert "leaves the picture" not in caption
 
 
 def test_ten_methods_on_five_long_recordings_stay_small(finished, random_drive):

@@ -1,6 +1,6 @@
 """Absolute errors over the distance travelled, and their components along the axes of the LiDAR."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,15 +31,16 @@ def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     if not measured:
         return None
     errors = [metrics.absolute_errors() for _, metrics in measured]
-    panels = [
-        _panel("Position error [m]", measured, [metres for metres, _ in errors], styles, signed=False),
-        _panel("Orientation error [°]", measured, [np.rad2deg(rad) for _, rad in errors], styles, signed=False),
-    ]
+    curves = {
+        "Position error [m]": [metres for metres, _ in errors],
+        "Orientation error [°]": [np.rad2deg(rad) for _, rad in errors],
+    }
+    panels = [_panel(title, measured, of, styles, signed=False) for title, of in curves.items()]
     caption = (
         f"Absolute trajectory error, {aligned_how(measured)}: distance between the estimated and the reference position"
         f" and angle between the orientations, over the distance travelled along the reference"
         f" ({sequence.reference_name}). Crosses mark scans on which tracking was lost."
-        f"{_leaving(measured, [metres for metres, _ in errors])}"
+        f"{_leaving(measured, curves, signed=False)}"
     )
     return Figure("Absolute errors", caption, panels, [method.name for method, _ in measured])
 
@@ -50,14 +51,12 @@ def deviation_figure(sequence: SequenceComparison, styles: Styles) -> Figure | N
     if not measured:
         return None
     found = [np.hstack(metrics.deviations()) for _, metrics in measured]
-    panels = [
-        _panel(title, measured, [components[:, axis] for components in found], styles, signed=True)
-        for axis, title in enumerate(_COMPONENTS)
-    ]
+    curves = {title: [components[:, axis] for components in found] for axis, title in enumerate(_COMPONENTS)}
+    panels = [_panel(title, measured, of, styles, signed=True) for title, of in curves.items()]
     caption = (
         "Pose of the estimate in the frame of the reference's LiDAR (x forward, y left, z up),"
         f" {aligned_how(measured)}, over the distance travelled along the reference."
-        f"{_leaving(measured, [np.linalg.norm(components[:, :3], axis=1) for components in found])}"
+        f"{_leaving(measured, curves, signed=True)}"
     )
     return Figure("Error components", caption, panels, [method.name for method, _ in measured], columns=3)
 
@@ -97,26 +96,34 @@ def _panel(title: str, measured: Measured, curves: Sequence[FloatArray], styles:
         "yaxis": {} if signed else {"rangemode": "tozero"},
         "hovermode": "x unified",
     }
-    inside = _inside(curves)
-    kept = [curve for curve, is_kept in zip(curves, inside, strict=True) if is_kept]
-    log = None if signed else needs_log(kept)
-    end = _BEYOND * max(map(_largest, kept))
-    if not all(inside) and not log and end > 0.0:
+    kept, log = _kept(curves, signed)
+    if not all(kept):
+        end = _BEYOND * max(_largest(curve) for curve, is_kept in zip(curves, kept, strict=True) if is_kept)
         layout["yaxis"]["range"] = [-end if signed else 0.0, end]
-    return Panel(title, traces, layout, 190 if signed else 270, log)
+    return Panel(title, traces, layout, 190 if signed else 270, None if signed else log)
+
+
+def _kept(curves: Sequence[FloatArray], signed: bool) -> tuple[list[bool], bool]:
+    """Which curves a panel holds, and whether its axis is logarithmic, which holds them all."""
+    largest = [_largest(curve) for curve in curves]
+    kept = in_bulk(largest, _LOG_RATIO)
+    log = not signed and needs_log([curve for curve, is_kept in zip(curves, kept, strict=True) if is_kept])
+    shows_all = log or not any(size for size, is_kept in zip(largest, kept, strict=True) if is_kept)
+    return [True] * len(kept) if shows_all else kept, log
 
 
 def _largest(curve: FloatArray) -> float:
     return float(np.nanmax(np.abs(curve), initial=0.0))
 
 
-def _inside(curves: Sequence[FloatArray]) -> list[bool]:
-    """Which of several curves the picture holds."""
-    return in_bulk([_largest(curve) for curve in curves], _LOG_RATIO)
-
-
-def _leaving(measured: Measured, distances_m: Sequence[FloatArray]) -> str:
-    """The sentences about methods that leave the picture."""
-    left = zip(measured, distances_m, _inside(distances_m), strict=True)
-    notes = [f" {leaves(m.name, _largest(far))}." for (m, _), far, inside in left if not inside]
+def _leaving(measured: Measured, panels: Mapping[str, Sequence[FloatArray]], signed: bool) -> str:
+    """The sentences about methods that leave a panel, by the panels' titles, which end with the unit."""
+    far: dict[str, dict[str, float]] = {}
+    for title, curves in panels.items():
+        unit = {"[m]": " m", "[°]": "°"}[title.split()[-1]]
+        for (method, _), curve, is_kept in zip(measured, curves, _kept(curves, signed)[0], strict=True):
+            if not is_kept:
+                of = far.setdefault(method.name, {})
+                of[unit] = max(of.get(unit, 0.0), _largest(curve))
+    notes = [f" {leaves(name, of)}." for name, of in far.items()]
     return "".join([*notes, " A double click shows all."] if notes else notes)

@@ -144,7 +144,7 @@ def _caption(sequence: SequenceComparison, paths: dict[str, FloatArray], low: Fl
     else:
         frame = "aligned with the reference by the first pose"
     outside = {name: far for name, path in paths.items() if (far := beyond_m(path, low, high)) > 0.0}
-    cut = "".join(f" {leaves(name, far)} outside." for name, far in outside.items())
+    cut = "".join(f" {leaves(name, {' m': far})} outside." for name, far in outside.items())
     cut += " A double click shows all." if outside else ""
     what = "Paths of all methods" if len(paths) > 1 else "Path"
     return (
