@@ -279,16 +279,21 @@ def test_view_writes_a_recording_and_a_picture(recording: Path, tmp_path: Path) 
     assert drawn.exit_code == 0
     assert (tmp_path / "map.png").stat().st_size > 1_000
     assert lidarslam("view", recording, "--picture", tmp_path / "none.png").exit_code == 1
-    coloured = lidarslam("view", tmp_path / "run", "--picture", tmp_path / "error.png", "--colour", "error")
+
+
+def test_a_picture_is_coloured_by_error(recording: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert lidarslam("run", recording, "--out", run).exit_code == 0
+    coloured = lidarslam("view", run, "--picture", tmp_path / "error.png", "--colour", "error")
     assert coloured.exit_code == 0, "the recording has ground truth"
-    assert (tmp_path / "error.png").read_bytes() != (tmp_path / "map.png").read_bytes()
-    both = ("view", tmp_path / "run", tmp_path / "run")
+    assert (tmp_path / "error.png").read_bytes() != (run / "map.png").read_bytes()
+    both = ("view", run, run)
     assert (
         "--colour is of one run, and these are 2" in lidarslam(*both, "--picture", "x.png", "--colour", "error").stderr
     )
     errors = tmp_path / "errors.ply"
-    reference = ("--reference-map", tmp_path / "run" / "map.ply")
-    assert lidarslam("evaluate", tmp_path / "run", *reference, "--errors", errors).exit_code == 0
+    reference = ("--reference-map", run / "map.ply")
+    assert lidarslam("evaluate", run, *reference, "--errors", errors).exit_code == 0
     apart = lidarslam("view", errors, "--picture", tmp_path / "apart", "--colour", "error")
     assert apart.stdout == f"written to {tmp_path / 'apart' / 'errors.ply.png'}\n"
 

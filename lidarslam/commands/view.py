@@ -21,8 +21,6 @@ from lidarslam.commands.shared.terminal import note, say, serving, wait_for_inte
 from lidarslam.core.errors import InputError
 
 if TYPE_CHECKING:
-    from lidarslam.viewer.drawing.colouring import Quantity
-    from lidarslam.viewer.picture import DrawnRun
     from lidarslam.viewer.web_page import WebPage
 
 _RRD = ".rrd"
@@ -69,7 +67,7 @@ def view(
     save: Path | None,
     picture: Path | None,
     video: Path | None,
-    colour: "Quantity | None",
+    colour: Any,
     oblique: bool,
     **options: Any,
 ) -> None:
@@ -156,12 +154,14 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
     return show_scans(recording, source, chosen, config.viewer, show_count, note)
 
 
-def _drawn(places: tuple[Path, ...], colour: "Quantity | None", apart: bool) -> "list[DrawnRun]":
+def _drawn(places: tuple[Path, ...], colour: Any, apart: bool) -> list[Any]:
+    """The runs that are drawn; their type is not named because that would import scipy."""
     from lidarslam.compare.assessment.inputs import truth_of_run
+    from lidarslam.storage.comparison_folder import run_directories
     from lidarslam.viewer.drawn_runs import load_drawn_runs, require_quantity
 
-    truth = truth_of_run(places[0]) if colour == "error" and places[0].is_dir() else None
-    runs = load_drawn_runs(places, truth)
+    first = run_directories(places[0])[0]
+    runs = load_drawn_runs(places, truth_of_run(first) if colour == "error" and first.is_dir() else None)
     if colour is not None and len(runs) > 1 and not apart:
         raise click.UsageError(f"--colour is of one run, and these are {len(runs)}, which have a colour each")
     for run in runs if colour is not None else ():
@@ -169,7 +169,7 @@ def _drawn(places: tuple[Path, ...], colour: "Quantity | None", apart: bool) -> 
     return runs
 
 
-def _draw(runs: "list[DrawnRun]", picture: Path, colour: "Quantity", oblique: bool) -> None:
+def _draw(runs: list[Any], picture: Path, colour: Any, oblique: bool) -> None:
     from lidarslam.viewer.picture import OBLIQUE, TOP, draw_apart, draw_runs, fit_frame, save_picture
 
     frame = fit_frame(runs, OBLIQUE if oblique else TOP, quantity=colour)
@@ -180,7 +180,7 @@ def _draw(runs: "list[DrawnRun]", picture: Path, colour: "Quantity", oblique: bo
         say(f"written to {', '.join(map(str, draw_apart(runs, picture, frame)))}")
 
 
-def _film(places: tuple[Path, ...], video: Path, colour: "Quantity | None") -> None:
+def _film(places: tuple[Path, ...], video: Path, colour: Any) -> None:
     from lidarslam.run.progress import show_count
     from lidarslam.viewer.video import check_video_file, save_video, turn_runs
 
