@@ -121,6 +121,9 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         (["view", "{recording}", "--web", "--save", "{out}.rrd"], 2, "exclude one another"),
         (["view", "{recording}", "--web", "--picture", "{out}.png"], 2, "exclude one another"),
         (["view", "{recording}", "--save", "{out}.rrd", "--picture", "{out}.png"], 2, "exclude one another"),
+        (["view", "{recording}", "--picture", "{out}.png", "--video", "{out}.gif"], 2, "exclude one another"),
+        (["view", "{recording}", "--colour", "error"], 2, "--colour belongs to --picture and --video"),
+        (["view", "{recording}", "--video", "{out}.avi"], 1, r"must end in .gif or .mp4"),
         (["run", "{recording}", "--out", "{out}", "--odometry", "loam"], 2, "'loam' is not one of"),
         (["run", "{recording}", "--out", "{out}", "--step", "0"], 2, "0 is not in the range x>=1"),
         (["run", "{recording}", "--out", "{out}", "--weights", "{recording}/none"], 2, "does not exist"),
@@ -292,6 +295,23 @@ def test_view_shows_the_runs_of_a_comparison(recording: Path, tmp_path: Path) ->
     assert saved.exit_code == 0
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "both.rrd").stream()}
     assert {r"/world/kiss-icp/trajectory", r"/world/kiss-icp\+map/map", r"/world/ground\ truth"} <= entities
+
+
+def test_a_picture_is_coloured_by_error(recording: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert lidarslam("run", recording, "--out", run).exit_code == 0
+    coloured = lidarslam("view", run, "--picture", tmp_path / "error.png", "--colour", "error")
+    assert coloured.exit_code == 0, "the recording has ground truth"
+    assert (tmp_path / "error.png").read_bytes() != (run / "map.png").read_bytes()
+    both = ("view", run, run)
+    assert (
+        "--colour is of one run, and these are 2" in lidarslam(*both, "--picture", "x.png", "--colour", "error").stderr
+    )
+    errors = tmp_path / "errors.ply"
+    reference = ("--reference-map", run / "map.ply")
+    assert lidarslam("evaluate", run, *reference, "--errors", errors).exit_code == 0
+    apart = lidarslam("view", errors, "--picture", tmp_path / "apart", "--colour", "error")
+    assert apart.stdout == f"written to {tmp_path / 'apart' / 'errors.ply.png'}\n"
 
 
 def test_options_that_the_source_has_no_use_for_are_named(recording: Path) -> None:

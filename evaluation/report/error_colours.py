@@ -6,6 +6,8 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 
 DEFAULT_CLIP_M = 0.5
+DISTANCE_FIELD = "distance_m"
+"""Of the points of a file, their distances to the reference map."""
 
 # Viridis at nine even stops (van der Walt, Smith, 2015): even in lightness, from dark for none to bright for far.
 _VIRIDIS = np.array(

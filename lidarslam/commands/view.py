@@ -34,12 +34,27 @@ _RRD = ".rrd"
     lidarslam view compared/04 --web
     lidarslam view runs/04/recording.rrd
     lidarslam view runs/04 --picture map.png
-    lidarslam view compared/04 --picture maps.png""",
+    lidarslam view compared/04 --picture maps.png
+    lidarslam view runs/04 --video map.gif""",
 )
 @click.argument("places", type=PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
 @click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
-@click.option("--picture", type=PATH, metavar="FILE.png", help="Draw runs, or .ply files, in one picture instead.")
+@click.option(
+    "--picture",
+    type=PATH,
+    metavar="FILE.png",
+    help="Draw runs, or .ply files, in one picture instead; into a folder, each in one of its own, in the same frame.",
+)
+@click.option(
+    "--video", type=PATH, metavar="FILE.gif", help="Turn what --picture draws once, as .gif, or .mp4 by ffmpeg."
+)
+@click.option(
+    "--colour",
+    type=click.Choice(["height", "intensity", "error", "rgb"]),
+    help="Colour of one run's map, in the picture or video; error: the path by its distance to the ground truth, or the"
+    " map that evaluate --errors wrote by that to the reference map.  [default: height]",
+)
 @click.option("--oblique", is_flag=True, help="Draw the picture obliquely instead of from above.")
 @scan_options
 @reader_options
@@ -52,6 +67,8 @@ def view(
     web: bool,
     save: Path | None,
     picture: Path | None,
+    video: Path | None,
+    colour: Any,
     oblique: bool,
     **options: Any,
 ) -> None:
@@ -61,11 +78,15 @@ def view(
     ground truth if there is one.  [default: the latest run in runs]  SOURCE is a recording; --start, --stop and --step
     choose its scans. With --picture, RUN may also be a cloud (.ply or .pcd).
     """
-    if sum([web, save is not None, picture is not None]) > 1:
-        raise click.UsageError("--web, --save and --picture exclude one another; choose one")
+    if sum([web, *(place is not None for place in (save, picture, video))]) > 1:
+        raise click.UsageError("--web, --save, --picture and --video exclude one another; choose one")
+    if (colour is not None and picture is None and video is None) or (oblique and picture is None):
+        raise click.UsageError("--colour belongs to --picture and --video, and --oblique to --picture")
     places = places or (latest_run(),)
     if picture is not None:
-        _draw(places, picture, oblique)
+        _draw(_drawn(places, colour, apart=not picture.suffix), picture, colour or "height", oblique)
+    elif video is not None:
+        _film(places, video, colour)
     elif any(place.suffix.lower() == _RRD for place in places):
         if len(places) > 1 or save is not None:
             raise click.UsageError(f"a {_RRD} file is shown alone, in a window or with --web")
@@ -136,9 +157,38 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
     return show_scans(recording, source, chosen, config.viewer, show_count, note)
 
 
-def _draw(runs: tuple[Path, ...], picture: Path, oblique: bool) -> None:
-    from lidarslam.viewer.drawn_runs import load_drawn_runs
-    from lidarslam.viewer.picture import OBLIQUE, TOP, draw_runs, save_picture
+def _drawn(places: tuple[Path, ...], colour: Any, apart: bool) -> list[Any]:
+    """The runs that are drawn; their type is not named because that would import scipy."""
+    from lidarslam.compare.assessment.inputs import truth_of_run
+    from lidarslam.storage.comparison_folder import run_directories
+    from lidarslam.viewer.drawn_runs import load_drawn_runs, require_quantity
 
-    save_picture(picture, draw_runs(load_drawn_runs(runs), OBLIQUE if oblique else TOP).pixels)
-    say(f"written to {picture}")
+    first = run_directories(places[0])[0]
+    runs = load_drawn_runs(places, truth_of_run(first) if colour == "error" and first.is_dir() else None)
+    if colour is not None and len(runs) > 1 and not apart:
+        raise click.UsageError(f"--colour is of one run, and these are {len(runs)}, which have a colour each")
+    for run in runs if colour is not None else ():
+        require_quantity(run, colour)
+    return runs
+
+
+def _draw(runs: list[Any], picture: Path, colour: Any, oblique: bool) -> None:
+    from lidarslam.viewer.picture import OBLIQUE, TOP, draw_apart, draw_runs, fit_frame, save_picture
+
+    frame = fit_frame(runs, OBLIQUE if oblique else TOP, quantity=colour)
+    if picture.suffix:
+        save_picture(picture, draw_runs(runs, frame=frame).pixels)
+        say(f"written to {picture}")
+    else:
+        say(f"written to {', '.join(map(str, draw_apart(runs, picture, frame)))}")
+
+
+def _film(places: tuple[Path, ...], video: Path, colour: Any) -> None:
+    from lidarslam.run.progress import show_count
+    from lidarslam.viewer.video import check_video_file, save_video, turn_runs
+
+    check_video_file(video)
+    runs = _drawn(places, colour, apart=False)
+    with show_count("drawing") as counted:
+        save_video(video, turn_runs(runs, colour or "height", counted))
+    say(f"written to {video}")

@@ -22,7 +22,7 @@ from lidarslam.simulation.recording.request import RecordRequest
 from lidarslam.storage.comparison_folder import REPORT_HTML
 from lidarslam.storage.finished_run import load_run
 from lidarslam.viewer.drawn_runs import load_drawn_runs
-from lidarslam.viewer.picture import draw_runs, save_picture
+from lidarslam.viewer.picture import draw_apart, fit_frame
 
 RECORDING, REPLAY = "recording", "demo.rrd"
 METHODS = "learned+map+graph,kiss-icp"
@@ -69,13 +69,8 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
 
         finished, truth = [load_run(run) for run in runs], truth_of_run(runs[0])
         save(show_runs(finished, truth, ViewerConfig()), out / REPLAY)
-    return Demo(out, outcome, tuple(_picture(out, place) for place in (source, *runs)))
-
-
-def _picture(out: Path, place: Path) -> Path:
-    path = out / f"{place.name}.png"
-    save_picture(path, draw_runs(load_drawn_runs([place])).pixels)
-    return path
+    drawn = load_drawn_runs([source, *runs])
+    return Demo(out, outcome, tuple(draw_apart(drawn, out, fit_frame(drawn))))
 
 
 def format_demo(demo: Demo) -> str:

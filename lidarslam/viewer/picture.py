@@ -1,6 +1,6 @@
 """Maps and trajectories of runs as a picture, drawn without a window or a graphics card."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lidarslam.core.errors import OutputError
-from lidarslam.core.files import cannot_write, replacing
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
+from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
 from lidarslam.evaluation.report.error_colours import viridis
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.viewer.drawing import annotations as notes
 from lidarslam.viewer.drawing.annotations import Colour, Entry
+from lidarslam.viewer.drawing.colouring import UNKNOWN, ColourScale, Quantity, fit_scale
 from lidarslam.viewer.drawing.shading import draw_layer
 from lidarslam.viewer.drawing.view import WIDTH, View, fit_view
 
@@ -28,16 +30,17 @@ _PATH_COLOURS: dict[Status, Colour] = {
     Status.DEGRADED: (255, 140, 0),
     Status.LOST: (225, 0, 60),
 }
-# After Okabe and Ito (blue, vermilion, green, purple, orange, sky blue).
+# After Okabe and Ito (blue, vermilion, green, purple, orange, sky blue), then two more.
 _RUN_COLOURS: tuple[Colour, ...] = (
-    (0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233),
+    (0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (120, 40, 90),
+    (110, 80, 50),
 )  # fmt: skip
+# Of several paths each is so much wider than the next, which is drawn above it: both are seen where they coincide.
+_WIDENING = 0.8
 _REFERENCE: Colour = (150, 150, 150)
+_REFERENCE_WIDER = 2.0
 _MAP_TINT = 0.55  # the share of a run's colour in that of its map; the rest is white
 _RAMP_LENGTH = 0.08
-# Colours of heights on white paper: light ground, dark tops; (256, 3).
-_STOPS = np.array([[201, 209, 214], [140, 181, 199], [66, 138, 166], [41, 84, 135], [60, 28, 92]])
-_RAMP = np.stack([np.interp(np.linspace(0.0, 4.0, 256), range(5), stop) for stop in _STOPS.T], axis=1).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,31 @@ class DrawnRun:
     cloud: PointCloud
     positions: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) of the trajectory
     statuses: Sequence[Status] = ()  # of the N scans; none: all ok
+    errors_m: FloatArray | None = None  # (N,) distances of the positions to the reference, NaN where it has none
+    distances_m: FloatArray | None = None  # of the cloud's points to a reference map
+
+    def point_values(self, quantity: Quantity) -> FloatArray | None:
+        """What the points of the cloud are coloured by; None where they have no such number."""
+        intensity = self.cloud.attributes.intensity
+        values = {
+            "height": self.cloud.points[:, 2],
+            "intensity": None if intensity is None else intensity.astype(np.float64),
+            "error": self.distances_m,
+        }
+        return values.get(quantity)
+
+    def pose_values(self, quantity: Quantity) -> FloatArray | None:
+        """What the path is coloured by; None for its status."""
+        return self.errors_m if quantity == "error" and self.distances_m is None else None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What pictures that are compared have in common."""
+
+    view: View
+    quantity: Quantity  # that a single run is coloured by
+    scale: ColourScale | None  # of its colours; None without values
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,35 +86,85 @@ class Picture:
     view: View
 
 
+def fit_frame(
+    runs: Sequence[DrawnRun],
+    elevation_deg: float = TOP,
+    reference: FloatArray | None = None,
+    width: int = WIDTH,
+    quantity: Quantity = "height",
+    turn_deg: float | None = None,
+) -> Frame:
+    """The frame that holds runs but for those that diverge; arguments as in `draw_runs` and `fit_view`."""
+    view = fit_view(*framed(runs, reference), elevation_deg, turn_deg, width)
+    return Frame(view, quantity, _fit_scale(runs, quantity))
+
+
+def framed(runs: Sequence[DrawnRun], reference: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """The points (N, 3) and positions (M, 3) that a picture has to hold: not those of runs that diverge."""
+    moved = [run for run in runs if len(run.positions)]
+    kept = dict(zip(map(id, moved), paths_in_bulk([run.positions for run in moved], reference), strict=True))
+    shown = [run for run in runs if kept.get(id(run), True)]
+    positions = [run.positions for run in shown] + ([] if reference is None else [reference])
+    return np.concatenate([run.cloud.points for run in shown or runs]), np.concatenate(positions)
+
+
 def draw_runs(
-    runs: Sequence[DrawnRun], elevation_deg: float = TOP, reference: FloatArray | None = None, width: int = WIDTH
+    runs: Sequence[DrawnRun],
+    elevation_deg: float = TOP,
+    reference: FloatArray | None = None,
+    width: int = WIDTH,
+    frame: Frame | None = None,
 ) -> Picture:
     """Maps and trajectories in one frame, with legend, size and scale bar.
 
-    One run is coloured by height, and its path by status. Several have a colour each; where maps cover each other,
-    their colours mix.
+    One run is coloured by the frame's quantity, by height without a frame, and its path by status. Several have a
+    colour each; where maps cover each other, their colours mix. Their paths are the narrower the later in order.
 
     Args:
         runs: in one world.
         elevation_deg: of the camera above the horizon; the projection is orthographic.
         reference: positions (K, 3) of a true trajectory, drawn below the others.
         width: of the picture, pixels.
+        frame: the view and colours, instead of those that suit the runs.
     """
-    points = np.concatenate([run.cloud.points for run in runs])
-    paths = [run.positions for run in runs] + ([] if reference is None else [reference])
-    view = fit_view(points, np.concatenate(paths), elevation_deg, width=width)
-    fine = view.enlarged(_SUPERSAMPLING)
+    frame = frame or fit_frame(runs, elevation_deg, reference, width)
+    fine = frame.view.enlarged(_SUPERSAMPLING)
     colours = _colours(runs)
-    image = Image.fromarray(_draw_maps(runs, colours, fine))
+    image = Image.fromarray(_draw_maps(runs, colours, fine, frame))
     if reference is not None:
-        notes.draw_path(image, fine, reference, [_REFERENCE] * len(reference), around=_REFERENCE)
-    halo = notes.HALO if len(points) else None
-    for run, colour in zip(runs, colours, strict=True):
-        notes.draw_path(image, fine, run.positions, _path_colours(run, colour), halo)
-    for run, colour in zip(runs, colours, strict=True):
-        notes.draw_ends(image, fine, run.positions, colour or notes.INK)
-    image = notes.with_strip(image.reduce(_SUPERSAMPLING), list(_entries(runs, colours, view, reference is not None)))
-    return Picture(np.asarray(image), view)
+        notes.draw_path(image, fine, reference, [_REFERENCE] * len(reference), _REFERENCE_WIDER)
+    widths = [1.0 + _WIDENING * below for below in reversed(range(len(runs)))]
+    around = _outline(runs, frame)
+    if around == notes.INK:  # the path is to be read by its colour
+        widths = [_REFERENCE_WIDER]
+    if around is not None:
+        for run, wider in zip(runs, widths, strict=True):
+            notes.draw_outline(image, fine, run.positions, around, wider)
+    for run, colour, wider in zip(runs, colours, widths, strict=True):
+        notes.draw_path(image, fine, run.positions, _path_colours(run, colour, frame), wider)
+    for run, colour, wider in zip(runs, colours, widths, strict=True):
+        notes.draw_end(image, fine, run.positions[-1:], colour or notes.INK, wider)
+    for run in runs:
+        notes.draw_end(image, fine, run.positions[:1], notes.START)
+    entries = list(_entries(runs, colours, widths, frame, reference is not None))
+    return Picture(np.asarray(notes.with_strip(image.reduce(_SUPERSAMPLING), entries)), frame.view)
+
+
+def draw_apart(runs: Sequence[DrawnRun], folder: Path, frame: Frame) -> list[Path]:
+    """A picture of each run, FOLDER/NAME.png, all in one frame; the files.
+
+    Raises:
+        InputError: two runs have one name.
+        OutputError: they cannot be written.
+    """
+    names = [run.name for run in runs]
+    if len(set(names)) < len(names):
+        raise InputError(f"{folder}: several runs have one name ({', '.join(names)}); draw them in one picture")
+    make_directory(folder)
+    files = [folder / f"{name}.png" for name in names]
+    for run, file in zip(runs, files, strict=True):
+        save_picture(file, draw_runs([run], frame=frame).pixels)
+    return files
 
 
 def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
@@ -108,20 +186,13 @@ def height_colours(points: FloatArray) -> NDArray[np.uint8]:
     """Colours (N, 3) by the height of points (N, 3), the lowest and highest 2 % clipped."""
     if not len(points):
         return np.empty((0, 3), dtype=np.uint8)
-    low, high = _heights(points)
+    low, high = np.percentile(points[:, 2], [2.0, 98.0])
     return viridis(np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0))
 
 
-def _heights(points: FloatArray) -> tuple[float, float]:
-    low, high = np.percentile(points[:, 2], [2.0, 98.0])
-    return float(low), float(high)
-
-
-def _paper_colours(points: FloatArray) -> NDArray[np.uint8]:
-    """Colours (N, 3) by height, as `height_colours`, from light ground to dark tops."""
-    low, high = _heights(points)
-    level = np.clip((points[:, 2] - low) * (255.0 / max(high - low, 1e-6)), 0.0, 255.0)
-    return _RAMP[level.astype(np.uint8)]
+def _fit_scale(runs: Sequence[DrawnRun], quantity: Quantity) -> ColourScale | None:
+    found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
+    return fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
 
 
 def _colours(runs: Sequence[DrawnRun]) -> list[Colour | None]:
@@ -131,14 +202,16 @@ def _colours(runs: Sequence[DrawnRun]) -> list[Colour | None]:
     return [_RUN_COLOURS[number % len(_RUN_COLOURS)] for number in range(len(runs))]
 
 
-def _draw_maps(runs: Sequence[DrawnRun], colours: Sequence[Colour | None], view: View) -> NDArray[np.uint8]:
+def _draw_maps(
+    runs: Sequence[DrawnRun], colours: Sequence[Colour | None], view: View, frame: Frame
+) -> NDArray[np.uint8]:
     """All maps (height, width, 3) on paper; the mean of their colours where several cover a pixel."""
     total = np.zeros((view.height * view.width, 3), dtype=np.uint16)
     count = np.zeros(len(total), dtype=np.uint16)
     for run, colour in zip(runs, colours, strict=True):
         if len(run.cloud):
             layer = draw_layer(run.cloud.points, run.cloud.normals, view)
-            surface = _paper_colours(run.cloud.points)[layer.points] if colour is None else _tint(colour)
+            surface = _point_colours(run, frame)[layer.points] if colour is None else _tint(colour)
             total[layer.pixels] += (surface * layer.brightness[:, None]).astype(np.uint16)
             count[layer.pixels] += 1
     picture = np.full(total.shape, notes.PAPER, dtype=np.uint8)
@@ -147,39 +220,74 @@ def _draw_maps(runs: Sequence[DrawnRun], colours: Sequence[Colour | None], view:
     return picture.reshape(view.height, view.width, 3)
 
 
+def _point_colours(run: DrawnRun, frame: Frame) -> NDArray[np.uint8]:
+    """Colours (N, 3) of the points of a single run."""
+    values, rgb = run.point_values(frame.quantity), run.cloud.attributes.rgb
+    if frame.quantity == "rgb" and rgb is not None:
+        return rgb
+    if frame.scale is None or values is None:
+        return np.tile(np.array(UNKNOWN, dtype=np.uint8), (len(run.cloud), 1))
+    return frame.scale.colours(values)
+
+
 def _tint(colour: Colour) -> NDArray[np.float32]:
     """The colour of a run's map."""
     return np.float32(_MAP_TINT) * np.array(colour, dtype=np.float32) + np.float32(255.0 * (1.0 - _MAP_TINT))
 
 
-def _path_colours(run: DrawnRun, colour: Colour | None) -> list[Colour]:
+def _path_colours(run: DrawnRun, colour: Colour | None, frame: Frame) -> list[Colour]:
+    values = run.pose_values(frame.quantity) if colour is None else None
+    if values is not None and frame.scale is not None:
+        return [(red, green, blue) for red, green, blue in frame.scale.colours(values).tolist()]
     statuses = run.statuses or [Status.OK] * len(run.positions)
     usual = _PATH_COLOURS | ({} if colour is None else {Status.OK: colour, Status.DEGRADED: colour})
     return [usual[status] for status in statuses]
 
 
+def _outline(runs: Sequence[DrawnRun], frame: Frame) -> Colour | None:
+    """The colour around paths: dark where these are pale, white on maps, none on paper."""
+    if len(runs) == 1 and runs[0].pose_values(frame.quantity) is not None:
+        return notes.INK
+    return notes.HALO if any(len(run.cloud) for run in runs) else None
+
+
 def _entries(
-    runs: Sequence[DrawnRun], colours: Sequence[Colour | None], view: View, with_reference: bool
-) -> list[Entry]:
-    """The legend, the size of the frame, and the scale bar."""
-    entries = []
-    for run, colour in zip(runs, colours, strict=True):
+    runs: Sequence[DrawnRun],
+    colours: Sequence[Colour | None],
+    widths: Sequence[float],
+    frame: Frame,
+    with_reference: bool,
+) -> Iterator[Entry]:
+    """The legend, the size of the frame, the scale bar, and who leaves the picture."""
+    view = frame.view
+    single = runs[0] if len(runs) == 1 else None
+    by_status = single is None or single.pose_values(frame.quantity) is None
+    for run, colour, wider in zip(runs, colours, widths, strict=True):
         length_m = float(np.linalg.norm(np.diff(run.positions, axis=0), axis=1).sum())
-        named = "path" if colour is None else run.name
         if len(run.positions) or colour is not None:
-            text = f"{named}, {length_m:.0f} m" if len(run.positions) else named
-            entries.append(notes.line_entry(text, colour or _PATH_COLOURS[Status.OK], view.width))
-    found = {status for run in runs for status in run.statuses}
-    shown = (Status.DEGRADED, Status.LOST) if len(runs) == 1 else (Status.LOST,)
-    entries += [notes.line_entry(s.value, _PATH_COLOURS[s], view.width) for s in shown if s in found]
+            text = f"{_named(run, runs)}, {length_m:.0f} m" if len(run.positions) else run.name
+            line = colour or _PATH_COLOURS[Status.OK]
+            yield notes.line_entry(text, line, view.width, wider) if by_status else Entry(text)
+    found = {status for run in runs for status in run.statuses} if by_status else set()
+    shown = (Status.LOST,) if single is None else (Status.DEGRADED, Status.LOST)
+    yield from (notes.line_entry(s.value, _PATH_COLOURS[s], view.width) for s in shown if s in found)
     if with_reference:
-        entries.append(notes.line_entry("ground truth", _REFERENCE, view.width))
+        yield notes.line_entry("ground truth", _REFERENCE, view.width)
     if any(len(run.positions) for run in runs):
-        entries += [notes.end_entry("start", notes.START, view.width), notes.end_entry("end", notes.INK, view.width)]
-    if len(runs) == 1 and len(runs[0].cloud):
-        low, high = _heights(runs[0].cloud.points)
-        ramp = _RAMP[np.linspace(0, 255, round(_RAMP_LENGTH * view.width)).astype(np.intp)]
-        entries.append(notes.ramp_entry(f"z {low:.1f}", f"{high:.1f} m", ramp, view.width))
+        yield notes.end_entry("start", notes.START, view.width)
+        yield notes.end_entry("end", notes.INK, view.width)
+    if single is not None and frame.scale is not None and (len(single.cloud) or not by_status):
+        ramp = frame.scale.ramp[np.linspace(0, 255, round(_RAMP_LENGTH * view.width)).astype(np.intp)]
+        yield notes.ramp_entry(*frame.scale.ends, ramp, view.width)
     across, up = view.size_m
-    size = f"{across:.0f} m x {up:.0f} m" if view.axes[2, 2] == 1.0 else f"{across:.0f} m wide"
-    return [*entries, notes.scale_entry(view), Entry(size)]
+    yield notes.scale_entry(view)
+    yield Entry(f"{across:.0f} m x {up:.0f} m" if view.axes[2, 2] == 1.0 else f"{across:.0f} m wide")
+    half = 0.5 * view.pixel_m * np.array([view.width, view.height])
+    for run in runs:
+        outside_m = beyond_m(run.positions @ view.axes[:2].T - view.centre, -half, half)
+        if outside_m > 0.0:
+            yield Entry(f"{leaves(notes.short(_named(run, runs)), {' m': outside_m})} outside")
+
+
+def _named(run: DrawnRun, runs: Sequence[DrawnRun]) -> str:
+    return "path" if len(runs) == 1 else run.name

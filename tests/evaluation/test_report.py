@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
@@ -226,16 +227,38 @@ def test_an_empty_comparison_and_one_without_references_are_rendered(comparison,
     page_of(Comparison("None", "", [replace(alone, methods=[MethodResult("gone", "not run")])]))
 
 
-def test_a_runaway_is_drawn_whole_on_a_logarithmic_axis(comparison, finished):
+def test_a_runaway_leaves_the_pictures_instead_of_flattening_them(comparison, finished):
     sequence = comparison.sequences[0]
-    wild = finished("wild", sequence.reference, 9, 200.0)
-    page = page_of(replace(comparison, sequences=[replace(sequence, methods=[sequence.methods[1], wild])]))
+    good, wild = sequence.methods[1], finished("wild", sequence.reference, 9, 200.0)
+    page = page_of(replace(comparison, sequences=[replace(sequence, methods=[good, wild])]))
+    largest_m = good.metrics.absolute_errors()[0].max()
+    (plot,) = plots(page, "Position error [m]")
+    assert plot["layout"]["yaxis"].get("type") is None, "linear"
+    np.testing.assert_allclose(plot["layout"]["yaxis"]["range"], [0.0, 1.5 * largest_m], rtol=1e-4)
+    assert [trace["name"] for trace in plot["data"]] == ["kiss-icp", "wild"]
+    (up,) = plots(page, "z, up [m]")
+    assert up["layout"]["yaxis"]["range"][1] <= 1.5 * largest_m
+    (top,) = plots(page, "Top view: y over x [m]")
+    size_m = np.ptp(sequence.reference.positions[:, 0])
+    assert np.ptp(top["layout"]["xaxis"]["range"]) < 1.5 * size_m
+    wildest_m = wild.metrics.absolute_errors()[0].max()
+    wildest_deg = np.rad2deg(wild.metrics.absolute_errors()[1].max())
+    note = f"wild leaves the picture: up to {wildest_m:,.0f} m and {wildest_deg:,.0f}°. A double click shows all."
+    assert note in text_of(page)
+    assert len(re.findall(r"wild leaves the picture: up to [\d,]+ m outside\.", text_of(page))) == 1
+    assert "kiss-icp leaves the picture" not in text_of(page)
+
+
+def test_methods_of_several_sizes_of_error_are_drawn_whole_on_a_logarithmic_axis(comparison, finished):
+    sequence = comparison.sequences[0]
+    methods = [finished(str(n), sequence.reference, n, sigma) for n, sigma in enumerate((0.001, 0.03, 0.1))]
+    page = page_of(replace(comparison, sequences=[replace(sequence, methods=methods)]))
     (plot,) = plots(page, "Position error [m]")
     assert plot["layout"]["yaxis"]["type"] == "log"
     assert "range" not in plot["layout"]["yaxis"]
-    assert [trace["name"] for trace in plot["data"]] == ["kiss-icp", "wild"]
     assert next(button.get("aria-pressed") for button in page.iter("button") if button.get("class") == "log") == "true"
-    assert "A path leaves the view" in text_of(page)
+    (caption,) = (text_of(f.find("figcaption")) for f in page.iter("figure") if "Absolute errors" in text_of(f))
+    assert "leaves the picture" not in caption
 
 
 def test_ten_methods_on_five_long_recordings_stay_small(finished, random_drive):

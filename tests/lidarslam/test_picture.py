@@ -1,20 +1,35 @@
 """Pictures: everything is in the frame, at its place and to scale; what is in front hides what is behind."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
-from lidarslam.core.errors import OutputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.viewer.drawing.annotations import INK, round_length
+from lidarslam.viewer.drawing.annotations import INK, START, round_length
 from lidarslam.viewer.drawing.shading import draw_layer, spacing_m
-from lidarslam.viewer.drawing.view import fit_view
-from lidarslam.viewer.picture import OBLIQUE, TOP, DrawnRun, Picture, draw_runs, height_colours, save_picture
+from lidarslam.viewer.drawing.view import fit_view, turning_views
+from lidarslam.viewer.drawn_runs import require_quantity
+from lidarslam.viewer.picture import (
+    OBLIQUE,
+    TOP,
+    DrawnRun,
+    Picture,
+    draw_apart,
+    draw_runs,
+    fit_frame,
+    height_colours,
+    save_picture,
+)
+from lidarslam.viewer.video import check_video_file, save_video, turn_runs
 
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 WIDTH = 400
@@ -137,7 +152,7 @@ def test_the_path_is_drawn_above_everything_with_its_ends_and_its_lost_stretch()
         (-6.0, (15, 15, 15)),
         (0.0, (255, 140, 0)),
         (6.0, (225, 0, 60)),
-        (-8.0, (0, 158, 115)),
+        (-8.0, START),
         (8.0, INK),
     ):
         assert is_like(near(picture, np.array([x, 0.0, 0.0])), colour), x
@@ -231,3 +246,123 @@ def test_a_picture_is_written_as_png(tmp_path: Path) -> None:
 def test_a_picture_in_no_folder_says_so(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"map\.png: cannot be written \(No such file"):
         save_picture(tmp_path / "none" / "map.png", np.zeros((2, 2, 3), dtype=np.uint8))
+
+
+def line(y: float, reach_m: float = 9.0) -> FloatArray:
+    return np.column_stack([np.linspace(-reach_m, reach_m, 400), np.full(400, y), np.zeros(400)])
+
+
+NOTHING = PointCloud(np.empty((0, 3)), np.empty((0, 3)))
+
+
+def test_paths_that_coincide_are_all_seen_and_have_no_gaps() -> None:
+    arc = np.column_stack([9.0 * np.sin(a := np.linspace(-1.0, 1.0, 700)), 9.0 * np.cos(a), np.zeros(700)])
+    picture = draw_runs([DrawnRun(name, NOTHING, arc) for name in "abc"], width=1600)
+    colours = [(0, 114, 178), (213, 94, 0), (0, 158, 115)]
+    for place in arc[50:-50:7]:
+        column, row = np.round(picture.view.project(place[None])[0]).astype(int)
+        across = picture.pixels[row - 12 : row + 13, column].astype(np.int64)
+        assert all(is_like(across, colour) for colour in colours), place
+    for position in arc[[0, -1]]:
+        assert not any(is_like(near(picture, position, 0), colour) for colour in colours[:2])
+    assert not any(np.abs(np.subtract(START, colour)).max() < 60 for colour in colours)
+
+
+def test_a_run_that_diverges_leaves_the_picture_and_is_named() -> None:
+    good, also = line(0.0), line(1.0)
+    wild = np.column_stack([np.linspace(-9.0, 300.0, 400), np.zeros((400, 2))])
+    runs = [DrawnRun("good", cloud(plane(0.0)), good), DrawnRun("also", NOTHING, also), DrawnRun("wild", NOTHING, wild)]
+    view = fit_frame(runs).view
+    assert view.size_m[0] < 25.0
+    assert fit_frame([runs[0], replace(runs[2], name="near", positions=line(2.0, 20.0))]).view.size_m[0] > 35.0
+    heights = [draw_runs(of, width=WIDTH).pixels.shape[0] for of in (runs[:2], runs)]
+    assert heights[1] > heights[0], "a row of the legend more"
+    assert draw_runs([DrawnRun("wild", NOTHING, wild)], reference=good, width=WIDTH).view.size_m[0] < 25.0
+
+
+def test_pictures_of_one_frame_are_the_same_but_for_the_run(tmp_path: Path) -> None:
+    street = np.column_stack([a := np.linspace(0.0, 50.0, 500), a, 0.02 * a])
+    runs = [DrawnRun("a", cloud(street), street), DrawnRun("b", cloud(0.5 * street), street[:250])]
+    frame = fit_frame(runs, width=WIDTH)
+    assert abs(frame.view.turn_deg) > 30.0
+    assert fit_frame(runs, OBLIQUE).view.turn_deg == frame.view.turn_deg, "turned the same way from every elevation"
+    files = draw_apart(runs, tmp_path / "apart", frame)
+    assert [file.name for file in files] == ["a.png", "b.png"]
+    first, second = (np.asarray(o3d.io.read_image(str(file))) for file in files)
+    column, row = np.round(frame.view.project(street[100:101])[0]).astype(int)
+    np.testing.assert_array_equal(first[row, column], second[row, column])
+    with pytest.raises(InputError, match="one name"):
+        draw_apart([runs[0], runs[0]], tmp_path, frame)
+
+
+def test_the_map_is_coloured_by_intensity_rgb_or_error() -> None:
+    points, left = plane(0.0), plane(0.0)[:, 0] < 0.0
+    intensity, rgb = np.where(left, 0.1, 0.9).astype(np.float32), np.where(left[:, None], (200, 0, 0), (0, 0, 200))
+    known = replace(cloud(points), attributes=PointAttributes(intensity, rgb.astype(np.uint8)))
+    run = DrawnRun("", known, line(8.0), distances_m=np.where(left, 0.0, 0.4))
+    sides = [np.array([x, 0.0, 0.0]) for x in (-5.0, 5.0)]
+    for quantity, brighter in (("intensity", 1), ("error", 0)):
+        picture = draw_runs([run], frame=fit_frame([run], quantity=quantity, width=WIDTH))
+        means = [near(picture, side).mean() for side in sides]
+        assert means[brighter] > means[1 - brighter] + 40, quantity
+    red, blue = (near(draw_runs([run], frame=fit_frame([run], quantity="rgb", width=WIDTH)), side) for side in sides)
+    assert (red[:, 0] > 100).all()
+    assert (blue[:, 2] > 100).all()
+
+
+def test_the_path_is_coloured_by_its_error_and_grey_without_one() -> None:
+    errors_m = np.concatenate([np.zeros(150), np.full(150, 0.4), np.full(100, np.nan)])
+    run = DrawnRun("", cloud(plane(0.0)), line(0.0), errors_m=errors_m)
+    picture = draw_runs([run], frame=fit_frame([run], quantity="error", width=800))
+    for x, colour in ((-6.0, (253, 231, 37)), (1.0, (68, 1, 84)), (7.0, (205, 205, 205))):
+        assert is_like(near(picture, np.array([x, 0.0, 0.0]), 0), colour), x
+
+
+def test_a_run_is_not_coloured_by_what_is_unknown() -> None:
+    run = DrawnRun("site", cloud(plane(0.0)), line(0.0))
+    require_quantity(run, "height")
+    for quantity in ("intensity", "rgb", "error"):
+        with pytest.raises(InputError, match=f"site: cannot be coloured by {quantity}: "):
+            require_quantity(run, quantity)
+
+
+def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path: Path) -> None:
+    pole = np.array([[3.0, 1.0, 0.0]]) + np.column_stack([np.zeros((50, 2)), np.linspace(0.0, 2.0, 50)])
+    run = DrawnRun("", cloud(np.concatenate([plane(0.0, count=50), pole])), line(0.0))
+    counted: list[tuple[int, int]] = []
+    frames = list(turn_runs([run], count=lambda *numbers: counted.append(numbers), frames=4))
+    assert counted == [(number, 4) for number in range(1, 5)]
+    assert len({frame.shape for frame in frames}) == 1
+    assert len({frame.tobytes() for frame in frames}) == 4
+    views = turning_views(run.cloud.points, run.positions, OBLIQUE, [0.0, 90.0, 180.0], WIDTH)
+    assert len({view.pixel_m for view in views}) == 1
+    corners = np.array([[x, y, 0.0] for x in (-10.0, 10.0) for y in (-10.0, 10.0)])
+    for view in views:
+        assert (view.project(corners) > 0).all()
+        assert (view.project(corners) < [view.width, view.height]).all()
+    save_video(tmp_path / "map.gif", frames)
+    with Image.open(tmp_path / "map.gif") as video:
+        assert video.n_frames == 4
+        assert video.info["loop"] == 0
+        assert np.abs(np.asarray(video.convert("RGB")).astype(int) - frames[0]).mean() < 4.0
+
+
+def test_a_video_of_another_kind_or_without_ffmpeg_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OutputError, match=r"\.gif or \.mp4"):
+        save_video(tmp_path / "map.avi", [])
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(OutputError, match="ffmpeg, which is not on PATH"):
+        check_video_file(tmp_path / "map.mp4")
+
+
+def test_an_mp4_file_is_written_by_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "ffmpeg"
+    program.write_text('#!/bin/sh\ncat > "$(eval echo \\${$#})"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    frames = [np.full((5, 7, 3), level, dtype=np.uint8) for level in (1, 2)]
+    save_video(tmp_path / "map.mp4", frames)
+    assert (tmp_path / "map.mp4").read_bytes() == b"".join(frame[:4, :6].tobytes() for frame in frames)
+    program.write_text("#!/bin/sh\necho no such codec >&2\nexit 3\n")
+    with pytest.raises(OutputError, match="status 3: no such codec"):
+        save_video(tmp_path / "map.mp4", frames)

@@ -8,6 +8,7 @@ import plotly.graph_objects as go
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
 from lidarslam.evaluation.report.figures.errors import ALIGNED
 from lidarslam.evaluation.report.figures.figure import (
     EQUAL_AXES,
@@ -21,8 +22,8 @@ from lidarslam.evaluation.report.figures.figure import (
 from lidarslam.evaluation.trajectory.alignment import align
 
 _NOMINAL_WIDTH, _LOWEST, _TALLEST, _SIDE_HEIGHT = 500.0, 240.0, 480.0, 210
-# The view holds every path up to this multiple of the reference's size; beyond, it starts at the reference.
-_WIDEST_VIEW = 3.0
+# A view that a path leaves ends at this share of its size beyond the others.
+_BEYOND = 0.1
 _LEAST_HEIGHT_RANGE_M = 1.0
 # A straight road seen along its direction is a point.
 _LEAST_SIDE = 0.25
@@ -52,7 +53,7 @@ def trajectory_figure(sequence: SequenceComparison, styles: Styles) -> Figure | 
         height = int(np.clip(_NOMINAL_WIDTH * extent[1] / extent[0], _LOWEST, _TALLEST)) if up == 1 else _SIDE_HEIGHT
         panels.append(Panel(title, traces, layout, height))
     name = "" if reference is None else sequence.reference_name
-    return Figure("Trajectories", _caption(sequence, list(paths.values()), low, high), panels, list(paths), name)
+    return Figure("Trajectories", _caption(sequence, paths, low, high), panels, list(paths), name)
 
 
 def _aligned(method: MethodResult, sequence: SequenceComparison) -> FloatArray | None:
@@ -118,17 +119,13 @@ def _thin(count: int) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
 
 
 def _view(paths: Sequence[FloatArray], reference: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner of the first view: all paths, unless one of them leaves the reference by far."""
-    points = np.concatenate(paths)
+    """Lower and upper corner of the first view: all paths but those that diverge."""
+    kept = [path for path, inside in zip(paths, paths_in_bulk(paths, reference), strict=True) if inside]
+    points = np.concatenate([*kept, *([] if reference is None else [reference])])
     low, high = points.min(axis=0), points.max(axis=0)
-    if reference is not None:
-        low, high = np.minimum(low, reference.min(axis=0)), np.maximum(high, reference.max(axis=0))
-        size = max(float(np.ptp(reference, axis=0).max()), 1.0)
-        if (high - low).max() > _WIDEST_VIEW * size:
-            low = np.maximum(low, reference.min(axis=0) - 0.5 * size)
-            high = np.minimum(high, reference.max(axis=0) + 0.5 * size)
     short = np.maximum(_LEAST_HEIGHT_RANGE_M - (high - low), 0.0) / 2.0
-    return low - short, high + short
+    beyond = _BEYOND * (high - low) if len(kept) < len(paths) else 0.0
+    return low - short - beyond, high + short + beyond
 
 
 def _range(low: FloatArray, high: FloatArray, axis: int) -> list[float]:
@@ -136,7 +133,7 @@ def _range(low: FloatArray, high: FloatArray, axis: int) -> list[float]:
     return [float(low[axis] - margin), float(high[axis] + margin)]
 
 
-def _caption(sequence: SequenceComparison, paths: Sequence[FloatArray], low: FloatArray, high: FloatArray) -> str:
+def _caption(sequence: SequenceComparison, paths: dict[str, FloatArray], low: FloatArray, high: FloatArray) -> str:
     measured = [method.metrics for method in sequence.methods if method.metrics is not None]
     unmeasured = [m.name for m in sequence.methods if m.trajectory is not None and m.metrics is None]
     if sequence.reference is None:
@@ -146,8 +143,9 @@ def _caption(sequence: SequenceComparison, paths: Sequence[FloatArray], low: Flo
         frame += f"; aligned by the first pose only: {', '.join(unmeasured)}" if unmeasured else ""
     else:
         frame = "aligned with the reference by the first pose"
-    outside = any((path < low).any() or (path > high).any() for path in paths)
-    cut = " A path leaves the view; a double click shows it whole." if outside else ""
+    outside = {name: far for name, path in paths.items() if (far := beyond_m(path, low, high)) > 0.0}
+    cut = "".join(f" {leaves(name, {' m': far})} outside." for name, far in outside.items())
+    cut += " A double click shows all." if outside else ""
     what = "Paths of all methods" if len(paths) > 1 else "Path"
     return (
         f"{what}, {frame}. The ring marks the start, crosses mark scans on which tracking was lost."

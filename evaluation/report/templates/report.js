@@ -89,7 +89,21 @@
   const recolour = () => drawn().forEach((plot) => Plotly.relayout(plot, { template: template() }));
   dark.addEventListener("change", recolour);
   matchMedia("print").addEventListener("change", recolour); // paper is light whatever the screen is
-  addEventListener("beforeprint", drawAll);
+  // On paper plots are as wide as the page, not as the window, and folded tables are shown.
+  addEventListener("beforeprint", () => {
+    document.documentElement.classList.add("printing");
+    document.querySelectorAll("details.table:not([open])").forEach((table) => table.toggleAttribute("open"));
+    drawAll();
+    for (const plot of plots) Plotly.relayout(plot, { width: plot.clientWidth, height: plot.clientHeight });
+  });
+  addEventListener("afterprint", () => {
+    document.documentElement.classList.remove("printing");
+    for (const plot of plots) {
+      delete plot.layout.width;
+      delete plot.layout.height;
+      Plotly.Plots.resize(plot); // which leaves plots of a given size alone
+    }
+  });
   const observer = new IntersectionObserver((entries) => {
     for (const entry of entries) if (entry.isIntersecting) draw(entry.target);
   }, { rootMargin: "800px" });

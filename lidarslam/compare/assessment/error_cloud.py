@@ -9,14 +9,14 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.files import replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.map.metrics import MapComparison
-from lidarslam.evaluation.report.error_colours import error_colours
+from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD, error_colours
 from lidarslam.simulation.writers.ply import write_ply
 
 _SUFFIXES = (".ply", ".rrd")
 _FIELDS = [
     *((axis, "<f8") for axis in "xyz"),
     *((colour, "|u1") for colour in ("red", "green", "blue")),
-    ("distance_m", "<f4"),
+    (DISTANCE_FIELD, "<f4"),
 ]
 
 

@@ -13,10 +13,11 @@ from lidarslam.viewer.drawing.view import View
 Colour = tuple[int, int, int]
 
 INK, PAPER, HALO = (20, 20, 20), (255, 255, 255), (255, 255, 255)
-START = (0, 158, 115)
+START = (255, 225, 40)
 # Of the picture's width.
 _TEXT, _LINE, _MARKER = 1 / 58, 1 / 320, 1 / 130
 _LONGEST_BAR = 0.2
+_END_WIDENING = 0.25  # of the marks of wide paths, relative to that of the paths
 _LONGEST_NAME = 32
 
 
@@ -31,36 +32,34 @@ class Entry:
 
 
 def draw_path(
-    picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], around: Colour | None = HALO
+    picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], wider: float = 1.0
 ) -> None:
-    """Draw a path through positions (N, 3) above everything; colours are those of its poses, and of a wider line."""
-    if len(positions) < 2:
-        return
-    pen, width = ImageDraw.Draw(picture), max(2, round(view.width * _LINE))
-    pixels = [tuple(pixel) for pixel in view.project(positions).tolist()]
-    if around is not None:
-        pen.line(pixels, fill=around, width=2 * width, joint="curve")
+    """Draw a path through positions (N, 3) above everything, in the colours of its poses, and so many times wider."""
+    pixels = _pixels(view, positions)
     for first, last in _stretches(colours):
-        pen.line(pixels[first : last + 1], fill=colours[last], width=width, joint="curve")
+        _line(picture, pixels[first : last + 1], colours[last], wider * _line_width(view))
 
 
-def draw_ends(picture: Image.Image, view: View, positions: FloatArray, colour: Colour) -> None:
-    """Mark the first position with a disc, the last with a square of the colour."""
-    if not len(positions):
-        return
-    pen, radius = ImageDraw.Draw(picture), view.width * _MARKER
-    for pixel, fill in zip(view.project(positions[[-1, 0]]), (colour, START), strict=True):
-        _mark(pen, pixel[0], pixel[1], radius, fill)
+def draw_outline(picture: Image.Image, view: View, positions: FloatArray, colour: Colour, wider: float = 1.0) -> None:
+    """Draw what is seen on both sides of a path that is drawn above it, so many times wider."""
+    _line(picture, _pixels(view, positions), colour, (wider + 1.0) * _line_width(view))
 
 
-def line_entry(text: str, colour: Colour, width: int) -> Entry:
+def draw_end(picture: Image.Image, view: View, position: FloatArray, colour: Colour, wider: float = 1.0) -> None:
+    """Mark the first position (1, 3) with a disc, the last with a square of the colour; (0, 3): nothing."""
+    for column, row in view.project(position).tolist():
+        radius = view.width * _MARKER * (1.0 + _END_WIDENING * (wider - 1.0))
+        _mark(ImageDraw.Draw(picture), column, row, radius, colour)
+
+
+def line_entry(text: str, colour: Colour, width: int, wider: float = 1.0) -> Entry:
     """A line of the legend."""
-    length, thick = round(width / 45), max(3, round(1.2 * width * _LINE))
+    length, thick = round(width / 45), max(3, round((0.2 + wider) * width * _LINE))
 
     def symbol(pen: ImageDraw.ImageDraw, column: float, row: float) -> None:
         pen.line([(column, row), (column + length, row)], fill=colour, width=thick)
 
-    return Entry(_short(text), length, symbol)
+    return Entry(short(text), length, symbol)
 
 
 def end_entry(text: str, colour: Colour, width: int) -> Entry:
@@ -137,7 +136,7 @@ def _font(width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(width * _TEXT)
 
 
-def _short(text: str) -> str:
+def short(text: str) -> str:
     """Shortened, and without the characters that Pillow's font lacks."""
     text = text.encode("ascii", "replace").decode()
     return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..."
@@ -147,7 +146,23 @@ def _mark(pen: ImageDraw.ImageDraw, column: float, row: float, radius: float, co
     """A disc at the start, else a square."""
     box = [column - radius, row - radius, column + radius, row + radius]
     draw = pen.ellipse if colour == START else pen.rectangle
-    draw(box, fill=colour, outline=HALO, width=max(1, round(radius / 4)))
+    draw(box, fill=colour, outline=INK if colour == START else HALO, width=max(1, round(radius / 4)))
+
+
+def _line_width(view: View) -> float:
+    return max(2.0, view.width * _LINE)
+
+
+def _pixels(view: View, positions: FloatArray) -> list[tuple[float, float]]:
+    return [(column, row) for column, row in view.project(positions).tolist()]
+
+
+def _line(picture: Image.Image, pixels: Sequence[tuple[float, float]], colour: Colour, width: float) -> None:
+    """A line with round joints; Pillow's own leave gaps between short pieces."""
+    pen, radius = ImageDraw.Draw(picture), 0.5 * width
+    pen.line(pixels, fill=colour, width=round(width))
+    for column, row in pixels:
+        pen.ellipse([column - radius, row - radius, column + radius, row + radius], fill=colour)
 
 
 def _stretches(colours: Sequence[Colour]) -> list[tuple[int, int]]:

@@ -1,5 +1,6 @@
 """The view of a picture: an orthographic projection, so that one scale bar holds everywhere."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +37,11 @@ class View:
         """What the picture shows."""
         return self.width * self.height * self.pixel_m**2
 
+    @property
+    def turn_deg(self) -> float:
+        """Of the picture about z."""
+        return float(np.rad2deg(np.arctan2(self.axes[0, 1], self.axes[0, 0])))
+
     def project(self, points: FloatArray) -> FloatArray:
         """Column and row (N, 2) of points (N, 3); pixel centres are at whole numbers."""
         across = (points @ self.axes[:2].T - self.centre) / self.pixel_m
@@ -70,24 +76,41 @@ def fit_view(
         points: of all clouds; may be empty.
         path: positions of all trajectories; may be empty.
         elevation_deg: of the camera above the horizon.
-        turn_deg: of the picture about z; None: the turn that leaves the least empty space, 0 unless it saves much.
+        turn_deg: of the picture about z; None: the turn that leaves the least empty space seen from above, whatever the
+            elevation; 0 unless it saves much.
         width: of the picture, pixels; its height follows the scene.
     """
     if turn_deg is None:
         sample = points[:: max(1, len(points) // _SAMPLED)]
-        areas = {turn: _fit(view_axes(turn, elevation_deg), sample, path, width).area_m2 for turn in _TURNS_DEG}
+        areas = {turn: _fit(view_axes(turn, 90.0), sample, path, width).area_m2 for turn in _TURNS_DEG}
         best = min(areas, key=lambda turn: areas[turn])
         turn_deg = float(best) if areas[0] > _WORTH_TURNING * areas[best] else 0.0
     return _fit(view_axes(turn_deg, elevation_deg), points, path, width)
 
 
+def turning_views(
+    points: FloatArray, path: FloatArray, elevation_deg: float, turns_deg: Sequence[float], width: int
+) -> list[View]:
+    """Views about the vertical through the middle of the scene, one for each turn, all of one scale; see `fit_view`."""
+    sample = points[:: max(1, len(points) // _SAMPLED)]
+    # The middle of the scene, in the world.
+    middle = np.mean([_box(np.roll(np.eye(3), -axis, axis=0), sample, path)[:, 0] for axis in range(3)], axis=1)
+    axes = [view_axes(turn_deg, elevation_deg) for turn_deg in turns_deg]
+    reach = np.max([np.abs(_box(of, sample, path) - of[:2] @ middle) for of in axes], axis=(0, 1))
+    return [_view(of, of[:2] @ middle, 2.0 * reach, width) for of in axes]
+
+
 def _fit(axes: FloatArray, points: FloatArray, path: FloatArray, width: int) -> View:
     box = _box(axes, points, path)
-    size_m, margin = box[1] - box[0], round(_MARGIN * width)
+    return _view(axes, box.mean(axis=0), box[1] - box[0], width)
+
+
+def _view(axes: FloatArray, centre: FloatArray, size_m: FloatArray, width: int) -> View:
+    margin = round(_MARGIN * width)
     tallest, lowest = round(_TALLEST * width), round(_LOWEST * width)
     pixel_m = float((size_m / [width - 2 * margin, tallest - 2 * margin]).max())
     height = int(np.clip(np.ceil(size_m[1] / pixel_m) + 2 * margin, lowest, tallest))
-    return View(axes, box.mean(axis=0), pixel_m, width, height, size_m)
+    return View(axes, centre, pixel_m, width, height, size_m)
 
 
 def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from lidarslam.storage.summary_file import read_summary
 from lidarslam.viewer.drawn_runs import load_drawn_runs
 from lidarslam.viewer.page.run_result import read_series, with_run
 from lidarslam.viewer.page.run_text import changed_settings, describe_results, describe_source, describe_warnings
-from lidarslam.viewer.picture import DrawnRun, draw_runs
+from lidarslam.viewer.picture import draw_runs, fit_frame
 
 logger = logging.getLogger(__name__)
 
@@ -63,11 +63,13 @@ def leave_report(run: Path, accuracy: Accuracy) -> bool:
 
 def _draw(run: Path, accuracy: Accuracy) -> None:
     directory, (drawn,) = RunDirectory(run), load_drawn_runs([run])
-    path = DrawnRun(drawn.name, _NO_CLOUD, drawn.positions, drawn.statuses)
-    _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], reference=_true_path(accuracy)).pixels)
+    path, truth = replace(drawn, cloud=_NO_CLOUD), _true_path(accuracy)
+    frame = fit_frame([drawn])
+    alone = fit_frame([path], reference=truth, turn_deg=frame.view.turn_deg)
+    _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], reference=truth, frame=alone).pixels)
     picture = None
     if len(drawn.cloud):
-        picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn]).pixels)
+        picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn], frame=frame).pixels)
     directory.write_text(files.REPORT, render_run(_page(run, accuracy, picture)))
 
 

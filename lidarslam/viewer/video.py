@@ -1,0 +1,100 @@
+"""The scene turning once about the vertical, as an animated GIF or, through ffmpeg, an MP4 file."""
+
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lidarslam.core.errors import OutputError
+from lidarslam.core.files import cannot_write, replacing
+from lidarslam.viewer.drawing.colouring import Quantity
+from lidarslam.viewer.drawing.view import turning_views
+from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, fit_frame, framed
+
+_FRAMES = 72
+_PER_SECOND = 12
+# Keeps a GIF file to a few megabytes.
+_WIDTH, _GIF_COLOURS = 640, 64
+_SUFFIXES = (".gif", ".mp4")
+
+
+def check_video_file(path: Path) -> None:
+    """Refuse a file that cannot be written later.
+
+    Raises:
+        OutputError: its name ends in neither .gif nor .mp4, or there is no ffmpeg for the latter.
+    """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise OutputError(f"{path}: a video must end in .gif or .mp4")
+    if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
+        raise OutputError(f"{path}: .mp4 is written by ffmpeg, which is not on PATH; install it, or name a .gif file")
+
+
+def turn_runs(
+    runs: Sequence[DrawnRun],
+    quantity: Quantity = "height",
+    count: Callable[[int, int], None] = lambda *_: None,
+    frames: int = _FRAMES,
+) -> Iterator[NDArray[np.uint8]]:
+    """Frames (height, width, 3) of one turn, all of one size and scale.
+
+    Args:
+        runs: in one world.
+        quantity: that a single run is coloured by.
+        count: called with the number of each drawn frame, from 1, and their total.
+        frames: number of them.
+    """
+    frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
+    turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)
+    for number, view in enumerate(turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
+        yield draw_runs(runs, frame=replace(frame, view=view)).pixels
+        count(number, frames)
+
+
+def save_video(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
+    """Write frames (height, width, 3) as .gif or .mp4.
+
+    Raises:
+        OutputError: as `check_video_file`, or it cannot be written.
+    """
+    check_video_file(path)
+    try:
+        with replacing(path) as partial:
+            (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(partial, frames)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
+    images = map(Image.fromarray, frames)
+    # One palette without dithering, so that what stands still is the same in successive frames.
+    first = next(images).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
+    others = (image.quantize(palette=first, dither=Image.Dither.NONE) for image in images)
+    duration_ms = 1000 // _PER_SECOND
+    first.save(path, format="GIF", save_all=True, append_images=others, duration=duration_ms, loop=0)
+
+
+def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
+    frames = (frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames)  # the codec wants even sides
+    first = next(frames)
+    size, rate = f"{first.shape[1]}x{first.shape[0]}", str(_PER_SECOND)
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
+    command = ["ffmpeg", "-loglevel", "error", "-y", *given, "-pix_fmt", "yuv420p", "-f", "mp4", str(path.resolve())]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        try:
+            for frame in chain([first], frames):
+                process.stdin.write(frame.tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass  # ffmpeg says why
+        said = process.stderr.read().decode(errors="replace").strip()
+    if process.returncode:
+        raise OutputError(f"ffmpeg ended with status {process.returncode}: {said}")
