@@ -85,10 +85,10 @@ def test_loops_are_counted_and_their_effect_is_said() -> None:
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
-        (None, " s for all; 1 MB of memory"),
-        (0.6, " s for all, 1.7 times slower than recorded; "),
-        (1.02, " s for all, as fast as recorded; "),
-        (1.7, " s for all, 1.7 times faster than recorded; "),
+        (None, " ms per scan; 1 MB of memory"),
+        (0.6, " ms per scan, 1.7 times slower than recorded; "),
+        (1.02, " ms per scan, as fast as recorded; "),
+        (1.7, " ms per scan, 1.7 times faster than recorded; "),
     ],
 )
 def test_speed_is_faster_or_slower(factor: float | None, words: str) -> None:

@@ -1,8 +1,8 @@
 """The maximum range by the size of a scene: `@scene` behind a method's name.
 
 KISS-ICP's voxels are a hundredth of its maximum range, 100 m by default, which suits streets; its authors advise a
-shorter range indoors. One rule for KISS-ICP and for every peer with voxels: the range is twice that of nearly all
-points of the first scans, and voxels are in proportion to it. Outdoors this is the default.
+shorter range indoors. One rule for KISS-ICP and for every peer with voxels: the range is twice that of 99 % of the
+points of the first scans, as the default is on streets, and voxels are in proportion to it.
 """
 
 from contextlib import suppress
@@ -39,6 +39,6 @@ def scene_range_m(recording: Recording, chosen: range) -> float:
 def scene_note(range_m: float) -> str:
     """A sentence on what the name means on this recording."""
     return (
-        f"@{BY_SCENE}: maximum range {range_m:g} m instead of {MAX_RANGE_M:g} m, and voxels in proportion, by the ranges"
-        " of the first scans"
+        f"@{BY_SCENE}: maximum range {range_m:g} m instead of {MAX_RANGE_M:g} m, and voxels in proportion, by the"
+        " ranges of the first scans"
     )

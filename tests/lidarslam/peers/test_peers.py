@@ -167,7 +167,7 @@ def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recordi
 
 
 class _Ranges:
-    """A recording whose points lie up to 7 m away, and one in two hundred in 60 m; from the eleventh scan on in 90 m."""
+    """A recording whose points lie up to 7 m away, and one in two hundred in 60 m; from the eleventh scan on, 90 m."""
 
     def __init__(self, scale: float) -> None:
         self._scale = scale
