@@ -24,5 +24,5 @@ def test_the_map_survives_the_turns_that_lose_kiss_icp(tmp_path: Path) -> None:
         assert (tmp_path / name).stat().st_size > 0
     text = format_demo(demo)
     assert "learned+map+graph" in text
-    assert "@scene: maximum range 14 m instead of 100 m" in text
+    assert "@scene: maximum range 14.1 m instead of 100 m" in text
     assert str(tmp_path / "report.html") in text
