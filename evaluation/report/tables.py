@@ -79,7 +79,8 @@ def _summary_table(sequence: SequenceComparison) -> Table:
         for m in sequence.methods
     ]
     partial = any(method.status not in WHOLE and method.metrics is not None for method in sequence.methods)
-    note = "The errors of a method that ended early are those of its part, and are not ranked." if partial else ""
+    early = "The errors of a method that ended early are those of its part, and are not ranked." if partial else ""
+    note = " ".join(filter(None, [early, times_note(sequence.methods)]))
     return Table(
         f"{sequence.sequence}: {'all methods' if len(sequence.methods) > 1 else 'summary'}", columns, rows, note
     ).without_empty()

@@ -85,6 +85,6 @@ def format_demo(demo: Demo) -> str:
 maps      {", ".join(str(picture) for picture in demo.pictures)}
 replay    {command_line(as_typed("lidarslam"), "view", str(demo.out / REPLAY), "--web")}
 
-Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that, with
-its defaults, which suit streets, and with a range and voxels by the size of the scene (kiss-icp@scene). The network
-measures a turn whatever its size, and the map corrects the rest."""
+Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that,
+with its defaults, which suit streets, and with a range and voxels by the size of the scene (kiss-icp@scene). The
+network measures a turn whatever its size, and the map corrects the rest."""

@@ -136,8 +136,8 @@ def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_c
     sequence = _sequence("00", ours, peer, third)
     quantities = [find_quantity("elapsed_ms_per_scan"), find_quantity("peak_rss_mb")]
     means = mean_table(TablePlan("T", {"all": ("00",)}, quantities), [sequence])
-    (times,) = sequence_tables(sequence)["time"]
-    for table in (means, times):
+    tables = sequence_tables(sequence)
+    for table in (means, *tables["summary"], *tables["time"]):
         columns = [column.label for column in table.columns]
         best = {(table.rows[row].method, columns[column]) for row, column in table.best()}
         assert best == {("ours", "elapsed"), ("peer", "memory")}
