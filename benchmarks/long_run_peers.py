@@ -52,7 +52,7 @@ class KissIcpEstimator:
         return Poses(np.array(self._instants), np.array(self._poses))
 
 
-_KISS_ICP = Peer("kiss-icp", "kiss_icp", "kiss-icp", lambda _, __: KissIcpEstimator())
+_KISS_ICP = Peer("kiss-icp", "kiss_icp", "kiss-icp", lambda *_: KissIcpEstimator())
 
 
 class FedPeer:

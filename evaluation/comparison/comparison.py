@@ -17,6 +17,9 @@ MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "time
 """`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with what there was. The last four:
 no result but the message; `not run`: the comparison was interrupted before, or something is missing that it needs."""
 
+TimesCover = Literal["reading, registration and map", "registration"]
+"""What the times of a scan contain."""
+
 WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 """Statuses of a run that came to the recording's end; of any other, the figures are of a part."""
 
@@ -56,10 +59,15 @@ class MethodResult:
     map_metrics: Mapping[str, object] | None = None  # the content of metrics.json's "map"
     map_errors: MapErrors | None = None  # for the figure
     map_entropy: float | None = None  # mean map entropy of its map, which needs no reference
+    elapsed_ms_per_scan: float | None = None  # elapsed time of all scans over their number
+    # latency_ms_median, latency_ms_p99: sum of the stages of one scan
+    latency_ms_median: float | None = None
+    latency_ms_p99: float | None = None
     # ms_per_scan_median, ms_per_scan_p95, ms_per_scan_p99: wall time from one finished scan to the next
     ms_per_scan_median: float | None = None
     ms_per_scan_p95: float | None = None
     ms_per_scan_p99: float | None = None
+    times_cover: TimesCover = "reading, registration and map"  # all of the above
     # median wall time of each stage; stages run beside one another
     stage_ms: Mapping[str, float] = field(default_factory=dict)
     peak_rss_mb: float | None = None  # of its process and its children
@@ -79,6 +87,10 @@ class MethodResult:
             "status": self.status,
             "message": self.message,
             "metrics": self._metrics_json(),
+            "elapsed_ms_per_scan": self.elapsed_ms_per_scan,
+            "latency_ms_median": self.latency_ms_median,
+            "latency_ms_p99": self.latency_ms_p99,
+            "times_cover": self.times_cover,
             "ms_per_scan_median": self.ms_per_scan_median,
             "ms_per_scan_p95": self.ms_per_scan_p95,
             "ms_per_scan_p99": self.ms_per_scan_p99,

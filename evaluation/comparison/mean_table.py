@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison
-from lidarslam.evaluation.comparison.quantities import Quantity
+from lidarslam.evaluation.comparison.quantities import Quantity, times_note
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 
 
@@ -34,15 +34,18 @@ def mean_table(plan: TablePlan, sequences: Sequence[SequenceComparison]) -> Tabl
     for method in methods:
         found = [[results.get((name, method)) for name in column.sequences] for column in columns]
         rows.append(TableRow(method, [_mean(*of) for of in zip(found, quantities, strict=True)]))
-    return Table(plan.title, columns, [*rows, *plan.published], plan.note)
+    has_times = any(quantity.is_time for quantity in plan.quantities)
+    note = " ".join(filter(None, [plan.note, times_note(results.values()) if has_times else ""]))
+    return Table(plan.title, columns, [*rows, *plan.published], note)
 
 
 def _mean(results: Sequence[MethodResult | None], quantity: Quantity) -> TableCell:
-    """A mean over fewer recordings than the column names has a note, and is not ranked with the others."""
+    """A mean over fewer recordings than the column names has a note. Only comparable means are ranked."""
     finished = [result for result in results if result is not None and result.status in WHOLE]
     values = [value for result in finished if (value := quantity.of(result)) is not None]
     if not values:
         return TableCell(None, 0)
     complete = len(values) == len(results)
+    comparable = complete and all(quantity.is_comparable(result) for result in finished)
     note = "" if complete else f"over {len(values)} of {len(results)}"
-    return TableCell(sum(values) / len(values), len(values), note, complete)
+    return TableCell(sum(values) / len(values), len(values), note, comparable)

@@ -1,10 +1,11 @@
 """The quantities that tables are made of, by name, read from a method's entry in comparison.json."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.evaluation.comparison.comparison import MethodResult
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult
+from lidarslam.evaluation.comparison.table import TableCell
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 
 
@@ -19,6 +20,7 @@ class Quantity:
     lower_is_better: bool | None = True  # None for a quantity that is not ranked
     # path of the value that the number is given in percent of; None: it is given as it is
     percent_of: str | None = None
+    is_time: bool = False  # of a scan, with what `MethodResult.times_cover` says
 
     def of(self, result: MethodResult) -> float | None:
         """The number; None where there is none."""
@@ -28,6 +30,22 @@ class Quantity:
             return value
         whole = _look_up(entry, self.percent_of)
         return 100.0 * value / whole if whole else None
+
+    def is_comparable(self, result: MethodResult) -> bool:
+        """Whether the number is of the whole recording, and a time of all that is done for a scan."""
+        return result.status in WHOLE and not (self.is_time and result.times_cover == "registration")
+
+    def cell(self, result: MethodResult) -> TableCell:
+        """The number in a table."""
+        return TableCell(self.of(result), ranked=self.is_comparable(result))
+
+
+def times_note(results: Iterable[MethodResult]) -> str:
+    """A sentence on the methods whose times are of the registration alone; empty without any."""
+    names = dict.fromkeys(result.name for result in results if result.times_cover == "registration")
+    if not names:
+        return ""
+    return f"Times of {', '.join(names)}: registration alone, without reading and map; not ranked with the others."
 
 
 def _look_up(entry: object, path: str) -> float | None:
@@ -78,9 +96,12 @@ QUANTITIES: dict[str, Quantity] = {
     "map_coverage_percent_1.0": Quantity(_MAP + "coverage_percent/1.0", "map coverage 1.0 m", "%", 1, False),
     "map_deviation_percent_1.0": Quantity(_MAP + "deviation_percent/1.0", "map deviation 1.0 m", "%", 1),
     "map_entropy": Quantity("map_entropy", "map entropy", "", 2),
-    "ms_per_scan_median": Quantity("ms_per_scan_median", "time", "ms/scan", 1),
-    "ms_per_scan_p95": Quantity("ms_per_scan_p95", "time (95 %)", "ms/scan", 1),
-    "ms_per_scan_p99": Quantity("ms_per_scan_p99", "time (99 %)", "ms/scan", 1),
+    "elapsed_ms_per_scan": Quantity("elapsed_ms_per_scan", "elapsed", "ms/scan", 1, is_time=True),
+    "latency_ms_median": Quantity("latency_ms_median", "latency (median)", "ms", 1, is_time=True),
+    "latency_ms_p99": Quantity("latency_ms_p99", "latency (99 %)", "ms", 1, is_time=True),
+    "ms_per_scan_median": Quantity("ms_per_scan_median", "between scans (median)", "ms/scan", 1, is_time=True),
+    "ms_per_scan_p95": Quantity("ms_per_scan_p95", "between scans (95 %)", "ms/scan", 1, is_time=True),
+    "ms_per_scan_p99": Quantity("ms_per_scan_p99", "between scans (99 %)", "ms/scan", 1, is_time=True),
     "odometry_ms_median": Quantity("stage_ms/odometry", "odometry", "ms/scan", 1),
     "peak_rss_mb": Quantity("peak_rss_mb", "memory", "MB", 0),
     "wall_s": Quantity("wall_s", "wall time", "s", 1),

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.lost import lost_intervals
-from lidarslam.evaluation.comparison.quantities import QUANTITIES, Quantity
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, Quantity, times_note
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
@@ -18,10 +18,14 @@ _SUMMARY = (
     "kitti_rotation_deg_per_100m",
     "map_f_score_percent_0.2",
     "map_entropy",
-    "ms_per_scan_median",
+    "elapsed_ms_per_scan",
     "peak_rss_mb",
 )
-_TIME = ("ms_per_scan_median", "ms_per_scan_p95", "ms_per_scan_p99", "peak_rss_mb", "wall_s")
+_TIME = ("elapsed_ms_per_scan", "latency_ms_median", "latency_ms_p99", "peak_rss_mb", "wall_s")
+_TIME_NOTE = (
+    "Elapsed: time of all scans over their number, with reading and map. Latency: sum of the stages of one scan; stages"
+    " of successive scans overlap, so that it exceeds the elapsed time. Wall time: of the whole process."
+)
 _SYMBOLS = {"ok": "✓", "lost": "△", "stopped": "◐"}
 _MOST_INTERVALS = 40
 
@@ -71,11 +75,12 @@ def _summary_table(sequence: SequenceComparison) -> Table:
     quantities = [QUANTITIES[name] for name in _SUMMARY]
     columns = [TableColumn("", "Status", numeric=False), *map(_column, quantities)]
     rows = [
-        TableRow(m.name, [TableCell(_status(m), note=m.message), *(_measured(m, q) for q in quantities)])
+        TableRow(m.name, [TableCell(_status(m), note=m.message), *(q.cell(m) for q in quantities)])
         for m in sequence.methods
     ]
     partial = any(method.status not in WHOLE and method.metrics is not None for method in sequence.methods)
-    note = "The errors of a method that ended early are those of its part, and are not ranked." if partial else ""
+    early = "The errors of a method that ended early are those of its part, and are not ranked." if partial else ""
+    note = " ".join(filter(None, [early, times_note(sequence.methods)]))
     return Table(
         f"{sequence.sequence}: {'all methods' if len(sequence.methods) > 1 else 'summary'}", columns, rows, note
     ).without_empty()
@@ -106,7 +111,7 @@ def _map_table(sequence: SequenceComparison) -> Table:
         return Table("", [], [])
     quantities = [q for name, q in QUANTITIES.items() if name.startswith("map_") and name != "map_entropy"]
     columns = [_column(quantity, prefix="map ") for quantity in quantities]
-    rows = [TableRow(m.name, [_measured(m, quantity) for quantity in quantities]) for m in sequence.methods]
+    rows = [TableRow(m.name, [quantity.cell(m) for quantity in quantities]) for m in sequence.methods]
     note = (
         "Accuracy: mean distance of the map from the reference map; completeness: of the reference map from the map;"
         " chamfer: mean of the two. Coverage: share of the reference map within the tolerance of the map; deviation:"
@@ -123,11 +128,12 @@ def _time_table(sequence: SequenceComparison) -> Table:
     rows = [
         TableRow(
             m.name,
-            [*(_measured(m, q) for q in quantities), *(TableCell(m.stage_ms.get(stage) or None) for stage in stages)],
+            [*(q.cell(m) for q in quantities), *(TableCell(m.stage_ms.get(stage) or None) for stage in stages)],
         )
         for m in sequence.methods
     ]
-    return Table(f"{sequence.sequence}: time and memory", columns, rows).without_empty()
+    note = " ".join(filter(None, [_TIME_NOTE, times_note(sequence.methods)]))
+    return Table(f"{sequence.sequence}: time and memory", columns, rows, note).without_empty()
 
 
 def _lost_table(sequence: SequenceComparison) -> Table:
@@ -158,10 +164,6 @@ def _column(quantity: Quantity, prefix: str = "") -> TableColumn:
     """A prefix of the label that the table's title has already is dropped."""
     label = quantity.label.removeprefix(prefix)
     return TableColumn("", label, quantity.unit, quantity.digits, quantity.lower_is_better)
-
-
-def _measured(method: MethodResult, quantity: Quantity) -> TableCell:
-    return TableCell(quantity.of(method), ranked=method.status in WHOLE)
 
 
 def _status(method: MethodResult) -> str:

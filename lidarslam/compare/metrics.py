@@ -7,6 +7,7 @@ from pathlib import Path
 from lidarslam.compare.assessment.inputs import read_estimate
 from lidarslam.compare.assessment.map_evaluation import evaluate_map
 from lidarslam.compare.assessment.reference_map import ReferenceMap, find_reference_map, load_reference_map
+from lidarslam.compare.peers.scene import scene_note
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
 from lidarslam.core.text.trajectory_io import read_tum
@@ -25,7 +26,7 @@ def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_map
         results: one a method.
         with_maps: whether maps are compared with the reference map, if there is one.
     """
-    notes: list[str] = []
+    notes = [] if planned.range_m is None else [scene_note(planned.range_m)]
     reference = _find_reference(planned, results, notes)
     measured = [_measure_trajectory(result, reference) for result in results]
     if with_maps:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from lidarslam.compare.methods.process import MethodRun
 from lidarslam.compare.methods.run import PROCESS
+from lidarslam.compare.peers.interface import MAX_RANGE_M
+from lidarslam.compare.peers.scene import scene_range_m
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
@@ -26,6 +28,7 @@ class PlannedRecording:
     source: Path
     entry: RecordingEntry
     recording: Recording
+    range_m: float | None  # maximum range by the size of the scene; None where no method asks for it
     runs: tuple[MethodRun, ...]
 
 
@@ -63,13 +66,15 @@ def _plan_recording(request: CompareRequest, entry: RecordingEntry, source: Path
     candidates = [name, *(f"{name}-{number}" for number in range(2, len(taken) + 3))]
     name = next(candidate for candidate in candidates if candidate not in taken | RESERVED)
     runs = []
+    chosen = range(len(recording))[entry.start : entry.stop : entry.step]
+    range_m = scene_range_m(recording, chosen) if any(method.by_scene for method in request.methods) else None
     for method in request.methods:
-        config = load_config(request.config_file, [*settings, *method.settings])
+        config = load_config(request.config_file, [*settings, *method.settings_at(range_m or MAX_RANGE_M)])
         folder = request.out / name / method.name
         prior = entry.prior if method.needs_prior else None
         run = RunRequest(source, folder, config, entry.start, entry.stop, entry.step, prior)
-        runs.append(MethodRun(run, method.peer))
-    return PlannedRecording(name, source, entry, recording, tuple(runs))
+        runs.append(MethodRun(run, method.peer, range_m if method.by_scene else None))
+    return PlannedRecording(name, source, entry, recording, range_m, tuple(runs))
 
 
 def _check_entry(request: CompareRequest, entry: RecordingEntry) -> None:

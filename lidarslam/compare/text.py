@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.core.text.plain_text import as_typed, command_line, joined
-from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
-from lidarslam.evaluation.comparison.quantities import QUANTITIES
+from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
@@ -15,8 +15,8 @@ _BEST = "*"
 _SHOWN = (
     "ate_rotation_rmse_deg",
     "rpe_translation_rmse_m",
-    "ms_per_scan_median",
-    "ms_per_scan_p99",
+    "elapsed_ms_per_scan",
+    "latency_ms_p99",
     "peak_rss_mb",
     "map_chamfer_m",
     "lost_scans",
@@ -65,12 +65,11 @@ def _table(sequence: SequenceComparison) -> Table:
     columns = [TableColumn("", q.label, q.unit, q.digits, q.lower_is_better) for q in quantities]
     rows = []
     for result in results:
-        cells = [TableCell(quantity.of(result), ranked=result.status in WHOLE) for quantity in quantities]
+        cells = [quantity.cell(result) for quantity in quantities]
         rows.append(TableRow(result.name, [TableCell(result.status), *cells]))
     against = "" if sequence.reference is None else f", against {sequence.reference_name}"
-    return Table(
-        f"{sequence.sequence}{against}", [TableColumn("", "status", numeric=False), *columns], rows
-    ).without_empty()
+    columns = [TableColumn("", "status", numeric=False), *columns]
+    return Table(f"{sequence.sequence}{against}", columns, rows, times_note(results)).without_empty()
 
 
 def _table_lines(table: Table) -> Iterator[str]:

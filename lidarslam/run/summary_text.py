@@ -33,12 +33,7 @@ def format_stop(out: Path, outcome: RunOutcome) -> str:
 def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
-    total = summary.ms_per_scan["total"]
-    slowest = summary.slowest
-    worst = "" if slowest is None else f", slowest: scan {slowest.scan:,}, {slowest.ms:.0f} ms of {slowest.stage}"
-    each = f"{total.median:.0f} ms a scan (99 % under {total.p99:.0f} ms{worst})"
-    in_all = f"{summary.elapsed_s:.1f} s for all{_speed(summary.realtime_factor)}"
-    yield f"{each}, {in_all}; {summary.peak_rss_mb:,.0f} MB of memory"
+    yield from format_times(summary)
     yield format_map(summary.map)
     if summary.graph is not None:
         yield _loops(summary.graph)
@@ -51,6 +46,15 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     yield f"next: {command_line(as_typed('lidarslam'), 'view', str(out))}"
     if outcome.metrics is not None:
         yield f"      {command_line(as_typed('lidarslam'), 'evaluate', str(out))}"
+
+
+def format_times(summary: RunSummary) -> Iterator[str]:
+    """Lines about elapsed time and memory, and about the latency of one scan."""
+    elapsed = f"{summary.elapsed_s:.1f} s for all scans, {summary.elapsed_ms_per_scan:.1f} ms per scan"
+    yield f"{elapsed}{_speed(summary.realtime_factor)}; {summary.peak_rss_mb:,.0f} MB of memory"
+    latency, slowest = summary.latency_ms, summary.slowest
+    worst = "" if slowest is None else f"; slowest: scan {slowest.scan:,}, {slowest.ms:.0f} ms of {slowest.stage}"
+    yield f"latency of one scan: median {latency.median:.0f} ms, 99 % under {latency.p99:.0f} ms{worst}"
 
 
 def _speed(realtime_factor: float | None) -> str:

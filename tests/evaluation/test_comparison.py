@@ -20,6 +20,7 @@ from lidarslam.evaluation.comparison.comparison import (
 from lidarslam.evaluation.comparison.mean_table import TablePlan, mean_table
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
+from lidarslam.evaluation.report.tables import sequence_tables
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 
@@ -126,6 +127,23 @@ def test_means_count_the_recordings_that_have_a_value() -> None:
     content = json.loads(json.dumps(table.to_json()))
     assert content["rows"][0]["cells"][0] == {"value": 30.0, "averaged": 3}
     assert content["columns"][0]["sequences"] == ["00", "01", "02", "03"]
+
+
+def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_contains() -> None:
+    ours = MethodResult("ours", "ok", elapsed_ms_per_scan=30.0, peak_rss_mb=9.0)
+    peer = MethodResult("peer", "ok", elapsed_ms_per_scan=10.0, peak_rss_mb=5.0, times_cover="registration")
+    third = MethodResult("third", "ok", elapsed_ms_per_scan=40.0, peak_rss_mb=7.0)
+    sequence = _sequence("00", ours, peer, third)
+    quantities = [find_quantity("elapsed_ms_per_scan"), find_quantity("peak_rss_mb")]
+    means = mean_table(TablePlan("T", {"all": ("00",)}, quantities), [sequence])
+    tables = sequence_tables(sequence)
+    for table in (means, *tables["summary"], *tables["time"]):
+        columns = [column.label for column in table.columns]
+        best = {(table.rows[row].method, columns[column]) for row, column in table.best()}
+        assert best == {("ours", "elapsed"), ("peer", "memory")}
+        assert "Times of peer: registration alone, without reading and map" in table.note
+    assert peer.to_json()["times_cover"] == "registration"
+    assert "registration alone" not in mean_table(TablePlan("T", {"all": ("00",)}, quantities[1:]), [sequence]).note
 
 
 def test_columns_stand_quantity_by_quantity_under_each_heading() -> None:

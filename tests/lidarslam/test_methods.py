@@ -42,6 +42,15 @@ def test_a_voxel_size_stands_behind_the_at(name: str, size_m: float) -> None:
     assert load_config(None, parse_method(name).settings).odometry.kiss_icp.voxel_size_m == size_m
 
 
+@pytest.mark.parametrize("name", ["kiss-icp@scene", "kiss-icp-no-deskew@scene", "kiss-icp@scene+map"])
+def test_scene_is_a_range_by_the_size_of_the_scene_and_voxels_of_a_hundredth(name: str) -> None:
+    method = parse_method(name)
+    before = ("odometry.kiss_icp.voxel_size_m=0.5", "odometry.kiss_icp.max_range_m=70")
+    kiss = load_config(None, [*before, *method.settings_at(13.5)]).odometry.kiss_icp
+    assert (method.by_scene, kiss.max_range_m, kiss.voxel_size_m) == (True, 13.5, None)
+    assert parse_method("kiss-icp").settings_at(13.5) == parse_method("kiss-icp").settings
+
+
 def test_prior_is_the_external_odometry() -> None:
     method = parse_method("prior+map")
     assert method.needs_prior
@@ -65,6 +74,9 @@ def test_prior_is_the_external_odometry() -> None:
         ("", "no method is called ''"),
         ("prior@0.5", "only kiss-icp takes a voxel size"),
         ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
+        ("learned@scene", "only kiss-icp takes a voxel size"),
+        ("form@scene", "form has no voxel size"),
+        ("small-gicp@0.5", "no method is called"),
         ("kiss-icp@-1", "expected a voxel size"),
         ("kiss-icp@nan", "expected a voxel size"),
         ("imu", r"measures turns alone; compare imu\+map or imu\+loam"),

@@ -250,7 +250,15 @@ def rows(path: Path) -> list[dict[str, str]]:
 def numbers(path: Path) -> dict[str, Any]:
     """Of summary.json, likewise."""
     summary = json.loads(path.read_text())
-    for name in ("ms_per_scan", "slowest_scan", "elapsed_s", "realtime_factor", "peak_rss_mb"):
+    for name in (
+        "ms_per_scan",
+        "slowest_scan",
+        "elapsed_s",
+        "elapsed_ms_per_scan",
+        "latency_ms",
+        "realtime_factor",
+        "peak_rss_mb",
+    ):
         del summary[name]
     if summary["pose_graph"]:
         del summary["pose_graph"]["ms_per_keyframe"]

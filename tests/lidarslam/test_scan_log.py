@@ -12,7 +12,9 @@ from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import ScanResult, SweepMotion
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.summary import summarise
+from lidarslam.run.summary.timing import Milliseconds
 from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary_text import format_times
 
 
 def result(stamp: float, status: Status = Status.OK, **values: Any) -> ScanResult:
@@ -52,6 +54,21 @@ def test_the_table_has_a_row_a_scan(log: ScanLog) -> None:
         "0,1.000000000,ok,100,1,90,0.0123,,,0.001,0.002,0.003,0.01,0.02,1,1.23,0.00,0.00,0.00,0.00,2.00,",
         '1,2.500000000,lost,100,1,90,,,x yaw,,,,,,,1.23,0.00,0.00,0.00,0.00,2.00,"no points, none"',
     ]
+
+
+def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps_are_short() -> None:
+    log = ScanLog()
+    for stamp, total_ms in enumerate([0.0, 0.0, 0.0, 0.0, 400.0]):
+        log.add(result(float(stamp), stage_ms={"odometry": 30.0, "refine": 50.0}), total_ms)
+    summary = summarise(log, WrittenMap(1, 0.1, 0), skipped=0)
+    assert (summary.elapsed_s, summary.elapsed_ms_per_scan) == (0.4, 80.0)
+    assert summary.latency_ms == Milliseconds(80.0, 80.0, 80.0)
+    lines = list(format_times(summary))
+    assert lines[0].startswith("0.4 s for all scans, 80.0 ms per scan, 10.0 times faster than recorded; ")
+    assert lines[1].startswith("latency of one scan: median 80 ms, 99 % under 80 ms; slowest: scan 1, 50 ms of refine")
+    json = summary.to_json()
+    assert (json["elapsed_ms_per_scan"], json["latency_ms"]["p99"]) == (80.0, 80.0)
+    assert json["ms_per_scan"]["total"]["median"] == 0.0
 
 
 def test_the_numbers_of_all_scans(log: ScanLog) -> None:

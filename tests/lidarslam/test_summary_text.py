@@ -23,6 +23,7 @@ def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
         duration_s=0.0,
         elapsed_s=0.1,
         ms_per_scan={"total": Milliseconds(1.0, 1.0, 1.0)},
+        latency_ms=Milliseconds(40.0, 80.0, 90.0),
         realtime_factor=None,
         peak_rss_mb=1.0,
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),
@@ -47,9 +48,8 @@ def test_the_slowest_stage_of_a_scan_is_named_but_not_of_the_first_that_loads_lo
     assert slowest == SlowestScan(2, "refine", 77.0)
     assert SlowestScan.of(stage_ms[:1]) is None
     summary = replace(summary_of(), slowest=slowest)
-    assert "1 ms a scan (99 % under 1 ms, slowest: scan 2, 77 ms of refine)," in format_outcome(
-        Path("out"), RunOutcome(summary, None)
-    )
+    words = "latency of one scan: median 40 ms, 99 % under 90 ms; slowest: scan 2, 77 ms of refine\n"
+    assert words in format_outcome(Path("out"), RunOutcome(summary, None))
     assert summary.to_json()["slowest_scan"] == {"scan": 2, "stage": "refine", "ms": 77.0}
 
 
@@ -85,10 +85,10 @@ def test_loops_are_counted_and_their_effect_is_said() -> None:
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
-        (None, " s for all; 1 MB of memory"),
-        (0.6, " s for all, 1.7 times slower than recorded; "),
-        (1.02, " s for all, as fast as recorded; "),
-        (1.7, " s for all, 1.7 times faster than recorded; "),
+        (None, " ms per scan; 1 MB of memory"),
+        (0.6, " ms per scan, 1.7 times slower than recorded; "),
+        (1.02, " ms per scan, as fast as recorded; "),
+        (1.7, " ms per scan, 1.7 times faster than recorded; "),
     ],
 )
 def test_speed_is_faster_or_slower(factor: float | None, words: str) -> None:

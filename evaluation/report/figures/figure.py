@@ -113,8 +113,8 @@ def line_trace(name: str, style: Style, x: ArrayLike, y: ArrayLike, **more: Any)
     return go.Scatter(x=x, y=y, name=plot_text(name), **given)
 
 
-def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles, **more: Any) -> Panel:
-    """A horizontal bar a method; further arguments, of the same methods in order, are those of the bars."""
+def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles) -> Panel:
+    """A horizontal bar per method."""
     bars = [
         go.Bar(
             x=[value],
@@ -124,7 +124,6 @@ def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles
             legendgroup=styles[name].key,
             marker={"color": styles[name].colour},
             hovertemplate=f"%{{x:.4g}} {unit}",
-            **{key: of[name] for key, of in more.items()},
         )
         for name, value in values.items()
     ]

@@ -1,10 +1,11 @@
-"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph], or a peer."""
+"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph], or PEER[@scene]."""
 
 import re
 from dataclasses import dataclass
 from typing import get_args
 
 from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.scene import BY_SCENE
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.text.names import require_name
 from lidarslam.mapping.config import MappingName
@@ -34,7 +35,7 @@ _MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", 
 _GRAMMAR = (
     f"{', '.join(_BASES)}; each with +map or +loam, with +graph, or with both as in learned+map+graph;"
     " kiss-icp@0.5 for a voxel size of 0.5 m; and as they are "
-    f"{', '.join(PEERS)}"
+    f"{', '.join(PEERS)}; kiss-icp@{BY_SCENE}, and likewise a peer with voxels, for a range by the size of the scene"
 )
 
 
@@ -45,6 +46,7 @@ class Method:
     name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`, and of its run directory
     settings: tuple[str, ...]  # of the configuration, `key.path=value`
     peer: str | None = None  # the peer that estimates the poses, see `lidarslam.compare.peers`
+    by_scene: bool = False  # whether maximum range and voxels follow the size of the scene
 
     def __post_init__(self) -> None:
         require_name(self.name, "method", RESERVED)
@@ -54,6 +56,13 @@ class Method:
         """Whether it takes its motions from a given trajectory."""
         return self.peer is None and "odometry.method=external" in self.settings
 
+    def settings_at(self, range_m: float) -> tuple[str, ...]:
+        """Its settings where the size of the scene asks for this maximum range."""
+        if not self.by_scene:
+            return self.settings
+        by_scene = (f"odometry.kiss_icp.max_range_m={range_m!r}", "odometry.kiss_icp.voxel_size_m=null")
+        return (*self.settings, *by_scene)
+
 
 def parse_method(name: str) -> Method:
     """The method of that name.
@@ -61,8 +70,11 @@ def parse_method(name: str) -> Method:
     Raises:
         ConfigError: no method is called so, or a part of it is not in this version.
     """
-    if name in PEERS:
-        return Method(name, _PEER, name)
+    peer, by_scene = name.removesuffix(f"@{BY_SCENE}"), name.endswith(f"@{BY_SCENE}")
+    if peer in PEERS:
+        if by_scene and not PEERS[peer].has_voxels:
+            raise ConfigError(f"{name}: {peer} has no voxel size that could follow the size of the scene")
+        return Method(name, _PEER, peer, by_scene)
     match = _NAME.fullmatch(name)
     if match is None or match["base"] not in _BASES:
         raise ConfigError(f"no method is called {name!r}; there are: {_GRAMMAR}")
@@ -74,11 +86,13 @@ def parse_method(name: str) -> Method:
             f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
             " a map"
         )
-    voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)
+    by_scene = match["voxel"] == BY_SCENE and odometry == "kiss-icp"
+    size = None if match["voxel"] is None or by_scene else _voxel_size_m(name, match)
+    voxel = () if size is None else (f"odometry.kiss_icp.voxel_size_m={size!r}",)
     deskew = ("odometry.kiss_icp.deskew=false",) if match["base"] == _NO_DESKEW else ()
     pose_graph = str(match["graph"] is not None).lower()
     switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
-    return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches))
+    return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches), by_scene=by_scene)
 
 
 def _voxel_size_m(name: str, match: re.Match[str]) -> float:

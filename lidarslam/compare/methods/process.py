@@ -1,6 +1,7 @@
 """One method of a comparison in a process of its own: a run that reports its progress.
 
-The arguments are the folder to stand in, the peer's name or nothing, and the request as JSON. After every scan a line
+The arguments are the folder to stand in, the peer's name or nothing, its maximum range or nothing, and the request as
+JSON. After every scan a line
 goes to standard output: its number from 1, and how many there are. Libraries' output goes to standard error. The exit
 status is that of `lidarslam run`.
 """
@@ -12,6 +13,7 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -34,6 +36,7 @@ class MethodRun:
 
     request: RunRequest  # into the directory with the method's name
     peer: str | None = None  # the peer that estimates the poses
+    range_m: float | None = None  # maximum range of the peer by the size of the scene
 
     @property
     def name(self) -> str:
@@ -41,21 +44,22 @@ class MethodRun:
         return self.request.out.name
 
 
-def encode(run: MethodRun) -> tuple[str, str, str]:
+def encode(run: MethodRun) -> tuple[str, str, str, str]:
     """The arguments; the run overwrites, and saves no state and draws no page, which would count as its time."""
     request = replace(run.request, overwrite=True, resumable=False, report=False)
-    return str(Path.cwd()), run.peer or "", _REQUEST.dump_json(request).decode()
+    return str(Path.cwd()), run.peer or "", str(run.range_m or ""), _REQUEST.dump_json(request).decode()
 
 
 def main() -> int:
     """Run; the exit status."""
-    folder, peer, request = sys.argv[1:]
+    folder, peer, range_m, request = sys.argv[1:]
     os.chdir(folder)
     _obey_parent()
     with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as progress:
         os.dup2(2, 1)
         try:
-            outcome = _run(_REQUEST.validate_json(request), peer, lambda *counted: print(*counted, file=progress))
+            count = partial(print, file=progress)
+            outcome = _run(_REQUEST.validate_json(request), peer, float(range_m) if range_m else None, count)
         except LidarSlamError as error:
             print(f"lidarslam: {error}", file=sys.stderr)
             return STOPPED
@@ -72,9 +76,9 @@ def _obey_parent() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
-def _run(request: RunRequest, peer: str, progress: Callable[[int, int], None]) -> RunOutcome:
+def _run(request: RunRequest, peer: str, range_m: float | None, progress: Callable[[int, int], None]) -> RunOutcome:
     if peer:
-        return execute_peer(request, PEERS[peer], progress)
+        return execute_peer(request, PEERS[peer], progress, range_m)
     return execute(request, lambda number, total, _: progress(number, total))
 
 

@@ -105,7 +105,8 @@ def finished_before(run: MethodRun) -> MethodResult | None:
         tree = read_yaml(folder / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         is_same = Config.model_validate(tree) == run.request.config
-        described = describe_run(run.request) if run.peer is None else describe_peer(run.request, PEERS[run.peer])
+        peer = None if run.peer is None else PEERS[run.peer]
+        described = describe_run(run.request) if peer is None else describe_peer(run.request, peer, run.range_m)
         is_same = is_same and all(was_run.get(key) == value for key, value in described.items())
     except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
@@ -115,6 +116,7 @@ def finished_before(run: MethodRun) -> MethodResult | None:
 def _collect(run: MethodRun, result: MethodResult) -> MethodResult:
     """The result with the content of its run directory; a damaged one counts as a failure."""
     result = replace(result, settings=dump_yaml(run.request.config))
+    result = result if run.peer is None else replace(result, times_cover="registration")
     if result.status not in (*WHOLE, "stopped"):
         return result
     try:

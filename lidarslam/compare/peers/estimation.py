@@ -31,7 +31,11 @@ class Estimate:
 
 
 def estimate(
-    peer: Peer, scans: Iterable[Scan], imu: ImuSamples | None = None, progress: Callable[[int], None] = lambda _: None
+    peer: Peer,
+    scans: Iterable[Scan],
+    imu: ImuSamples | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+    range_m: float | None = None,
 ) -> Estimate:
     """Register all scans.
 
@@ -40,6 +44,7 @@ def estimate(
         scans: in the order of time; those without times are taken for motion compensated, and then all have to be.
         imu: for the peers that need it.
         progress: called after every scan with its number from 1.
+        range_m: maximum range by the size of the scene, for the peers with voxels; None: their defaults.
 
     Raises:
         PeerError: it cannot run, or has no usable poses.
@@ -54,7 +59,7 @@ def estimate(
         stamps.append(scan.stamp)
         if len(scan) >= _MIN_POINTS:
             sweep = Sweep.of(scan)
-            estimator = estimator or peer.make(sweep, samples)
+            estimator = estimator or peer.make(sweep, samples, range_m)
             register = estimator.load(sweep)
             started = time.perf_counter()
             taken = _take_imu(estimator, samples, taken, sweep.end)

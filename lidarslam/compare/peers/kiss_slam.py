@@ -9,18 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.compare.peers.interface import Poses, Sweep
+from lidarslam.compare.peers.interface import MAX_RANGE_M, Poses, Sweep
 from lidarslam.core.imu import ImuSamples
 
 
 class KissSlamEstimator:
     """KISS-SLAM behind the protocol of peers."""
 
-    def __init__(self) -> None:
+    def __init__(self, range_m: float = MAX_RANGE_M) -> None:
         from kiss_slam.config import load_config
         from kiss_slam.slam import KissSLAM
 
-        self._slam: Any = KissSLAM(load_config(None))
+        config: Any = load_config(None)
+        config.odometry.preprocessing.max_range = range_m
+        config.odometry.mapping.voxel_size *= range_m / MAX_RANGE_M
+        config.local_mapper.voxel_size *= range_m / MAX_RANGE_M
+        self._slam: Any = KissSLAM(config)
         self._instants: list[float] = []
 
     def add_imu(self, samples: ImuSamples, number: int) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 
-from lidarslam.compare.peers.interface import Estimator, PeerError, Sweep
+from lidarslam.compare.peers.interface import MAX_RANGE_M, Estimator, PeerError, Sweep
 from lidarslam.core.imu import ImuSamples
 
 EXTRA = "pip install 'lidarslam[peers]'"
@@ -18,8 +18,10 @@ class Peer:
     name: str  # in `--methods`
     library: str  # the module that it needs
     package: str  # that holds it
-    make: Callable[[Sweep, ImuSamples | None], Estimator]  # from the first sweep with points
+    # from the first sweep with points, the IMU, and the maximum range by the size of the scene; None: its defaults
+    make: Callable[[Sweep, ImuSamples | None, float | None], Estimator]
     needs_imu: bool = False
+    has_voxels: bool = True  # whether it has settings that follow the size of the scene
 
     @property
     def is_installed(self) -> bool:
@@ -43,37 +45,37 @@ class Peer:
             raise PeerError("needs an IMU, and the recording has none")
 
 
-def _evalio(name: str) -> Callable[[Sweep, ImuSamples | None], Estimator]:
-    def make(first: Sweep, imu: ImuSamples | None) -> Estimator:
+def _evalio(name: str) -> Callable[[Sweep, ImuSamples | None, float | None], Estimator]:
+    def make(first: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
         from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
 
-        return EvalioEstimator(PIPELINES[name], first, imu)
+        return EvalioEstimator(PIPELINES[name], first, imu, range_m)
 
     return make
 
 
-def _small_gicp(_: Sweep, __: ImuSamples | None) -> Estimator:
+def _small_gicp(_: Sweep, __: ImuSamples | None, range_m: float | None) -> Estimator:
     from lidarslam.compare.peers.small_gicp import SmallGicpEstimator
 
-    return SmallGicpEstimator()
+    return SmallGicpEstimator(range_m or MAX_RANGE_M)
 
 
-def _kiss_slam(_: Sweep, __: ImuSamples | None) -> Estimator:
+def _kiss_slam(_: Sweep, __: ImuSamples | None, range_m: float | None) -> Estimator:
     from lidarslam.compare.peers.kiss_slam import KissSlamEstimator
 
-    return KissSlamEstimator()
+    return KissSlamEstimator(range_m or MAX_RANGE_M)
 
 
-def _rko_lio(_: Sweep, imu: ImuSamples | None) -> Estimator:
+def _rko_lio(_: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
     from lidarslam.compare.peers.rko_lio import RkoLioEstimator
 
     assert imu is not None
-    return RkoLioEstimator(imu)
+    return RkoLioEstimator(imu, range_m or MAX_RANGE_M)
 
 
 _ALL = (
     *(
-        Peer(name, "evalio", "evalio", _evalio(name))
+        Peer(name, "evalio", "evalio", _evalio(name), has_voxels=name not in ("mad-icp", "loam-evalio", "form"))
         for name in ("kiss-icp-evalio", "genz-icp", "mad-icp", "ct-icp", "loam-evalio", "form")
     ),
     *(Peer(name, "evalio", "evalio", _evalio(name), needs_imu=True) for name in ("lio-sam", "dlio")),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.compare.peers.interface import Poses, Sweep
+from lidarslam.compare.peers.interface import MAX_RANGE_M, Poses, Sweep
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 
@@ -17,12 +17,12 @@ from lidarslam.core.imu import ImuSamples
 class RkoLioEstimator:
     """RKO-LIO behind the protocol of peers; its base frame is that of the LiDAR."""
 
-    def __init__(self, imu: ImuSamples) -> None:
+    def __init__(self, imu: ImuSamples, range_m: float = MAX_RANGE_M) -> None:
         from rko_lio.config import LIOConfig
         from rko_lio.lio import LIO
 
         self._T_lidar_imu = np.eye(4) if imu.T_lidar_imu is None else imu.T_lidar_imu
-        self._lio: Any = LIO(LIOConfig())
+        self._lio: Any = LIO(LIOConfig(voxel_size=range_m / 100.0, max_range=range_m))
         self._poses: list[tuple[float, FloatArray]] = []
 
     def add_imu(self, samples: ImuSamples, number: int) -> None:

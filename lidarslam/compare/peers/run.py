@@ -28,12 +28,15 @@ from lidarslam.storage.directory import RunDirectory
 PEER_KEY = "peer"
 
 
-def describe_peer(request: RunRequest, peer: Peer) -> dict[str, object]:
+def describe_peer(request: RunRequest, peer: Peer, range_m: float | None) -> dict[str, object]:
     """The section of config.yaml about what was run."""
-    return {**describe_run(request), PEER_KEY: peer.version}
+    by_scene = {} if range_m is None else {"max_range_m": range_m}
+    return {**describe_run(request), PEER_KEY: peer.version, **by_scene}
 
 
-def execute_peer(request: RunRequest, peer: Peer, progress: Callable[[int, int], None]) -> RunOutcome:
+def execute_peer(
+    request: RunRequest, peer: Peer, progress: Callable[[int, int], None], range_m: float | None = None
+) -> RunOutcome:
     """Run a peer, and write the run directory.
 
     First the peer takes all scans; then they are read again, chained with its poses, checked and drawn into the map as
@@ -43,6 +46,7 @@ def execute_peer(request: RunRequest, peer: Peer, progress: Callable[[int, int],
         request: what is run, with the poses of an external odometry.
         peer: which one.
         progress: called after every scan that the peer has registered, with its number from 1 and how many there are.
+        range_m: as of `estimate`.
 
     Raises:
         LidarSlamError: the source, the peer or the output directory is not usable.
@@ -52,14 +56,14 @@ def execute_peer(request: RunRequest, peer: Peer, progress: Callable[[int, int],
     errors: list[InputError] = []
     scans = _until_damaged(take_in(recording, chosen, Faults()), errors)
     samples = recording.imu if peer.needs_imu else None
-    estimated = estimate(peer, prefetch(scans), samples, lambda number: progress(number, len(chosen)))
+    estimated = estimate(peer, prefetch(scans), samples, lambda number: progress(number, len(chosen)), range_m)
     with Interruptions() as interruptions, RunDirectory.create(request.out, request.overwrite) as directory:
         interruptions.protect_results()
         tracked = _track(request, recording, chosen, estimated)
         if errors:
             tracked = replace(tracked, error=errors[0])
         drawn = final_map(tracked, None, request.config.global_map, directory)
-        return write_results(directory, request.config, describe_peer(request, peer), tracked, None, drawn)
+        return write_results(directory, request.config, describe_peer(request, peer, range_m), tracked, None, drawn)
 
 
 def _until_damaged(scans: Iterator[Scan], errors: list[InputError]) -> Iterator[Scan]:

@@ -74,7 +74,8 @@ class GraphSummary:
 class RunSummary:
     """The content of summary.json.
 
-    `ms_per_scan["total"]` is the time from one finished scan to the next; the stages overlap and add up to more.
+    `ms_per_scan["total"]` is the time from one finished scan to the next, and `latency_ms` the sum of a scan's stages,
+    which is more, as the stages of successive scans overlap.
     """
 
     scans: int
@@ -82,6 +83,7 @@ class RunSummary:
     duration_s: float
     elapsed_s: float
     ms_per_scan: dict[str, Milliseconds]
+    latency_ms: Milliseconds
     realtime_factor: float | None
     peak_rss_mb: float
     lost: tuple[LostStretch, ...]
@@ -94,6 +96,11 @@ class RunSummary:
     contradictions: tuple[Contradiction, ...] = ()
     slowest: SlowestScan | None = None
     elevation: Elevation | None = None
+
+    @property
+    def elapsed_ms_per_scan(self) -> float:
+        """Elapsed time of all scans over their number."""
+        return 1e3 * self.elapsed_s / max(1, self.scans)
 
     @property
     def went_astray(self) -> bool:
@@ -117,6 +124,8 @@ class RunSummary:
             "length_m": self.length_m,
             "duration_s": self.duration_s,
             "elapsed_s": self.elapsed_s,
+            "elapsed_ms_per_scan": self.elapsed_ms_per_scan,
+            "latency_ms": vars(self.latency_ms),
             "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
             "slowest_scan": None if self.slowest is None else vars(self.slowest),
             "realtime_factor": self.realtime_factor,
@@ -168,6 +177,7 @@ def summarise(
         duration_s=trajectory.duration_s,
         elapsed_s=elapsed_s,
         ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
+        latency_ms=Milliseconds.of(log.stage_ms.sum(axis=1)),
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
         peak_rss_mb=peak_rss_mb(),
         lost=tuple(_lost_stretches(log)),

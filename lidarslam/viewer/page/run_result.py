@@ -23,6 +23,7 @@ def with_run(result: MethodResult, run: Path) -> MethodResult:
     trajectory, summary = read_trajectory(run), read_summary(run)
     statuses = read_statuses(run, len(trajectory))
     try:
+        latency = summary.get("latency_ms", {})  # absent from runs of earlier versions
         ms = {stage: values["median"] for stage, values in summary["ms_per_scan"].items()}
         return replace(
             result,
@@ -31,6 +32,9 @@ def with_run(result: MethodResult, run: Path) -> MethodResult:
             lost=np.array([status == "lost" for status in statuses], dtype=np.bool_),
             lost_reasons=tuple(stretch["reason"] for stretch in summary["lost"]),
             map_entropy=summary["map_entropy"],
+            elapsed_ms_per_scan=summary.get("elapsed_ms_per_scan"),
+            latency_ms_median=latency.get("median"),
+            latency_ms_p99=latency.get("p99"),
             ms_per_scan_median=ms.pop("total"),
             ms_per_scan_p95=summary["ms_per_scan"]["total"]["p95"],
             ms_per_scan_p99=summary["ms_per_scan"]["total"]["p99"],

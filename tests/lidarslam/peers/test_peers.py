@@ -15,6 +15,7 @@ from lidarslam.compare.methods.names import parse_method
 from lidarslam.compare.peers.estimation import estimate, is_covered
 from lidarslam.compare.peers.interface import PeerError, Poses, Sweep
 from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.scene import scene_range_m
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
@@ -163,6 +164,57 @@ def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recordi
     again = CliRunner().invoke(main, [*arguments, "--reuse"], catch_exceptions=False)
     assert "small-gicp: ok" in again.output
     assert "in an earlier comparison" in again.output
+
+
+class _Ranges:
+    """A recording whose points lie up to 7 m away, and one in two hundred in 60 m; from the eleventh scan on, 90 m."""
+
+    def __init__(self, scale: float) -> None:
+        self._scale = scale
+
+    def scans(self, start: int, stop: int, step: int, _: object) -> list[Scan]:
+        ranges = np.r_[np.linspace(1.0, 7.0, 199), 60.0]
+        far = np.full(200, 90.0)
+        points = [np.outer(far if number > 9 else ranges, [self._scale, 0.0, 0.0]) for number in range(30)]
+        return [Scan(points[number], float(number)) for number in range(start, stop, step)]
+
+
+def test_the_range_of_a_scene_is_twice_that_of_nearly_all_points_of_the_first_scans_and_outdoors_the_default() -> None:
+    ranges = {scale: scene_range_m(_Ranges(scale), range(30)) for scale in (1.0, 0.1, 8.0)}
+    assert ranges[1.0] == pytest.approx(14.0, abs=0.2)
+    assert (ranges[0.1], ranges[8.0]) == (10.0, 100.0)
+    assert scene_range_m(_Ranges(1.0), range(10, 30)) == 100.0
+    assert scene_range_m(_Ranges(1.0), range(0)) == 100.0
+
+
+def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("small_gicp", reason="needs the extra peers")
+    out = tmp_path / "compared"
+    names = ["small-gicp", "small-gicp@scene", "kiss-icp@scene"]
+    arguments = ["compare", str(recording), "-o", str(out), "--methods", ",".join(names)]
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    content = json.loads((out / "comparison.json").read_text())
+    assert [method["status"] for method in content["methods"].values()] == ["ok"] * 3
+    assert all(method["metrics"]["trajectory"]["ate_rmse_m"] < 0.1 for method in content["methods"].values())
+    (note,) = (note for note in content["notes"] if note.startswith("@scene: maximum range "))
+    range_m = float(note.split()[3])
+    assert 10.0 <= range_m < 40.0
+    configs = {name: (out / "room" / name / "config.yaml").read_text() for name in names}
+    assert "max_range_m: 100.0" in configs["small-gicp"]
+    assert [f"max_range_m: {range_m}" in configs[name] for name in names] == [False, True, True]
+    assert "Times of small-gicp, small-gicp@scene: registration alone" in done.output
+    again = CliRunner().invoke(main, [*arguments, "--reuse"], catch_exceptions=False)
+    assert again.output.count("in an earlier comparison") == 3
+
+
+@pytest.mark.parametrize("name", [name for name, peer in PEERS.items() if peer.has_voxels and not peer.needs_imu])
+def test_every_peer_with_voxels_registers_a_small_scene_with_fine_ones(name: str, room: Any) -> None:
+    pytest.importorskip(PEERS[name].library, reason="needs the extra peers")
+    sweeps = [room.sweep(_swaying, SWEEP_S * number) for number in range(1, 7)]
+    coarse, fine = (estimate(PEERS[name], sweeps, range_m=range_m).trajectory for range_m in (None, 20.0))
+    assert len(fine) == len(coarse)
+    assert np.abs(fine.T_world_lidar - coarse.T_world_lidar).max() > 1e-6
 
 
 def test_what_is_not_installed_names_the_extra() -> None:

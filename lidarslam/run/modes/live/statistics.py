@@ -32,7 +32,7 @@ class Latency:
         return cls(float(median), float(p99))
 
     def __str__(self) -> str:
-        return f"median {self.median_ms:.0f} ms, p99 {self.p99_ms:.0f} ms"
+        return f"median {self.median_ms:.0f} ms, 99 % under {self.p99_ms:.0f} ms"
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,9 @@ class LiveCounts:
 
     def line(self) -> str:
         """A line for the time of the run."""
-        latency = "" if self.from_arrival is None else f", {self.from_arrival.median_ms:.0f} ms"
-        p99 = "" if self.from_arrival is None else f" (p99 {self.from_arrival.p99_ms:.0f})"
+        latency = "" if self.from_arrival is None else f", latency: {self.from_arrival}"
         lost = f"{self.missing} missing, {self.dropped} dropped"
-        return f"{count(self.registered, 'scan')}, {self.rate_hz:.1f} Hz{latency}{p99}, {lost}"
+        return f"{count(self.registered, 'scan')}, {self.rate_hz:.1f} Hz{latency}, {lost}"
 
     def text(self) -> str:
         """Lines for its end."""

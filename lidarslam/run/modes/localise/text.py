@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, scan_span
 from lidarslam.run.modes.localise.localise import LocaliseOutcome
 from lidarslam.run.modes.localise.request import LocaliseRequest
+from lidarslam.run.summary_text import format_times
 from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # Stretches of lost scans that are listed; summary.json has them all.
@@ -25,14 +26,11 @@ def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
 
 def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     summary, found, out = outcome.run.summary, outcome.localisation, request.run.out
-    total = summary.ms_per_scan["total"]
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     yield f"found at scan {found.found}, confirmed at scan {found.confirmed}, after {found.after_s:.1f} s"
     before = f", {found.placed_afterwards:,} before that placed afterwards" if found.placed_afterwards else ""
     yield f"{found.tracked:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
-    yield f"{total.median:.0f} ms a scan (99 % under {total.p99:.0f} ms), {summary.elapsed_s:.1f} s for all;" + (
-        f" {summary.peak_rss_mb:,.0f} MB of memory"
-    )
+    yield from format_times(summary)
     for warning in summary.warnings:
         yield f"warning: {warning}"
     for stretch in summary.lost[:_LISTED]:
