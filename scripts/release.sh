@@ -21,9 +21,9 @@ try --version
 cat log
 try simulate -o office --world office --scans 20
 try run office -o run
-cat log
 
 mkdir -p "$root/dist"
-mv "$folder"/dist/* "$root/dist"
-echo "written to dist: $(cd "$folder/venv" && bin/pip list --format freeze | grep '^lidarslam==')"
-ls "$root/dist"
+for file in "$folder"/dist/*; do
+    mv "$file" "$root/dist"
+    echo "tried, and written to dist/${file##*/}"
+done
