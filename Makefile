@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check lowest audit docs install clean
+.PHONY: demo test lint check lowest audit release docs install clean
 
 demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
@@ -15,12 +15,14 @@ PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loa
 test: install
 	$(PYTEST)
 
-# Everything that continuous integration asks.
-check: install
+lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+# Everything that continuous integration asks.
+check: lint
 	$(PYTEST)
 
 # The lowest versions of libraries that pyproject.toml allows, which needs the network.
@@ -31,6 +33,11 @@ lowest:
 audit: install
 	$(BIN)/python -m pip install --quiet pip-audit
 	$(BIN)/pip-audit --skip-editable
+
+# Source distribution and wheel in dist/, once the wheel has been tried in an environment of its own; publishes nothing.
+release:
+	sh scripts/system_libraries.sh
+	PYTHON=$(PYTHON) sh scripts/release.sh
 
 # The documentation as a site; warnings are errors (mkdocs.yml), which --quiet would hide.
 docs: install
@@ -57,4 +64,4 @@ $(VENV)/.installed: $(VENV)/.base
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build dist *.egg-info
