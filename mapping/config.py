@@ -1,10 +1,9 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
-from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
 

@@ -1,10 +1,9 @@
 """Settings of the odometry methods, and the description of a network that its weights carry; imports no method."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from typing_extensions import Self
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.limits import require_range_left

@@ -1,12 +1,12 @@
 """Hooks of mkdocs: mathematics becomes MathML, and links that leave docs/ lead to the repository."""
 
 import re
+import tomllib
 from html import unescape
 from pathlib import Path, PurePosixPath
 from posixpath import normpath
 from typing import Any
 
-import tomllib
 from latex2mathml.converter import convert
 
 REPOSITORY = Path(__file__).parents[1]

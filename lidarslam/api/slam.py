@@ -8,12 +8,11 @@ from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from threading import RLock
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
-from typing_extensions import Self
 
 from lidarslam.api.arrays import check_stamp, check_sweep, make_scan, make_vector
 from lidarslam.api.registered_scan import RegisteredScan

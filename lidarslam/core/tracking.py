@@ -1,9 +1,9 @@
 """Tracking status."""
 
-from enum import Enum
+from enum import StrEnum
 
 
-class Status(str, Enum):
+class Status(StrEnum):
     """Quality of a scan's pose.
 
     `ok`: the scan fits the map. `degraded`: it fits badly, or only some directions are constrained. `lost`: it does not

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +157,7 @@ def _notes(info: RecordingInfo) -> Iterator[str]:
 def _instant(stamp: float) -> str:
     if not _EPOCH_FROM_S <= stamp < _EPOCH_UNTIL_S:
         return f"{stamp:.3f} s"
-    return f"{datetime.fromtimestamp(stamp, timezone.utc):%Y-%m-%d %H:%M:%S} UTC ({stamp:.3f})"
+    return f"{datetime.fromtimestamp(stamp, UTC):%Y-%m-%d %H:%M:%S} UTC ({stamp:.3f})"
 
 
 def _intensity(scan: Scan) -> str:

@@ -1,9 +1,8 @@
 """Settings of training; light, so that reading a configuration imports no torch."""
 
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from typing_extensions import Self
 
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 

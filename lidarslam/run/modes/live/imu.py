@@ -3,10 +3,9 @@
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
-from typing_extensions import Self
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.ros.bag_imu import ACCELERATION, ANGULAR_VELOCITY, IMU_TYPE, imu_numbers

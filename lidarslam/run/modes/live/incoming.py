@@ -5,8 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-
-from typing_extensions import Self
+from typing import Self
 
 _POLL_S = 0.2
 

@@ -3,9 +3,7 @@
 import time
 from contextlib import closing
 from types import TracebackType
-from typing import TYPE_CHECKING
-
-from typing_extensions import Self
+from typing import TYPE_CHECKING, Self
 
 from lidarslam.config.settings import Config
 from lidarslam.core.scan import Scan
