@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
@@ -57,6 +57,8 @@ def draw(
         return drawn_map(global_map, views, config)
     writer = TileWriter(directory)
     drawn = drawn_map(global_map, views, config, writer.write)
+    if writer.failure is not None:
+        return replace(drawn, tiled=None, failure=writer.failure)
     if drawn.tiled is not None and drawn.tiled.points:
         writer.finish(drawn.tiled)
     return drawn
@@ -82,7 +84,9 @@ def write_results(
     Raises:
         OutputError: a file cannot be written.
     """
-    log, failed = tracked.log, None
+    log, failed = tracked.log, drawn.failure
+    if failed is not None:
+        log.warn(f"the map is an overview without its tiles: {failed}")
     logger.info("writing the results of %s", count(len(log), "scan"))
     directory.write_text(files.CONFIG, dump_yaml(config, described))
     if closed is not None:

@@ -17,13 +17,18 @@ class TileWriter:
     def __init__(self, directory: RunDirectory) -> None:
         self._directory = directory
         self._entries: dict[Tile, dict[str, Any]] = {}
+        self.failure: OutputError | None = None  # of the first tile that could not be written, after which none is
 
     def write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
-        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
+        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`."""
+        if self.failure is None:
+            try:
+                self._write(tile, cloud, brightest)
+            except OutputError as error:
+                self.failure = error
+                self._remove()
 
-        Raises:
-            OutputError: the file could not be written.
-        """
+    def _write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
         if not self._entries:
             self._begin()
         name = f"{tile[0]}_{tile[1]}.laz"
@@ -62,3 +67,8 @@ class TileWriter:
             raise OutputError(f"{folder}: a file is in the way; name another directory") from error
         except OSError as error:
             raise cannot_write(folder, error) from error
+
+    def _remove(self) -> None:
+        """Leave the room of the tiles to the other results."""
+        for entry in self._entries.values():
+            (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)

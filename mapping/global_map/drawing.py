@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarslam.core.errors import OutputError
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import NORMALS_MARGIN_M, GlobalMap, PointCloud, VoxelMeans
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
@@ -46,6 +47,7 @@ class DrawnMap:
     moved: int = 0  # number of points that were removed as moving objects
     tiled: TiledMap | None = None  # all of the map, where `cloud` is an overview
     warning: str | None = None  # points that lie beyond the reach of the voxels
+    failure: OutputError | None = None  # of the tiles, where `cloud` is an overview without them
 
 
 WriteTile = Callable[[Tile, PointCloud, float], None]

@@ -80,6 +80,31 @@ def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, 
     assert lidarslam("run", small_recording, "--out", out, *FAST, "--overwrite").exit_code == 0
 
 
+def test_tiles_that_find_no_room_cost_no_other_result(
+    tmp_path: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def full_after_one(path: Path, *_: object) -> None:
+        if written:
+            raise OutputError(f"{path.parent}: the .laz map cannot be written there (No space left on device)")
+        path.write_bytes(b"a tile")
+        written.append(path)
+
+    monkeypatch.setattr("lidarslam.storage.map_tiles.write_cloud", full_after_one)
+    out = tmp_path / "run"
+    result = lidarslam("run", small_recording, "--out", out, *FAST, "--set", "global_map.most_points=2000")
+    assert result.exit_code == 1
+    assert result.stderr.count("lidarslam: ") == 1
+    assert "No space left on device" in result.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["map_tiles"] is None
+    assert any("an overview without its tiles" in warning for warning in summary["warnings"])
+    assert len(read_tum(out / "trajectory.tum")) == 6
+    assert not list(out.rglob("*.laz")), "the room of the tiles is left to the other results"
+    assert not (out / "map" / "index.json").exists()
+
+
 @pytest.mark.parametrize("size", [0, 4_000, 100_000])
 def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recording: Path, size: int) -> None:
     """Where the disk fills up as a run replaces an earlier one, before it has replaced anything or after."""

@@ -114,6 +114,8 @@ def write_merge(
                 views.append(read_part(part.saved()).views.placed(common.T_world_lidar[begin : begin + part.scans]))
             begin += part.scans
         drawn = draw(common.global_map, PlacedViews.join(views), request.config.global_map, directory)
+        if drawn.failure is not None:
+            raise drawn.failure
         written, beyond = write_map(directory, drawn, request.map_formats), drawn.warning
     recordings = tuple(_entry(part, runs[index], index in joined) for index, part in enumerate(parts))
     summary = MergeSummary(
