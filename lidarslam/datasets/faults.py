@@ -28,6 +28,7 @@ _SINGULAR = (
     ("and are taken", "and is taken"),
     ("and carry", "and carries"),
     ("their points", "its points"),
+    ("outside their sweeps", "outside its sweep"),
 )
 
 

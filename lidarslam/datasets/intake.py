@@ -28,6 +28,8 @@ _HALF_M, _SPREAD = 3000.0, 5.0
 _ALL_ROUND = 0.5
 # No sweep is so short; the times of a flash are, and so are those in another unit.
 _SHORTEST_SWEEP_S = 1e-3
+# Share of a sweep by which its stamp may lie outside: clouds are stamped as they are published, too.
+_OUTSIDE = 0.25
 _FEW_POINTS = 50
 _SAMPLE = 4096
 # No LiDAR makes a thousand scans a second.
@@ -47,6 +49,10 @@ _AT_ONCE = (
 _COUNTER_CLOCKWISE = (
     "scans turn counter-clockwise as seen from above, as few sensors do unless upside down: otherwise their axes are"
     " mirrored, and so is the map, or the times of their points run backwards (reader.time_scale=-1)"
+)
+_OUTSIDE_SWEEP = (
+    "scans are stamped outside their sweeps, and poses belong to the stamps: check whether the times of the points are"
+    " shifted or on another clock"
 )
 _UNTIMED = "scans have points without a time, which were given one between those of their neighbours"
 _REPEATED = "scans were left out: they have the points of the scan before, as from a driver that hangs"
@@ -139,8 +145,16 @@ def look_at(scan: Scan, faults: Faults) -> Scan:
 def _look_at_times(scan: Scan, faults: Faults) -> None:
     if scan.untimed:
         faults.note(_UNTIMED, f"{count(scan.untimed, 'point')} at {scan.stamp:.9f}")
-    if scan.time_offsets is not None and (span_s := float(np.ptp(scan.time_offsets))) < _SHORTEST_SWEEP_S:
+    if scan.time_offsets is None:
+        return
+    first_s, last_s = float(scan.time_offsets.min()), float(scan.time_offsets.max())
+    span_s, outside_s = last_s - first_s, max(first_s, -last_s)
+    if span_s < _SHORTEST_SWEEP_S:
         faults.note(_AT_ONCE, f"{span_s:.3g} s at {scan.stamp:.9f}")
+    elif outside_s > _OUTSIDE * span_s:
+        faults.note(
+            _OUTSIDE_SWEEP, f"{1e3 * outside_s:.0f} ms {'before' if first_s > 0.0 else 'after'}, {scan.stamp:.9f}"
+        )
 
 
 def _implausible_ranges(points: FloatArray) -> str | None:

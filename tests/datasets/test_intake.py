@@ -77,6 +77,18 @@ def test_times_of_no_sweep_are_told(rng, span_s):
     assert seen(points, time_offsets=np.linspace(0.0, 0.02, 1000))[1].warnings() == ()
 
 
+@pytest.mark.parametrize(
+    ("shift_s", "told"), [(0.0, ""), (-0.05, ""), (-0.12, ""), (0.05, "50 ms before"), (-0.15, "50 ms after")]
+)
+def test_times_shifted_away_from_the_stamp_are_told(rng, shift_s, told):
+    points = rng.uniform(-8.0, 8.0, (1000, 3))
+    _, faults = seen(points, time_offsets=np.linspace(0.0, 0.1, 1000) + shift_s)
+    assert len(faults.warnings()) == bool(told)
+    if told:
+        assert faults.warnings()[0].startswith("1 scan is stamped outside its sweep")
+        assert told in faults.warnings()[0]
+
+
 def test_points_without_a_time_are_counted(rng):
     points, times = rng.uniform(-8.0, 8.0, (1000, 3)), np.linspace(0.0, 0.1, 1000)
     times[::4] = np.nan
