@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--graph", action="store_true", help="with the pose graph")
     arguments = parser.parse_args()
-    print("| Recording | Way, m | Method | ATE, m | Height, m | Roll, pitch, deg | Turn, deg | Lost | Degraded |")
+    print("| Recording | Path, m | Method | ATE, m | Height, m | Roll, pitch, deg | Turn, deg | Lost | Degraded |")
     print("|---|---|---|---|---|---|---|---|---|")
     for recorded in recordings(arguments):
         for method in arguments.methods:

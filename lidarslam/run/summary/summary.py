@@ -226,7 +226,7 @@ def _warnings(
     if log.points_dropped:
         share = log.points_dropped / max(1, len(log))
         points = count(log.points_dropped, "invalid point")
-        yield f"{points} dropped (NaN, at the origin or out of range), {share:.0f} a scan"
+        yield f"{points} dropped (NaN, at the origin or out of range), {share:.0f} per scan"
     if degraded := log.statuses.count(Status.DEGRADED):
         yield f"tracking was degraded on {count(degraded, 'scan')}; {SCANS_CSV} gives the reasons"
     length_m = log.trajectory.length_m

@@ -74,7 +74,7 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
     how = f"{request.mount}, {request.moved}"
     lines = (
         f"{count(summary.scans, 'scan')} of a {request.sensor} ({how}) in {request.world}, seed {request.seed}",
-        f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points a scan,"
+        f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points per scan,"
         f" reference map of {summary.map_points:,} points",
         f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what",
         f"next: {_run_command(summary, as_typed('lidarslam'))}",
