@@ -33,7 +33,7 @@ DRAW_ALL = """
   const isDrawn = plot => plot.querySelector('svg.main-svg .trace, svg.main-svg .hm image');
   for (let i = 0; i < 100 && !plots.every(isDrawn); i++) await new Promise(done => setTimeout(done, 50));
   dispatchEvent(new Event('afterprint'));
-  const isFitted = plot => plot.querySelector('svg.main-svg').clientWidth === plot.clientWidth;
+  const isFitted = plot => plot.querySelector('svg.main-svg')?.clientWidth === plot.clientWidth;
   for (let i = 0; i < 100 && !plots.every(isFitted); i++) await new Promise(done => setTimeout(done, 50));
   return [plots.length, plots.filter(isDrawn).length];
 })()
