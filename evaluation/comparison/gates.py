@@ -59,7 +59,7 @@ PATHS: dict[str, str] = {
         "metrics/trajectory/length_m",
     )
 }
-_PLUGIN = re.compile(r"plugins\.(.+)\.([^.]+)")
+_PLUGIN = re.compile(r"plugins\.[^.]+\.[^.]+")  # of another package's metric
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,10 @@ class Gate:
     def of(self, figures: Figures) -> float | None:
         """The figure; None where it could not be computed."""
         value: object = figures
-        for key in _keys(self.figure):
+        path = FIGURES.get(self.figure) or PATHS.get(self.figure) or f"metrics/{self.figure.replace('.', '/')}"
+        for key in path.split("/"):
             value = value.get(key) if isinstance(value, Mapping) else None
         return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
-
-
-def _keys(figure: str) -> list[str]:
-    """From the root of the figures."""
-    if (plugin := _PLUGIN.fullmatch(figure)) is not None:
-        return ["metrics", "plugins", *plugin.groups()]
-    return (FIGURES.get(figure) or PATHS[figure]).split("/")
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """Plug points: what other packages add as entry points in the groups `lidarslam.odometry`, `lidarslam.mapping` etc."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.text.plain_text import one_line
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -39,11 +40,7 @@ class PlugPoint:
         return (*self.built_in, *self.added)
 
     def check(self, name: Any) -> Any:
-        """The name, if there is one like it.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """The name, where it is one of them; else a ValueError with all of them."""
         if name not in self.built_in and name not in self.names:
             raise ValueError(f"no {self.group} is called {name!r}; there are: {', '.join(self.names)}")
         return name
@@ -57,17 +54,13 @@ class PlugPoint:
         try:
             loaded = self.added[name].load()
         except Exception as error:  # another package's code
-            why = " ".join(f"{type(error).__name__}: {error}".split())
+            why = one_line(f"{type(error).__name__}: {error}")
             raise ConfigError(f"{self._origin(name)} cannot be loaded ({why}); repair or uninstall that") from error
         return self._of_kind(name, loaded, kind)
 
     def make(self, name: str, kind: Any, *arguments: object) -> Any:
-        """What the callable of another package's entry point makes of the arguments.
-
-        Raises:
-            ConfigError: it cannot be imported, or makes something of another kind.
-        """
-        return self._of_kind(name, self.load(name, object)(*arguments), kind)
+        """What a callable that is loaded likewise returns."""
+        return self._of_kind(name, self.load(name, Callable)(*arguments), kind)
 
     def _of_kind(self, name: str, given: Any, kind: Any) -> Any:
         if not isinstance(given, kind):
@@ -80,15 +73,13 @@ class PlugPoint:
 
 @cache
 def search(point: PlugPoint) -> "Mapping[str, EntryPoint]":
-    """The entry points of other packages, by name; of two with one name, the first."""
+    """The entry points of other packages, by name; a name that is taken is left out with a warning."""
     from importlib.metadata import entry_points  # takes a while, as the search does
 
     found: dict[str, EntryPoint] = {}
     for entry in entry_points(group=f"lidarslam.{point.group}"):
         if entry.name in point.built_in or entry.name in found:
-            owner = _package(found[entry.name]) if entry.name in found else "lidarslam"
-            package = _package(entry)
-            logger.warning("the %s %r of %s is ignored: %s has that name", point.group, entry.name, package, owner)
+            logger.warning("the %s %r of %s is ignored: the name is taken", point.group, entry.name, _package(entry))
         else:
             found[entry.name] = entry
     return found

@@ -188,7 +188,7 @@ def test_names_are_listed_and_a_built_in_one_is_not_taken(
     broken: Path, recording: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert "|learned+imu|broken|still]" in "".join(lidarslam("run", "--help").output.split())
-    assert "the odometry 'kiss-icp' of lidarslam-broken is ignored: lidarslam has that name" in caplog.text
+    assert "the odometry 'kiss-icp' of lidarslam-broken is ignored: the name is taken" in caplog.text
     result = lidarslam("run", recording, "--set", "odometry.method=loam")
     assert "there are: learned, kiss-icp, constant-velocity, imu, learned+imu, external, broken, still" in result.stderr
 
