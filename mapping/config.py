@@ -1,13 +1,15 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
+from lidarslam.core.plugins import PlugPoint
 
 MappingName = Literal["surfels", "loam", "off"]
+MAPPINGS = PlugPoint("mapping", get_args(MappingName))
 MapField = Literal["intensity", "rgb", "ring", "time"]
 """An attribute of the points of a map."""
 MapFormat = Literal["pcd", "laz", "e57"]
@@ -35,7 +37,9 @@ class MappingConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: MappingName = Field("surfels", description="surfels, loam (LOAM's mapping) or off (the odometry alone)")
+    method: Annotated[str, BeforeValidator(MAPPINGS.check)] = Field(
+        "surfels", description="surfels, loam (LOAM's mapping), off (the odometry alone), or another package's"
+    )
     cell_m: float | None = Field(
         None,
         ge=0.02,

@@ -1,14 +1,16 @@
 """Settings of the odometry methods, and the description of a network that its weights carry; imports no method."""
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.limits import require_range_left
+from lidarslam.core.plugins import PlugPoint
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
+ODOMETRIES = PlugPoint("odometry", get_args(OdometryName))
 NetworkName = Literal["correlation", "delora"]
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 Metres = Annotated[float, Field(ge=-100.0, le=100.0)]
@@ -55,8 +57,9 @@ class OdometryConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: OdometryName = Field(
-        "learned", description="learned, kiss-icp, constant-velocity, imu, learned+imu or external (--prior)"
+    method: Annotated[str, BeforeValidator(ODOMETRIES.check)] = Field(
+        "learned",
+        description="learned, kiss-icp, constant-velocity, imu, learned+imu, external (--prior), or another package's",
     )
     learned: LearnedConfig = LearnedConfig()
     kiss_icp: KissConfig = KissConfig()

@@ -1,7 +1,7 @@
 """The protocol of every odometry method."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class Motion:
         )
 
 
+@runtime_checkable
 class Odometry(Protocol):
     """Estimates the motion from scan to scan."""
 

@@ -1,8 +1,10 @@
 """The odometry methods by name; a method's module is imported when it is chosen."""
 
+from typing import cast
+
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.odometry.config import LearnedConfig, OdometryConfig
+from lidarslam.odometry.config import ODOMETRIES, LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.train_extra import require_train_extra
 
@@ -16,7 +18,8 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
 
     Raises:
         ConfigError: the method is `external` and there is no prior, or the other way round; or the learned odometry's
-            device, its shipped weights or the libraries for a file of weights are missing.
+            device, its shipped weights or the libraries for a file of weights are missing; or another package's cannot
+            be loaded.
         InputError: the learned odometry's weights are no weights.
     """
     if (config.method == "external") != (prior is not None):
@@ -31,9 +34,11 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         from lidarslam.odometry.methods.kiss import KissOdometry
 
         return KissOdometry(config.kiss_icp)
-    from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
+    if config.method in ODOMETRIES.built_in:
+        from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
 
-    return ConstantVelocity()
+        return ConstantVelocity()
+    return cast(Odometry, ODOMETRIES.make(config.method, Odometry))
 
 
 def _make_learned(config: LearnedConfig) -> Odometry:

@@ -1,6 +1,7 @@
 """Quality gates: bounds on the figures of metrics.json and summary.json, for continuous integration."""
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -58,6 +59,7 @@ PATHS: dict[str, str] = {
         "metrics/trajectory/length_m",
     )
 }
+_PLUGIN = re.compile(r"plugins\.[^.]+\.[^.]+")  # of another package's metric
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ class Gate:
     def of(self, figures: Figures) -> float | None:
         """The figure; None where it could not be computed."""
         value: object = figures
-        for key in (FIGURES.get(self.figure) or PATHS[self.figure]).split("/"):
+        path = FIGURES.get(self.figure) or PATHS.get(self.figure) or f"metrics/{self.figure.replace('.', '/')}"
+        for key in path.split("/"):
             value = value.get(key) if isinstance(value, Mapping) else None
         return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
@@ -110,10 +113,10 @@ def parse_gate(kind: Kind, text: str, with_method: bool = False) -> Gate:
         raise ConfigError(form) from None
     if not math.isfinite(bound):
         raise ConfigError(form)
-    if name not in FIGURES and name not in PATHS:
+    if name not in FIGURES and name not in PATHS and not _PLUGIN.fullmatch(name):
         raise ConfigError(
             f"--{kind} {text}: no figure is called {name!r}; there are: {', '.join(FIGURES)}, and paths of"
-            " metrics.json such as segments.25.translation_percent"
+            " metrics.json such as segments.25.translation_percent, or plugins.NAME.KEY of another package's metric"
         )
     return Gate(kind, name, bound, method or None)
 

@@ -1,15 +1,25 @@
 """Errors of a trajectory relative to a reference."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.plugins import PlugPoint, usable
+from lidarslam.core.text.plain_text import one_line
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, align_poses
 from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
 from lidarslam.evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
+
+logger = logging.getLogger(__name__)
+
+METRICS = PlugPoint("metric")
+"""Other packages' metrics: each takes the aligned estimate and the reference, and gives numbers by name."""
+Metric = Callable[[Trajectory, Trajectory], Mapping[str, float]]
 
 # Of the reference's spread: straight drives of two cars differ by 0.18 and more, a drive and its truth by 0.05 at most.
 _UNRELATED_SHARE = 0.15
@@ -50,6 +60,8 @@ class TrajectoryMetrics:
     kitti: KittiDrift | None  # KITTI's drift; None under 100 m
     segments: Mapping[int, Drift | None]  # metres -> drift over short segments; None where the reference is too short
     alignment: AlignmentMethod = "se3"  # how the alignment was found
+    # other packages' metrics by name; None where one cannot be computed
+    plugins: Mapping[str, Mapping[str, float | None] | None] = field(default_factory=dict)
 
     def absolute_errors(self) -> tuple[FloatArray, FloatArray]:
         """Distance (M,) in metres and angle (M,) in radians of every pose, as in the ATE."""
@@ -67,7 +79,14 @@ class TrajectoryMetrics:
             "kitti": self.kitti and self.kitti.to_json(),
             "segments": {str(m): drift and drift.to_json(10) for m, drift in self.segments.items()},
             "map": None,
+            **({"plugins": dict(self.plugins)} if self.plugins else {}),
         }
+
+    def plugin_lines(self) -> Iterator[tuple[str, str]]:
+        """Names of other packages' metrics, and their numbers in words."""
+        for name, values in self.plugins.items():
+            numbers = (f"{key} {'-' if value is None else f'{value:.6g}'}" for key, value in (values or {}).items())
+            yield name, ", ".join(numbers) if values else "could not be computed"
 
 
 def evaluate_trajectory(
@@ -97,7 +116,23 @@ def evaluate_trajectory(
         kitti=kitti_drift(association),
         segments=short_drift(association),
         alignment=alignment,
+        plugins={
+            name: _computed(name, metric, pair[0].transformed(T_reference_estimate), pair[1])
+            for name, metric in usable(METRICS, Callable).items()
+        },
     )
+
+
+def _computed(
+    name: str, metric: Metric, estimate: Trajectory, reference: Trajectory
+) -> Mapping[str, float | None] | None:
+    """The numbers of another package's metric, None where they are not finite; None where it fails."""
+    try:
+        values = {str(key): float(value) for key, value in metric(estimate, reference).items()}
+    except Exception as error:  # another package's code, which costs no other figure
+        logger.warning("the metric %s could not be computed: %s: %s", name, type(error).__name__, one_line(str(error)))
+        return None
+    return {key: value if math.isfinite(value) else None for key, value in values.items()}
 
 
 def metrics_json(

@@ -41,6 +41,9 @@ def _lines(comparison: Comparison, out: Path) -> Iterator[str]:
     for sequence, table in zip(comparison.sequences, tables, strict=True):
         yield from _table_lines(table)
         yield from (f"{result.name}: {result.message}" for result in sequence.methods if result.message)
+        for result in sequence.methods:
+            own = result.metrics.plugin_lines() if result.metrics is not None else ()
+            yield from (f"{result.name}: {name}: {text}" for name, text in own)
         yield from (*sequence.notes, "")
     for table in comparison.tables:
         yield from (*_table_lines(table), "")

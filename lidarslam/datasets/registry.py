@@ -1,12 +1,13 @@
 """The readers and the choice among them; a reader's module is imported on use."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting.elevation import KITTI_DEG
@@ -114,6 +115,8 @@ READERS: dict[str, Reader] = {
     ),
 }
 
+ALL_READERS = PlugPoint("reader", tuple(READERS))
+
 
 def choose_reader(source: Path, name: str | None = None) -> str:
     """The name of the reader for a source: the given one, else the first in the table that recognises it.
@@ -131,9 +134,10 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     if not exists:
         raise InputError(absent(source))
     if name is not None:
-        if name not in READERS:
-            raise InputError(f"no reader is called {name!r}; there are: {', '.join(READERS)}")
-        return name
+        try:
+            return cast(str, ALL_READERS.check(name))
+        except ValueError as error:
+            raise InputError(str(error)) from None
     if (result := result_of_program(source)) is not None:
         raise InputError(result)
     if (found := recognise(source)) is not None:
@@ -162,12 +166,21 @@ def is_recording(source: Path, name: str | None = None) -> bool:
 def takes_sequence(source: Path, name: str | None = None) -> bool:
     """Whether the reader that was named, or recognises the source, takes a sequence."""
     reader = name or recognise(source)
-    return reader is not None and READERS[reader].takes_sequence
+    return reader is not None and _reader(reader).takes_sequence
 
 
 def recognise(source: Path) -> str | None:
-    """The first reader in the table that recognises a path by its names."""
-    return next((name for name, reader in READERS.items() if reader.recognises(source)), None)
+    """The first reader in the table, or else of another package, that recognises a path by its names."""
+    return next((name for name, reader in _readers() if reader.recognises(source)), None)
+
+
+def _readers() -> Iterator[tuple[str, Reader]]:
+    yield from READERS.items()
+    yield from usable(ALL_READERS, Reader).items()
+
+
+def _reader(name: str) -> Reader:
+    return READERS.get(name) or cast(Reader, ALL_READERS.load(name, Reader))
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
@@ -175,15 +188,17 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
 
     Raises:
         InputError: the source cannot be read by the chosen reader.
+        ConfigError: the reader is another package's, and cannot be loaded.
     """
     config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
+    reader = _reader(name)
     why = "because the names fit" if config.name is None else "as it was named"
-    logger.info("reader: %s, %s: %s", name, why, READERS[name].reads)
+    logger.info("reader: %s, %s: %s", name, why, reader.reads)
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
-    recording = cast(Recording, import_module(READERS[name].module).open_recording(source, config))
-    raised_deg = config.raised_deg(READERS[name].elevation_deg)
+    recording = cast(Recording, import_module(reader.module).open_recording(source, config))
+    raised_deg = config.raised_deg(reader.elevation_deg)
     if config.mounting == "upright" and not raised_deg and config.time_scale == 1.0:
         return recording
     return MountedRecording(recording, config.mounting, raised_deg, config.time_scale)

@@ -2,15 +2,17 @@
 
 import time
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from lidarslam.config.settings import Config
+from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
@@ -43,14 +45,15 @@ class Localiser(Protocol):
         """Go on from a state, before the first scan."""
 
 
+@runtime_checkable
 class ScanMapper(Protocol):
     """A scan-to-map registration: with a local map, or in a map that is given."""
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map."""
 
-    def state(self) -> State:
-        """What it carries from scan to scan, the map included."""
+    def state(self) -> State | None:
+        """What it carries from scan to scan, the map included; None where it cannot be saved, nor a run resumed."""
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state, before the first scan."""
@@ -150,6 +153,17 @@ class ScanToMap(Stateful):
         """The mapper, unless the map is given; see `Localiser`."""
         return self._mapper if isinstance(self._mapper, Mapper) else None
 
+    def state(self) -> State:
+        """What it carries from scan to scan.
+
+        Raises:
+            OutputError: the mapper's cannot be saved.
+        """
+        state = super().state()
+        if state["_mapper"] is None:
+            raise OutputError("the mapping cannot save its state")
+        return state
+
     def sample(self, scan: Scan) -> SampledScan | None:
         """The points that are registered and inserted; see `Localiser`."""
         return None if self.mapper is None else self.mapper.sample(scan)
@@ -222,9 +236,14 @@ def make_localiser(
     """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
 
     Of surfels, the error of the sensor's elevations is estimated on the way, and the first scans may be smoothed.
+
+    Raises:
+        ConfigError: the mapping is another package's, and cannot be loaded.
     """
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())
+    if config.mapping.method not in MAPPINGS.built_in:
+        return ScanToMap(MAPPINGS.make(config.mapping.method, ScanMapper, config.mapping), inertial, None, start)
     is_surfels = config.mapping.method == "surfels"
     corrects = is_surfels and config.pose_graph.enabled and config.pose_graph.corrects_local_map
     mapper = Mapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0)

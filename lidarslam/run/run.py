@@ -12,6 +12,7 @@ from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.config import MAPPINGS
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
@@ -181,7 +182,7 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
     """The configured odometry; the caller closes it.
 
     Raises:
-        LidarSlamError: the configuration contradicts itself, or a file is damaged.
+        LidarSlamError: the configuration contradicts itself, a file is damaged, or a plug-in cannot be loaded.
     """
     method = config.odometry.method
     if method == "constant-velocity" and not config.mapping.enabled:
@@ -196,6 +197,8 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
         )
     if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
+    if config.mapping.method not in MAPPINGS.built_in:
+        MAPPINGS.load(config.mapping.method, Callable)  # so that nothing is written if it cannot be
     return make_odometry(config.odometry, None if prior is None else read_tum(prior))
 
 

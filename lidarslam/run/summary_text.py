@@ -101,6 +101,7 @@ def _accuracy(metrics: TrajectoryMetrics) -> Iterator[str]:
     if metrics.kitti is not None:
         drift = metrics.kitti.overall
         yield f"KITTI drift {drift.translation_percent:.2f} %, {100.0 * drift.rotation_deg_per_m:.2f} deg per 100 m"
+    yield from (f"{name}: {text}" for name, text in metrics.plugin_lines())
 
 
 def _lost(summary: RunSummary) -> Iterator[str]:

@@ -2,25 +2,30 @@
 
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 from click.shell_completion import CompletionItem
 
+from lidarslam.core.plugins import PlugPoint
+
 
 class Registered(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
-    """One of the names in a registry, a dictionary in a module that is imported when needed."""
+    """One of the names in a registry, a dictionary, Literal or plug point in a module that is imported when needed."""
 
     name = "name"
 
-    def __init__(self, module: str, registry: str) -> None:
-        self._module, self._registry = module, registry
+    def __init__(self, module: str, registry: str, without: str = "") -> None:
+        self._module, self._registry, self._without = module, registry, without
 
-    def _choice(self) -> "click.Choice[str]":
-        return click.Choice(list(getattr(import_module(self._module), self._registry)))
+    def _choice(self, given: Any = None) -> "click.Choice[str]":
+        registry = getattr(import_module(self._module), self._registry)
+        if isinstance(registry, PlugPoint):
+            registry = registry.built_in if given in registry.built_in else registry.names
+        return click.Choice([name for name in get_args(registry) or registry if name != self._without])
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return self._choice().convert(value, param, ctx)
+        return self._choice(value).convert(value, param, ctx)
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:  # noqa: ARG002
         return f"[{'|'.join(self._choice().choices)}]"

@@ -53,7 +53,6 @@ class _Path(click.Path):
 
 PATH = _Path(path_type=Path)
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
-_READER = Registered("lidarslam.datasets.registry", "READERS")
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -117,7 +116,11 @@ config_options = _together(
     click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One setting; may be repeated."),
 )
 reader_options = _together(
-    click.option("--reader", type=_READER, help="Reader of the source.  [default: recognised]"),
+    click.option(
+        "--reader",
+        type=Registered("lidarslam.datasets.registry", "ALL_READERS"),
+        help="Reader of the source.  [default: recognised]",
+    ),
     click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag with several."),
     click.option("--sequence", metavar="NAME", help="Sequence of a data set's root, such as 04 of KITTI odometry."),
 )
@@ -129,7 +132,7 @@ scan_options = _together(
 odometry_options = _together(
     click.option(
         "--odometry",
-        type=click.Choice(["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu"]),
+        type=Registered("lidarslam.odometry.config", "ODOMETRIES", without="external"),
         help="Motion from scan to scan; imu and learned+imu use the recording's IMU.  [default: learned]",
     ),
     click.option(
@@ -143,7 +146,7 @@ mapping_options = _together(
     # With a value or without: before there was a choice, it switched mapping on.
     click.option(
         "--mapping",
-        type=click.Choice(["surfels", "loam", "off"]),
+        type=Registered("lidarslam.mapping.config", "MAPPINGS"),
         is_flag=False,
         flag_value="surfels",
         help="Register scans to a map of surfels or as LOAM's mapping does.  [default: surfels]",
@@ -153,7 +156,7 @@ mapping_options = _together(
 map_options = _together(
     click.option(
         "--map-format",
-        type=click.Choice(["pcd", "laz", "e57"]),
+        type=Registered("lidarslam.mapping.config", "MapFormat"),
         multiple=True,
         help="Write the map as map.pcd, map.laz or map.e57 too; may be repeated.",
     ),
@@ -256,14 +259,14 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
             raise click.UsageError("--prior replaces the odometry; leave --odometry out")
         odometry = "external"
     if odometry is not None:
-        settings.append(f"odometry.method={odometry}")
+        settings.append(setting("odometry.method", odometry))
     mapping = options.pop("mapping", None)
     if options.pop("no_mapping", False):
         if mapping not in (None, "off"):
             raise click.UsageError(f"--no-mapping is --mapping off, not --mapping {mapping}; leave one of them out")
         mapping = "off"
     if mapping is not None:
-        settings.append(f"mapping.method={mapping}")
+        settings.append(setting("mapping.method", mapping))
     pose_graph, gnss = options.pop("pose_graph", None), options.pop("gnss", None)
     if gnss or options.get("loops") or options.get("no_loops"):
         if pose_graph is False:

@@ -16,7 +16,7 @@ from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.published.unrecognised import absent
-from lidarslam.datasets.registry import READERS, open_recording
+from lidarslam.datasets.registry import is_recording, open_recording
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.storage import directory as files
 from lidarslam.storage.about import require_whole
@@ -122,7 +122,7 @@ def read_reference(path: Path | Trajectory, config: ReaderConfig) -> Poses:
     if (path / files.TRAJECTORY_TUM).is_file():
         trajectory = read_trajectory(path)
         return Poses(f"the run {path}", trajectory.stamps, trajectory.T_world_lidar)
-    if path.is_dir() or any(reader.recognises(path) for reader in READERS.values()):
+    if path.is_dir() or is_recording(path):
         return recording_truth(path, config)
     return read_poses(path)
 

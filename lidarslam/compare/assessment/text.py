@@ -66,6 +66,8 @@ def _trajectory(metrics: TrajectoryMetrics) -> Iterator[str]:
             "BY SPEED", {f"{3.6 * v:.0f} km/h": drift for v, drift in metrics.kitti.by_speed.items()}, 100
         )
     yield from _drifts("SHORT SEGMENTS", {f"{m} m": drift for m, drift in metrics.segments.items()}, 10)
+    yield from ("",) if metrics.plugins else ()
+    yield from (_row(f"{name} ", text) for name, text in metrics.plugin_lines())
 
 
 def _number(value: float | None, unit: str) -> str:

@@ -2,14 +2,13 @@
 
 import re
 from dataclasses import dataclass
-from typing import get_args
 
-from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.registry import ALL_PEERS, PEERS, peer_named
 from lidarslam.compare.peers.scene import BY_SCENE
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.text.names import require_name
 from lidarslam.mapping.config import MappingName
-from lidarslam.odometry.config import OdometryName
+from lidarslam.odometry.config import ODOMETRIES
 from lidarslam.storage.comparison_folder import RESERVED
 
 # Name for the user -> name of the odometry in the configuration.
@@ -30,13 +29,10 @@ _ONLY_WITH_MAP = {
     "imu": "measures turns alone",
     "learned+imu": "the IMU takes part in scan-to-map registration",
 }
-_NAME = re.compile(r"(?P<base>[a-z][a-z-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?")
-_MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
-_GRAMMAR = (
-    f"{', '.join(_BASES)}; each with +map or +loam, with +graph, or with both as in learned+map+graph;"
-    " kiss-icp@0.5 for a voxel size of 0.5 m; and as they are "
-    f"{', '.join(PEERS)}; kiss-icp@{BY_SCENE}, and likewise a peer with voxels, for a range by the size of the scene"
+_NAME = re.compile(
+    r"(?P<base>[A-Za-z][\w.-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?"
 )
+_MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
 
 
 @dataclass(frozen=True)
@@ -64,23 +60,31 @@ class Method:
         return (*self.settings, *by_scene)
 
 
+def _grammar() -> str:
+    return (
+        f"{', '.join([*_BASES, *ODOMETRIES.added])}; each with +map or +loam, with +graph, or with both as in"
+        " learned+map+graph; kiss-icp@0.5 for a voxel size of 0.5 m; and as they are "
+        f"{', '.join(ALL_PEERS.names)}; kiss-icp@{BY_SCENE}, and likewise a peer with voxels, for a range by the size"
+        " of the scene"
+    )
+
+
 def parse_method(name: str) -> Method:
     """The method of that name.
 
     Raises:
-        ConfigError: no method is called so, or a part of it is not in this version.
+        ConfigError: no method is called so, or another package's cannot be loaded.
     """
     peer, by_scene = name.removesuffix(f"@{BY_SCENE}"), name.endswith(f"@{BY_SCENE}")
-    if peer in PEERS:
-        if by_scene and not PEERS[peer].has_voxels:
+    match = _NAME.fullmatch(name)
+    base = "" if match is None else match["base"]
+    if peer in PEERS or (base not in _BASES and peer in ALL_PEERS.added):
+        if not peer_named(peer).has_voxels and by_scene:
             raise ConfigError(f"{name}: {peer} has no voxel size that could follow the size of the scene")
         return Method(name, _PEER, peer, by_scene)
-    match = _NAME.fullmatch(name)
-    if match is None or match["base"] not in _BASES:
-        raise ConfigError(f"no method is called {name!r}; there are: {_GRAMMAR}")
-    odometry = _BASES[match["base"]]
-    if odometry not in get_args(OdometryName):
-        raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
+    odometry = _BASES.get(base) or (base if base in ODOMETRIES.added else None)
+    if match is None or odometry is None:
+        raise ConfigError(f"no method is called {name!r}; there are: {_grammar()}")
     if odometry in _ONLY_WITH_MAP and not match["mapping"]:
         raise ConfigError(
             f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
@@ -89,14 +93,14 @@ def parse_method(name: str) -> Method:
     by_scene = match["voxel"] == BY_SCENE and odometry == "kiss-icp"
     size = None if match["voxel"] is None or by_scene else _voxel_size_m(name, match)
     voxel = () if size is None else (f"odometry.kiss_icp.voxel_size_m={size!r}",)
-    deskew = ("odometry.kiss_icp.deskew=false",) if match["base"] == _NO_DESKEW else ()
+    deskew = ("odometry.kiss_icp.deskew=false",) if base == _NO_DESKEW else ()
     pose_graph = str(match["graph"] is not None).lower()
     switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
     return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches), by_scene=by_scene)
 
 
 def _voxel_size_m(name: str, match: re.Match[str]) -> float:
-    if _BASES[match["base"]] != "kiss-icp":
+    if _BASES.get(match["base"]) != "kiss-icp":
         raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
     try:
         size_m = float(match["voxel"])
@@ -115,7 +119,7 @@ def parse_methods(names: str) -> tuple[Method, ...]:
     """
     chosen = [name.strip() for name in names.split(",") if name.strip()]
     if not chosen:
-        raise ConfigError(f"no method is named; there are: {_GRAMMAR}")
+        raise ConfigError(f"no method is named; there are: {_grammar()}")
     if len(set(chosen)) < len(chosen):
         raise ConfigError(f"a method is named twice in {names!r}; name each once")
     return tuple(parse_method(name) for name in chosen)

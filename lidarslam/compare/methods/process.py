@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.registry import peer_named
 from lidarslam.compare.peers.run import execute_peer
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.run.request import RunRequest
@@ -78,7 +78,7 @@ def _obey_parent() -> None:
 
 def _run(request: RunRequest, peer: str, range_m: float | None, progress: Callable[[int, int], None]) -> RunOutcome:
     if peer:
-        return execute_peer(request, PEERS[peer], progress, range_m)
+        return execute_peer(request, peer_named(peer), progress, range_m)
     return execute(request, lambda number, total, _: progress(number, total))
 
 

@@ -10,7 +10,7 @@ from typing_extensions import TypedDict
 
 from lidarslam.compare.methods.ending import judge
 from lidarslam.compare.methods.process import MethodRun, encode
-from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.registry import peer_named
 from lidarslam.compare.peers.run import describe_peer
 from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
@@ -49,7 +49,7 @@ def obstacle(run: MethodRun, recording: Recording) -> str | None:
     if run.peer is None:
         return None
     try:
-        PEERS[run.peer].require(lambda: recording.imu is not None)
+        peer_named(run.peer).require(lambda: recording.imu is not None)
     except LidarSlamError as error:
         return str(error)
     return None
@@ -105,7 +105,7 @@ def finished_before(run: MethodRun) -> MethodResult | None:
         tree = read_yaml(folder / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         is_same = Config.model_validate(tree) == run.request.config
-        peer = None if run.peer is None else PEERS[run.peer]
+        peer = None if run.peer is None else peer_named(run.peer)
         described = describe_run(run.request) if peer is None else describe_peer(run.request, peer, run.range_m)
         is_same = is_same and all(was_run.get(key) == value for key, value in described.items())
     except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError):

@@ -4,9 +4,11 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import cast
 
 from lidarslam.compare.peers.interface import MAX_RANGE_M, Estimator, PeerError, Sweep
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.plugins import PlugPoint
 
 EXTRA = "pip install 'lidarslam[peers]'"
 
@@ -40,7 +42,8 @@ class Peer:
             PeerError: its library is not installed, or it needs an IMU and there is none.
         """
         if not self.is_installed:
-            raise PeerError(f"runs with {self.package}, which is not installed: {EXTRA}")
+            extra = EXTRA if self.name in PEERS else f"pip install {self.package}"
+            raise PeerError(f"runs with {self.package}, which is not installed: {extra}")
         if self.needs_imu and not has_imu():
             raise PeerError("needs an IMU, and the recording has none")
 
@@ -84,3 +87,13 @@ _ALL = (
     Peer("rko-lio", "rko_lio", "rko_lio", _rko_lio, needs_imu=True),
 )
 PEERS = {peer.name: peer for peer in _ALL}
+ALL_PEERS = PlugPoint("peer", tuple(PEERS))
+
+
+def peer_named(name: str) -> Peer:
+    """The peer of a name in `ALL_PEERS`.
+
+    Raises:
+        ConfigError: it is another package's, and cannot be loaded.
+    """
+    return PEERS.get(name) or cast(Peer, ALL_PEERS.load(name, Peer))

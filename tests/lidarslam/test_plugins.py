@@ -1,0 +1,203 @@
+"""Entry points of another package: the example of CONTRIBUTING.md, through the command line."""
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.commands.run import run
+from lidarslam.commands.shared.options import take_config
+from lidarslam.compare.methods.names import parse_methods
+from lidarslam.core import plugins
+from lidarslam.core.errors import ConfigError
+from lidarslam.core.scan import Scan
+from lidarslam.core.text.trajectory_io import read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.registry import choose_reader
+
+GUIDE = Path(__file__).parents[2] / "CONTRIBUTING.md"
+
+
+def _install(folder: Path, package: str, groups: dict[str, dict[str, str]]) -> None:
+    lines = [
+        f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in at.items()) for group, at in groups.items()
+    ]
+    about = folder / f"{package.replace('-', '_')}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("\n".join(lines))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, installed."""
+    folder = tmp_path_factory.mktemp("site")
+    code, table = (
+        re.search(rf"```{kind}\n(.*?)```", GUIDE.read_text().partition("## Plug-ins")[2], re.DOTALL)
+        for kind in ("python", "toml")
+    )
+    assert code is not None
+    assert table is not None
+    (folder / "lidarslam_example.py").write_text(code[1])
+    _install(folder, "lidarslam-example", tomllib.loads(table[1])["project"]["entry-points"])
+    return folder
+
+
+@contextmanager
+def _on_path(folder: Path) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        _forget()
+        yield folder
+    _forget()
+
+
+def _forget() -> None:
+    plugins.search.cache_clear()
+    plugins.usable.cache_clear()
+
+
+@pytest.fixture
+def example(site: Path) -> Iterator[Path]:
+    with _on_path(site):
+        yield site
+
+
+@pytest.fixture
+def broken(example: Path, tmp_path: Path) -> Iterator[Path]:
+    """A second package, which takes a built-in name, and cannot be imported."""
+    groups = {f"lidarslam.{group}": {"broken": f"no_such_module:{group}"} for group in get_args(plugins.Group)}
+    groups["lidarslam.odometry"] |= {"kiss-icp": "lidarslam_example:Still"}
+    _install(tmp_path / "other", "lidarslam-broken", groups)
+    with _on_path(tmp_path / "other") as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans[:5]):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def test_a_run_takes_odometry_mapping_and_metric(example: Path, recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    chosen = ("--odometry", "still", "--mapping", "chain", "--set", "checkpoints.every_scans=1", "--no-report")
+    result = lidarslam("run", recording, "--out", out, *chosen)
+    assert result.exit_code == 3, result.output  # its map shows that the sensor did move
+    np.testing.assert_array_equal(read_tum(out / "trajectory.tum").T_world_lidar, np.tile(np.eye(4), (5, 1, 1)))
+    assert "height: mean_m" in result.output
+    assert json.loads((out / "metrics.json").read_text())["plugins"]["height"]["mean_m"] >= 0.0
+    warnings = json.loads((out / "summary.json").read_text())["warnings"]
+    assert any("the mapping cannot save its state" in warning for warning in warnings)
+
+
+def test_a_mapping_corrects_an_added_odometry(example: Path, recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert lidarslam("run", recording, "--out", out, "--odometry", "still", "--no-report").exit_code == 0
+    truth = read_tum(recording / "ground_truth.tum").positions[:5]
+    moved = read_tum(out / "trajectory.tum").positions
+    np.testing.assert_allclose(
+        np.linalg.norm(moved - moved[0], axis=1), np.linalg.norm(truth - truth[0], axis=1), atol=0.02
+    )
+
+
+def test_a_source_is_recognised(example: Path, room_scans: list[Scan], tmp_path: Path) -> None:
+    source = tmp_path / "sweeps"
+    source.mkdir()
+    for index, scan in enumerate(room_scans[:3]):
+        scan.points.tofile(source / f"{index}.sweep")
+    described = json.loads(lidarslam("info", source, "--json").output)
+    assert (described["reader"], described["scans"]) == ("sweeps", 3)
+    assert choose_reader(source, "sweeps") == "sweeps"
+    result = lidarslam(
+        "run", source, "--reader", "sweeps", "--out", tmp_path / "run", "--odometry", "still", "--no-report"
+    )
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 3, result.output
+
+
+def test_a_peer_is_compared(example: Path, recording: Path, tmp_path: Path) -> None:
+    result = lidarslam("compare", recording, "--out", tmp_path / "compared", "--methods", "origin,still")
+    methods = json.loads((tmp_path / "compared" / "comparison.json").read_text())["methods"]
+    assert methods["origin"]["status"] == "lost", result.output  # for the same reason
+    assert methods["still"]["metrics"]["plugins"]["height"] == methods["origin"]["metrics"]["plugins"]["height"]
+    assert "origin: height: mean_m" in result.output
+    assert [method.peer for method in parse_methods("origin,still+map+graph")] == ["origin", None]
+
+
+def test_evaluate_has_the_metric_and_gates_of_it(example: Path, recording: Path, tmp_path: Path) -> None:
+    truth = read_tum(recording / "ground_truth.tum")
+    write_tum(tmp_path / "mine.tum", truth)
+    files = (tmp_path / "mine.tum", "--reference", recording / "ground_truth.tum", "--out", tmp_path / "metrics.json")
+    result = lidarslam("evaluate", *files, "--max", "plugins.height.mean_m=1e-6")
+    assert result.exit_code == 0, result.output
+    assert re.search(r"^height +mean_m ", result.output, re.MULTILINE)
+    assert json.loads((tmp_path / "metrics.json").read_text())["plugins"]["height"]["mean_m"] < 1e-6
+    assert lidarslam("evaluate", *files, "--min", "plugins.height.mean_m=1").exit_code == 4
+
+
+def test_without_the_package_nothing_is_added(recording: Path, tmp_path: Path) -> None:
+    assert lidarslam("run", recording, "--odometry", "still").exit_code == 2
+    with pytest.raises(ConfigError, match="there are: learned"):
+        parse_methods("still")
+    result = lidarslam(
+        "evaluate", recording / "ground_truth.tum", "--reference", recording, "--out", tmp_path / "m.json"
+    )
+    assert result.exit_code == 0
+    assert "plugins" not in json.loads((tmp_path / "m.json").read_text())
+
+
+def test_what_cannot_be_imported_is_one_line_with_the_package(
+    broken: Path, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for option in ("odometry", "mapping", "reader"):
+        result = lidarslam("run", recording, "--out", tmp_path / "run", f"--{option}", "broken")
+        assert result.exit_code == 1
+        assert result.stderr.count("\n") == 1
+        assert (
+            f"the {option} 'broken' of the package lidarslam-broken cannot be loaded (ModuleNotFoundError"
+            in result.stderr
+        )
+    with pytest.raises(ConfigError, match="the peer 'broken' of the package lidarslam-broken cannot be loaded"):
+        parse_methods("broken")
+    files = ("--reference", recording, "--out", tmp_path / "metrics.json")
+    assert lidarslam("evaluate", recording / "ground_truth.tum", *files).exit_code == 0
+    assert list(json.loads((tmp_path / "metrics.json").read_text())["plugins"]) == ["height"]
+    assert "the metric 'broken' of the package lidarslam-broken cannot be loaded" in caplog.text
+
+
+def test_names_are_listed_and_a_built_in_one_is_not_taken(
+    broken: Path, recording: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert "|learned+imu|broken|still]" in "".join(lidarslam("run", "--help").output.split())
+    assert "the odometry 'kiss-icp' of lidarslam-broken is ignored: the name is taken" in caplog.text
+    result = lidarslam("run", recording, "--set", "odometry.method=loam")
+    assert "there are: learned, kiss-icp, constant-velocity, imu, learned+imu, external, broken, still" in result.stderr
+
+
+def test_names_that_are_built_in_need_no_search(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def search(point: plugins.PlugPoint) -> None:
+        raise AssertionError(point)
+
+    monkeypatch.setattr(plugins, "search", search)
+    context = run.make_context("run", [str(recording), "--odometry", "kiss-icp", "--mapping", "loam", "--out", "run"])
+    assert take_config(context.params, recording).odometry.method == "kiss-icp"
+    assert parse_methods("kiss-icp@0.5,learned+map,small-gicp@scene")
