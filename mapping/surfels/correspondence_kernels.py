@@ -20,9 +20,6 @@ _LEAST_HEIGHT_M = 0.05
 _FEWEST_POINTS = 6
 # The plane of a surfel is as uncertain as if so many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
-# Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
-# direction.
-_CERTAIN_TILT = 0.02
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5
 
@@ -30,14 +27,15 @@ _MOST_ACROSS = 0.5
 @compiled
 def match_planes(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray, sensor: FloatArray,
-    spread_m: FloatArray, found: Surfaces,
+    spread_m: FloatArray, certain_tilt: float, found: Surfaces,
 ) -> int:  # fmt: skip
     """Write the surface of every unmatched point (N, 3) whose cell has a plane, unless it has a better one already.
 
     A better one is known better and its points are spread less: across steps, a coarse plane's are spread more.
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
-    without a plane, or with one of an uncertain normal, are moved to the beginning of `unmatched`. `spread_m` (N,) has
-    the standard deviations of each plane's points across it, and is written.
+    without a plane, or with one whose normal has a standard deviation of `certain_tilt` and more, are moved to the
+    beginning of `unmatched`. `spread_m` (N,) has the standard deviations of each plane's points across it, and is
+    written.
 
     Returns:
         Number of the points that were moved.
@@ -57,7 +55,7 @@ def match_planes(
                 if found.counts[n] == 0 or (spread < spread_m[n] and _thickness_m(p, 0) < found.thickness_m[n, 0]):
                     found.counts[n], spread_m[n] = 0, spread
                     _write(found, n, p, 0, p[3], p[4], p[5], tilt)
-                if tilt < _CERTAIN_TILT:
+                if tilt < certain_tilt:
                     continue
         unmatched[left] = n
         left += 1

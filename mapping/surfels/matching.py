@@ -12,6 +12,9 @@ from lidarslam.mapping.surfels.voxel_hash import point_keys
 
 # Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
 _COMPACT = 0.5
+# Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
+# direction.
+_CERTAIN_TILT = 0.02
 # No cell has this key.
 _NOWHERE = -1
 
@@ -25,10 +28,11 @@ class SurfelMatcher(Matcher):
     Args:
         grids: the finest first; each cell of one lies within a cell of the next.
         count: N.
+        is_young: whether few sweeps made the grids, so that coarse planes are of a few strokes and no better.
     """
 
-    def __init__(self, grids: Sequence[SurfelGrid], count: int) -> None:
-        self._grids = grids
+    def __init__(self, grids: Sequence[SurfelGrid], count: int, is_young: bool = False) -> None:
+        self._grids, self._certain_tilt = grids, np.inf if is_young else _CERTAIN_TILT
         self._cells = np.full(count, _NOWHERE, dtype=np.int64)
         self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)
@@ -49,8 +53,7 @@ class SurfelMatcher(Matcher):
             if finest is None:
                 finest = np.empty(len(points), dtype=np.int32), surfels
                 finest[0][unmatched] = rows
-            unmatched = unmatched[
-                : match_planes(points, unmatched, rows, surfels, sensor, self._spread_m, self.surfaces)
-            ]
+            given = self._spread_m, self._certain_tilt, self.surfaces
+            unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, *given)]
         assert finest is not None
         match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)

@@ -37,7 +37,8 @@ def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: floa
     grid = SurfelGrid(_CELLS * cell_m)
     grid.insert(points, elevations, views)
     rows, surfaces = grid.find(points), Surfaces.none(len(points))
-    match_planes(points, np.arange(len(points)), rows, grid.refreshed(rows), origin, np.empty(len(points)), surfaces)
+    spread_m = np.empty(len(points))
+    match_planes(points, np.arange(len(points)), rows, grid.refreshed(rows), origin, spread_m, np.inf, surfaces)
     planar = np.flatnonzero(surfaces.counts)
     if not len(planar):
         return planar

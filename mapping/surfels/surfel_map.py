@@ -109,7 +109,7 @@ class SurfelMap(LocalMap):
 
     def matcher(self, sweep: Sweep, level: int = 0) -> SurfelMatcher:
         """See `LocalMap`."""
-        return SurfelMatcher(self._grids[level:], len(sweep))
+        return SurfelMatcher(self._grids[level:], len(sweep), self.is_young)
 
     def level_normals(self) -> FloatArray:
         """See `LocalMap`."""
