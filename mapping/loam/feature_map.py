@@ -148,7 +148,7 @@ class FeatureMap(LocalMap):
                 grid.drop_beyond(sensor, self._radius_m)
         self.scans += 1
 
-    def matcher(self, sweep: Sweep, level: int = 0) -> FeatureMatcher:
+    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
         """See `LocalMap`."""
         return FeatureMatcher(self._edges[level:], self._planes[level:], sweep)
 

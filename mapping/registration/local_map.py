@@ -39,12 +39,13 @@ class LocalMap(Stateful, ABC):
         """Insert the points of a scan, at (N, 3) of the world, seen from a position (3,)."""
 
     @abstractmethod
-    def matcher(self, sweep: Sweep, level: int = 0) -> Matcher:
+    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> Matcher:
         """Finds correspondences of the points of a sweep; until the map changes.
 
         Args:
             sweep: which.
             level: finest resolution that is used, for points that may be off by more than a cell.
+            is_inertial: whether an IMU predicts the pose.
         """
 
     @abstractmethod

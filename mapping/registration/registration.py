@@ -102,7 +102,8 @@ def register(
         prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
         inflation = uniform = np.ones(len(sweep))
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
-            cell_m, matcher = local_map.cell_m * LEVELS[level], local_map.matcher(sweep, level)
+            cell_m = local_map.cell_m * LEVELS[level]
+            matcher = local_map.matcher(sweep, level, prediction.is_inertial)
             for _ in range(coarse if level else most - iterations):
                 points = sweep.compensated(velocity)
                 matcher.match(transform_points(T_world_lidar, points), T_world_lidar)

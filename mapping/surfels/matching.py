@@ -28,11 +28,12 @@ class SurfelMatcher(Matcher):
     Args:
         grids: the finest first; each cell of one lies within a cell of the next.
         count: N.
-        is_young: whether few sweeps made the grids, so that coarse planes are of a few strokes and no better.
+        keeps_finest: whether planes of uncertain normals are kept. In a young map coarser ones are of a few strokes;
+            without an IMU, whose prediction they would contradict, they still hold a fast start.
     """
 
-    def __init__(self, grids: Sequence[SurfelGrid], count: int, is_young: bool = False) -> None:
-        self._grids, self._certain_tilt = grids, np.inf if is_young else _CERTAIN_TILT
+    def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
+        self._grids, self._certain_tilt = grids, np.inf if keeps_finest else _CERTAIN_TILT
         self._cells = np.full(count, _NOWHERE, dtype=np.int64)
         self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)

@@ -107,9 +107,9 @@ class SurfelMap(LocalMap):
         for grid in self._grids:
             grid.insert(points, elevations, views, weight)
 
-    def matcher(self, sweep: Sweep, level: int = 0) -> SurfelMatcher:
+    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
         """See `LocalMap`."""
-        return SurfelMatcher(self._grids[level:], len(sweep), self.is_young)
+        return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
 
     def level_normals(self) -> FloatArray:
         """See `LocalMap`."""

@@ -341,7 +341,7 @@ def test_configurations_of_every_form(tmp_path: Path) -> None:
     ("settings", "told"),
     [
         ({"odometry.methd": "kiss-icp"}, "there is no odometry.methd; did you mean method"),
-        ({"odometry": {"method": "icp"}}, "odometry.method='icp'"),
+        ({"odometry": {"method": "icp"}}, "no odometry is called 'icp'"),
         ({"odometry.method": "external"}, "odometry.method=external"),
         ({"odometry.method": "constant-velocity", "mapping": {"method": "off"}}, "needs scan-to-map registration"),
         ({"odometry": 3, "odometry.method": "kiss-icp"}, "odometry is a value, not a section"),

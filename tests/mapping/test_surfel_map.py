@@ -7,6 +7,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.state.stateful import Saved
+from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS
 from lidarslam.mapping.registration.surfaces import Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
@@ -251,18 +252,19 @@ def test_in_grass_a_wider_plane_is_taken(rng: np.random.Generator, grass_on_a_sl
     """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off."""
     points, normal = grass_on_a_slope(rng, 0.2)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
-    local_map = SurfelMap(CELL, 100.0)
-    for sweep in np.array_split(points, 6):
-        local_map.insert(sweep, elevations_of(sweep), ORIGIN)
-    matches = local_map.match(asked, HERE)
+    matches = map_of(points).match(asked, HERE)
     errors_deg = np.degrees(np.arccos(np.abs(matches.normals @ normal)))
     assert len(matches) == len(asked)
     assert np.median(errors_deg) < 0.6
     assert np.median(matches.tilt) < 0.01
 
 
-def test_in_a_young_map_the_finest_plane_is_taken(rng: np.random.Generator, grass_on_a_slope: Grass) -> None:
+def test_with_an_imu_the_finest_plane_of_a_young_map_is_taken(
+    rng: np.random.Generator, grass_on_a_slope: Grass
+) -> None:
     """Few sweeps of a sensor without rings are a few strokes, of which coarse cells make planes of any direction."""
     points, _ = grass_on_a_slope(rng, 0.2)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
-    assert np.median(map_of(points).match(asked, HERE).tilt) > 0.02
+    matcher = map_of(points).matcher(Sweep(asked), is_inertial=True)
+    matcher.match(asked, HERE)
+    assert np.median(matcher.correspondences().tilt) > 0.02
