@@ -93,3 +93,15 @@ def whole_run(tmp_path_factory: pytest.TempPathFactory, small_recording: Path) -
 def finished_run(tmp_path: Path, whole_run: Path) -> Path:
     """A copy of a finished run."""
     return Path(shutil.copytree(whole_run, tmp_path / "run"))
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """Five scans with ground truth, not to be written to."""
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans[:5]):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder

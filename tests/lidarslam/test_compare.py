@@ -48,18 +48,6 @@ os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.methods.proce
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    """Five scans with ground truth."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
-    for index, scan in enumerate(room_scans[:5]):
-        np.save(folder / f"{index:06d}.npy", scan.points)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def faults(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     file = tmp_path_factory.mktemp("faults") / "faults.py"
     file.write_text(FAULTS)

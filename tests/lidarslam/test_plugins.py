@@ -21,7 +21,6 @@ from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import choose_reader
 
 GUIDE = Path(__file__).parents[2] / "CONTRIBUTING.md"
@@ -81,17 +80,6 @@ def broken(example: Path, tmp_path: Path) -> Iterator[Path]:
     _install(tmp_path / "other", "lidarslam-broken", groups)
     with _on_path(tmp_path / "other") as folder:
         yield folder
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
-    for index, scan in enumerate(room_scans[:5]):
-        np.save(folder / f"{index:06d}.npy", scan.points)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
-    return folder
 
 
 def lidarslam(*arguments: object) -> Result:
