@@ -20,7 +20,13 @@ class TileWriter:
         self.failure: OutputError | None = None  # of the first tile that could not be written, after which none is
 
     def write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
-        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`."""
+        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
+
+        Raises:
+            OutputError: a file is in the way of the folder.
+        """
+        if self.failure is None and not self._entries:
+            self._begin()
         if self.failure is None:
             try:
                 self._write(tile, cloud, brightest)
@@ -29,8 +35,6 @@ class TileWriter:
                 self._remove()
 
     def _write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
-        if not self._entries:
-            self._begin()
         name = f"{tile[0]}_{tile[1]}.laz"
         with self._directory.replacing(f"{MAP_TILES}/{name}") as path:
             write_cloud(path, cloud, brightest)
@@ -66,7 +70,7 @@ class TileWriter:
         except (FileExistsError, NotADirectoryError) as error:
             raise OutputError(f"{folder}: a file is in the way; name another directory") from error
         except OSError as error:
-            raise cannot_write(folder, error) from error
+            self.failure = cannot_write(folder, error)
 
     def _remove(self) -> None:
         """Leave the room of the tiles to the other results."""
