@@ -1,8 +1,8 @@
 """The demonstration: an indoor recording with turns on the spot, made here, and three methods on it.
 
-A tracked robot drives through a simulated office and turns on the spot at 120 deg/s. KISS-ICP, which
-predicts constant velocity, runs with its defaults, which suit streets, and with a range and voxels by the size of the
-scene. All are compared with the true trajectory and the true map.
+A tracked robot drives through a simulated office and turns on the spot at 120 deg/s. KISS-ICP, which predicts
+constant velocity, runs with its defaults, which suit streets, and with a range and voxels by the size of the scene. All
+are compared with the true trajectory and the true map.
 """
 
 from collections.abc import Callable

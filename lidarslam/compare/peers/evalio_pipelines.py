@@ -1,8 +1,8 @@
 """Peers that evalio runs; beside the pipeline that it runs of ours, the only file that imports evalio.
 
 Every pipeline keeps evalio's defaults but for what `PIPELINES` says, and for its voxels where these follow the size of
-the scene. evalio wants a sweep in row-major order with a
-cell for each shot; pipelines that look for features along the rings are given that, with the azimuth as the column.
+the scene. evalio wants a sweep in row-major order with a cell for each shot; pipelines that look for features along the
+rings are given that, with the azimuth as the column.
 """
 
 import os

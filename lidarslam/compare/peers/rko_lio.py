@@ -22,7 +22,7 @@ class RkoLioEstimator:
         from rko_lio.lio import LIO
 
         self._T_lidar_imu = np.eye(4) if imu.T_lidar_imu is None else imu.T_lidar_imu
-        self._lio: Any = LIO(LIOConfig(voxel_size=range_m / 100.0, max_range=range_m))
+        self._lio: Any = LIO(LIOConfig(voxel_size=range_m / MAX_RANGE_M, max_range=range_m))
         self._poses: list[tuple[float, FloatArray]] = []
 
     def add_imu(self, samples: ImuSamples, number: int) -> None:
