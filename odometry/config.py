@@ -27,6 +27,9 @@ class LearnedConfig(BaseModel):
     device: str = Field("cpu", min_length=1, description="torch's name of the device, such as cpu or cuda")
     threads: int = Field(1, ge=1, le=256, description="of the network; mapping works beside it")
     alignment: bool = Field(True, description="false: the network's motion as it is, for ablations")
+    when: Literal["needed", "always"] = Field(
+        "always", description="needed: only at scans whose motion the mapping does not predict well enough by itself"
+    )
 
 
 class KissConfig(BaseModel):

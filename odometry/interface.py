@@ -22,6 +22,7 @@ class Motion:
     # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the method has none
     covariance: Annotated[FloatArray, Shape(6, 6)] | None = None
     degenerate: tuple[str, ...] = ()  # names of the degenerate directions, where the method finds them
+    is_asked: bool = True  # False: left to the mapping's prediction, which is certain enough
 
     def in_axes(self, R_new_old: FloatArray) -> "Motion":
         """The motion in other axes (3, 3) of the LiDAR; degenerate directions take the names of the nearest axes."""
@@ -51,3 +52,11 @@ class Odometry(Protocol):
 
     def close(self) -> None:
         """Let go of whatever the method holds."""
+
+
+@runtime_checkable
+class SkippingOdometry(Odometry, Protocol):
+    """An odometry that need not be asked at every scan."""
+
+    def skip(self, scan: Scan) -> None:
+        """Take a scan with points whose motion is not asked for; that of the next is since this one."""

@@ -106,6 +106,7 @@ class Slam:
             with self._failing(), self._blas.limit(limits=1, user_api="blas"):
                 estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
                 localised = self._stages.localise(estimated)
+                self._stages.follow(estimated, lambda: localised)
                 total_ms = 1e3 * (time.perf_counter() - started)
                 self._submit(estimated, localised, total_ms)
             return RegisteredScan.of(scan.stamp, localised, self._graph is None)

@@ -98,6 +98,7 @@ class ScanResult(Localised):
     # points_read, points_dropped: valid points of the raw scan, and invalid ones that were left out
     points_read: int
     points_dropped: int
+    is_odometry_asked: bool = True  # whether the odometry was asked for the motion
 
 
 def graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:

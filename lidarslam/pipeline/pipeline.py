@@ -90,6 +90,7 @@ class Pipeline(Stateful):
 
             def submit(estimated: Estimated, following: Estimated | None) -> None:
                 localised = registration.submit(self._stages.localise, estimated, following)
+                self._stages.follow(estimated, localised.result)
                 jobs.append(mapping.submit(self._build, estimated, localised))
 
             for number, estimated in enumerate(self._estimate(scans), start=1):

@@ -5,6 +5,7 @@ called on a thread of its own; the pose graph is built on another.
 """
 
 import time
+from collections.abc import Callable
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
@@ -20,6 +21,7 @@ from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, graph
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.map_correction import MapCorrection
+from lidarslam.pipeline.odometry_gate import OdometryGate
 
 # Calls that may wait for the graph, which takes as long for a loop closure as for all scans up to the next keyframe.
 _GRAPH_CALLS_BEHIND = 64
@@ -60,16 +62,23 @@ class Stages(Stateful):
     def estimate(self, scan: Scan, read_ms: float = 0.0) -> Estimated:
         """The odometry of the next scan, which took so long to read; thinned for registration, which is busier."""
         started = time.perf_counter()
-        motion = self._odometry.estimate(scan)
-        moved = time.perf_counter()
         sampled = self._localiser.sample(scan)
-        stage_ms = {"read": read_ms, "odometry": _ms(started, moved)}
-        if sampled is not None:
-            stage_ms["refine"] = _ms(moved, time.perf_counter())
+        thinned = time.perf_counter()
+        stage_ms = {"read": read_ms, "refine": _ms(started, thinned)}
+        if isinstance(self._odometry, OdometryGate):
+            self._odometry.wait()
+        started = time.perf_counter()
+        motion = self._odometry.estimate(scan)
+        stage_ms["odometry"] = _ms(started, time.perf_counter())
         measured, previous = motion.failure is None, self._measured_stamp
         interval_s = scan.stamp - previous if measured and previous is not None else None
-        self._measured_stamp = scan.stamp if measured else None
+        self._measured_stamp = scan.stamp if measured or not motion.is_asked else None
         return Estimated(scan, motion, interval_s, stage_ms, sampled)
+
+    def follow(self, estimated: Estimated, localised: Callable[[], Localised]) -> None:
+        """Let the odometry know the pose of the next scan, which is computed on another thread."""
+        if isinstance(self._odometry, OdometryGate):
+            self._odometry.follow(estimated.scan.stamp, localised)
 
     def localise(self, estimated: Estimated, following: Estimated | None = None) -> Localised:
         """The pose of a scan; the odometry of the following one gives the motion after the stamp, where it is known."""
@@ -98,6 +107,7 @@ class Stages(Stateful):
             points=points,
             points_read=len(scan),
             points_dropped=scan.dropped,
+            is_odometry_asked=estimated.motion.is_asked,
         )
 
     def add_pending(self, next_is_lost: bool = False) -> None:

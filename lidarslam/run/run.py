@@ -13,10 +13,11 @@ from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MAPPINGS
-from lidarslam.odometry.interface import Odometry
+from lidarslam.odometry.interface import Odometry, SkippingOdometry
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.pipeline.odometry_gate import OdometryGate
 from lidarslam.run.elevation import with_elevations
 from lidarslam.run.gnss import gnss_track, write_in_utm
 from lidarslam.run.inertial import imu_samples
@@ -199,7 +200,10 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
     if config.mapping.method not in MAPPINGS.built_in:
         MAPPINGS.load(config.mapping.method, Callable)  # so that nothing is written if it cannot be
-    return make_odometry(config.odometry, None if prior is None else read_tum(prior))
+    odometry = make_odometry(config.odometry, None if prior is None else read_tum(prior))
+    if config.odometry.learned.when == "always" or not config.mapping.enabled:
+        return odometry
+    return OdometryGate(odometry) if isinstance(odometry, SkippingOdometry) else odometry
 
 
 def require_overlap(odometry: Odometry, recording: Recording) -> Odometry:

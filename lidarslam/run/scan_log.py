@@ -28,12 +28,13 @@ COLUMNS = (
     "inlier_ratio",
     "degenerate_directions",
     *SIGMAS,
+    "odometry_asked",
     *(f"ms_{stage}" for stage in STAGES),
     "message",
 )
 
 _STATUSES = tuple(Status)
-# The numbers of a scan, 433 bytes; NaN where there is none.
+# The numbers of a scan, 434 bytes; NaN where there is none.
 _ROW = np.dtype(
     [
         ("stamp", "f8"),
@@ -45,6 +46,7 @@ _ROW = np.dtype(
         ("inlier_ratio", "f8"),
         ("sigmas", "f8", len(SIGMAS)),
         ("turn_rate", "f8", 3),
+        ("odometry_asked", "?"),
         ("total_ms", "f8"),
         ("stage_ms", "f8", len(STAGES)),
         ("T_world_lidar", "f8", (4, 4)),
@@ -83,6 +85,7 @@ class ScanLog(Stateful):
             np.nan if result.inlier_ratio is None else result.inlier_ratio,
             np.full(len(SIGMAS), np.nan) if result.covariance is None else np.sqrt(np.diag(result.covariance)),
             np.full(3, np.nan) if result.turn_rate is None else result.turn_rate,
+            result.is_odometry_asked,
             total_ms,
             [result.stage_ms.get(stage, 0.0) for stage in STAGES],
             result.T_world_lidar,
@@ -144,6 +147,11 @@ class ScanLog(Stateful):
         return self._table()["turn_rate"]
 
     @property
+    def odometry_asked(self) -> int:
+        """Number of scans at which the odometry was asked for the motion."""
+        return int(self._table()["odometry_asked"].sum())
+
+    @property
     def total_ms(self) -> FloatArray:
         """(N,) wall time from one scan done to the next."""
         return self._table()["total_ms"]
@@ -174,8 +182,9 @@ class ScanLog(Stateful):
             fit = ("" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in ("residual_m", "inlier_ratio"))
             sigmas = ("" if np.isnan(sigma) else f"{sigma:.3g}" for sigma in row["sigmas"])
             ms = (f"{ms:.2f}" for ms in row["stage_ms"])
-            status = _STATUSES[row["status"]].value
-            writer.writerow([index, f"{row['stamp']:.9f}", status, *counts, *fit, degenerate, *sigmas, *ms, message])
+            status, asked = _STATUSES[row["status"]].value, int(row["odometry_asked"])
+            numbers = (*counts, *fit, degenerate, *sigmas, asked, *ms)
+            writer.writerow([index, f"{row['stamp']:.9f}", status, *numbers, message])
         return out.getvalue()
 
     def state(self) -> State:

@@ -34,6 +34,8 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     yield from format_times(summary)
+    if summary.odometry_asked < summary.scans:
+        yield f"odometry asked at {summary.odometry_asked:,} of {count(summary.scans, 'scan')}"
     yield format_map(summary.map)
     if summary.graph is not None:
         yield _loops(summary.graph)

@@ -65,6 +65,7 @@ class LearnedOdometry(Stateful):
     _imager: Imager
     _interpolator: StampInterpolator
     _last_covariance: Annotated[FloatArray, Shape(6, 6)] | None  # of the motion before, for a change from the left
+    _skipped: Scan | None  # the scan before, if its motion was not asked for
 
     def __init__(self, search: Search, images: ImageConfig, is_aligned: bool = True) -> None:
         self._search = search
@@ -74,6 +75,7 @@ class LearnedOdometry(Stateful):
         self._described: Described | None = None  # the last sweep
         self._interpolator = StampInterpolator()
         self._last_covariance = None
+        self._skipped = None
 
     def _after_restore(self) -> None:
         if self._last is not None:
@@ -85,10 +87,25 @@ class LearnedOdometry(Stateful):
         """The motion since the last scan that had points."""
         if not len(scan):
             return Motion(np.eye(4), 0, "the scan is empty")
+        if self._skipped is not None:
+            self._take_skipped(self._skipped)
         images = self._imager.images(scan)
         motion = self._estimate(scan, images)
         has_own_axes = np.array_equal(images.R_image_lidar, np.eye(3))
         return motion if has_own_axes else motion.in_axes(images.R_image_lidar.T)
+
+    def skip(self, scan: Scan) -> None:
+        """Take a scan with points whose motion is not asked for; see `SkippingOdometry`."""
+        self._skipped = scan
+
+    def _take_skipped(self, scan: Scan) -> None:
+        """Begin anew with a scan that was skipped."""
+        self._forget()
+        images = self._imager.images(scan)
+        shown = images.network
+        self._described = self._search.describe(shown.points, shown.normals)
+        middle = scan.stamp + scan.middle_offset_s
+        self._last, self._skipped = _Sweep(images, self._described.heading, scan.stamp, middle), None
 
     def _estimate(self, scan: Scan, images: ScanImages) -> Motion:
         """The motion in the images' axes."""

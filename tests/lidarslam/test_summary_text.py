@@ -29,6 +29,7 @@ def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),
         degraded_scans=0,
         unconstrained_m=0.0,
+        odometry_asked=1,
         graph=graph,
         map=WrittenMap(1, 0.1, moved),
         warnings=(),

@@ -366,3 +366,17 @@ def test_a_motion_in_other_axes():
     np.testing.assert_allclose(motion.covariance, np.diag([1.0, 3.0, 2.0, 4.0, 6.0, 5.0]), atol=1e-12)
     assert motion.degenerate == ("pitch", "x", "z")
     assert motion.points_used == 7
+
+
+def test_the_motion_after_skipped_scans_is_since_the_last_of_them(box_room):
+    scans = box_room.scans(6, TWIST)
+    odometry = LearnedOdometry(Told(moved(wrong=WRONG)), IMAGES)
+    for scan in scans[:2]:
+        odometry.estimate(scan)
+    for scan in scans[2:5]:
+        odometry.skip(scan)
+    motion = odometry.estimate(scans[5])
+    begun_there = estimates(scans[4:], Told(moved(wrong=WRONG)))[1]
+    assert_close(motion, moved())
+    np.testing.assert_array_equal(motion.T_prev_curr, begun_there.T_prev_curr)
+    np.testing.assert_array_equal(motion.covariance, begun_there.covariance)

@@ -90,6 +90,7 @@ class RunSummary:
     degraded_scans: int
     # way along axes of the sensor that the scans did not, or hardly, constrain: it is a prediction
     unconstrained_m: float
+    odometry_asked: int  # number of scans
     graph: GraphSummary | None
     map: WrittenMap
     warnings: tuple[str, ...]
@@ -134,6 +135,7 @@ class RunSummary:
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
             "unconstrained_m": self.unconstrained_m,
+            "odometry_asked": self.odometry_asked,
             "map_contradictions": [vars(found) for found in self.contradictions],
             **elevation_json(self.elevation),
             **graph_and_map_json(self.graph, self.map, self.warnings),
@@ -183,6 +185,7 @@ def summarise(
         lost=tuple(_lost_stretches(log)),
         degraded_scans=log.statuses.count(Status.DEGRADED),
         unconstrained_m=unconstrained_m,
+        odometry_asked=log.odometry_asked,
         graph=None if closed is None else GraphSummary.of(closed),
         map=written,
         warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m)),

@@ -72,6 +72,7 @@ class LiveSession:
             scan = self._imu.take_up(scan)
         estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
         localised = self._stages.localise(estimated)
+        self._stages.follow(estimated, lambda: localised)
         self._builder.submit(self._build, estimated, localised, 1e3 * (time.perf_counter() - started))
         return localised
 

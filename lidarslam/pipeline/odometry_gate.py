@@ -1,0 +1,117 @@
+"""Whether the learned odometry is needed at a scan: not where the motion before predicts it well enough.
+
+Registration converges from within about a cell of the local map. Where the constant velocity of the registered poses
+has predicted the last ones to a fraction of that, the network adds nothing and costs half of the time.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Annotated
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.scan import Scan
+from lidarslam.core.state.stateful import TRANSFORM, Shape, State, Stateful
+from lidarslam.core.tracking import Status
+from lidarslam.odometry.interface import Motion, SkippingOdometry
+from lidarslam.pipeline.estimates import Localised
+
+# Scans in a row that have to be ok before one goes without the odometry.
+_LEAST_OK = 10
+# Largest error of the predictions, as a share of the local map's cells, and what is left of an error after a scan.
+_LARGEST_ERROR, _FADING = 0.25, 0.9
+# Range at which an error of the rotation is counted, metres.
+_RANGE_M = 10.0
+# Largest interval over which a velocity is taken as constant, seconds, and its largest ratio to the one before.
+_LONGEST_S, _LARGEST_RATIO = 0.15, 1.5
+# Results that may wait: none is waited for that could not make a difference.
+_MOST_WAITING = 8
+
+
+class OdometryGate(Stateful):
+    """Asks the learned odometry where it is needed; implements `Odometry`.
+
+    Each scan is decided by the poses of all scans but the latest that were given to `follow`, however fast they come,
+    so that results do not depend on timing.
+
+    Args:
+        odometry: is asked.
+    """
+
+    _odometry: SkippingOdometry
+    _ok: int  # ok scans in a row
+    _error_m: float  # of the last predictions: the largest, fading
+    _stamp: float | None  # of the last scan that was given to `estimate`
+    _interval_s: float | None  # between the last two
+    _T_world_last: Annotated[FloatArray, TRANSFORM] | None  # pose of the last ok scan, unless another one followed
+    _last_stamp: float  # its stamp
+    _velocity: Annotated[FloatArray, Shape(6)] | None  # (6,) up to it
+    _cell_m: float
+
+    def __init__(self, odometry: SkippingOdometry) -> None:
+        self._odometry = odometry
+        self._waiting: deque[tuple[float, Callable[[], Localised]]] = deque()
+        self._ok, self._error_m, self._cell_m = 0, 0.0, 0.0
+        self._stamp = self._interval_s = self._T_world_last = self._velocity = None
+        self._last_stamp = 0.0
+
+    def estimate(self, scan: Scan) -> Motion:
+        """The motion since the previous scan, where it is needed; else a prediction is left to the mapping."""
+        interval_s = None if self._stamp is None else scan.stamp - self._stamp
+        before, self._stamp, self._interval_s = self._interval_s, scan.stamp, interval_s
+        is_gap = before is None or interval_s is None or interval_s > min(_LONGEST_S, _LARGEST_RATIO * before)
+        if is_gap or not len(scan) or self._is_needed():
+            return self._odometry.estimate(scan)
+        self._odometry.skip(scan)
+        return Motion(np.eye(4), 0, "not needed", is_asked=False)
+
+    def wait(self) -> None:
+        """Wait for the results that decide about the next scan, so that `estimate` takes no longer than it works."""
+        while self._may_be_skipped() and self._waiting:
+            self._take()
+
+    def follow(self, stamp: float, localised: Callable[[], Localised]) -> None:
+        """Take the result of the next scan, which is computed on another thread."""
+        self._waiting.append((stamp, localised))
+        if len(self._waiting) > _MOST_WAITING:
+            self._take()
+
+    def state(self) -> State:
+        """What it carries from scan to scan; all results have come."""
+        while self._waiting:
+            self._take()
+        return super().state()
+
+    def close(self) -> None:
+        """Close the odometry."""
+        self._odometry.close()
+
+    def _is_needed(self) -> bool:
+        self.wait()
+        return not self._may_be_skipped()
+
+    def _may_be_skipped(self) -> bool:
+        """Whether the next scan can do without, if all results that wait are as good as can be."""
+        error_m = self._error_m * _FADING ** len(self._waiting)
+        return self._ok + len(self._waiting) >= _LEAST_OK and error_m < _LARGEST_ERROR * self._cell_m
+
+    def _take(self) -> None:
+        stamp, result = self._waiting.popleft()
+        localised = result()
+        self._cell_m = localised.cell_m or 0.0
+        if localised.status is not Status.OK or not localised.is_connected:
+            self._ok, self._T_world_last, self._velocity = 0, None, None
+            return
+        before, self._T_world_last = self._T_world_last, localised.T_world_lidar
+        interval_s, self._last_stamp = stamp - self._last_stamp, stamp
+        if before is None:
+            self._ok = 1
+            return
+        motion = log(inverse(before) @ localised.T_world_lidar)
+        if self._velocity is not None:
+            error = log(inverse(exp(self._velocity * interval_s)) @ exp(motion))
+            error_m = float(np.linalg.norm(error[3:]) + _RANGE_M * np.linalg.norm(error[:3]))
+            self._error_m = max(_FADING * self._error_m, error_m)
+            self._ok += 1
+        self._velocity = motion / interval_s
