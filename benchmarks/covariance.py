@@ -40,7 +40,7 @@ from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.world import WORLDS
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]

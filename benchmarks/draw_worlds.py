@@ -10,12 +10,12 @@ import argparse
 from pathlib import Path
 
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording.reference_map import reference_map
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.simulation.reference_map import reference_map
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, save_picture
 
 

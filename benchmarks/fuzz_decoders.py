@@ -31,10 +31,9 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.mapping.global_map.global_map import PointCloud
     from lidarslam.mapping.global_map.map_io import write_cloud
     from lidarslam.run.modes.live.clouds import CloudDecoder
+    from lidarslam.simulation.formats import FORMATS
     from lidarslam.simulation.recorder import SimulatedScan
-    from lidarslam.simulation.writers.interface import Rig
-    from lidarslam.simulation.writers.ply import write_ply_scans
-    from lidarslam.simulation.writers.rosbag import write_mcap, write_rosbag1, write_rosbag2
+    from lidarslam.simulation.writers import Rig
     from lidarslam.storage.about import About
     from lidarslam.storage.summary_file import read_summary
 
@@ -80,7 +79,7 @@ TEXTS = {
     "summary": '{"scans": 3, "length_m": 1.0, "warnings": []}',
     "about": '{"description": {"merge": "all"}, "standing": "stopped", "resumed_after": [1]}',
 }
-RECORDINGS = {"mcap": write_mcap, "bag": write_rosbag1, "db3": write_rosbag2, "ply": write_ply_scans}
+RECORDINGS = {"mcap": "mcap", "bag": "rosbag1", "db3": "rosbag2", "ply": "ply"}
 
 
 def write_seeds(corpus: Path, name: str) -> None:
@@ -97,7 +96,7 @@ def write_seeds(corpus: Path, name: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "made"
         if name in RECORDINGS:
-            RECORDINGS[name](made, simulated, rig)
+            FORMATS[RECORDINGS[name]].write(made, simulated, rig)
             for number, path in enumerate(made.rglob(f"*.{name}")):
                 (corpus / f"seed-{number}").write_bytes(path.read_bytes())
         elif name == "message":
@@ -115,7 +114,7 @@ def write_seeds(corpus: Path, name: str) -> None:
 def _message(folder: Path, simulated: list[SimulatedScan], rig: Rig) -> bytes:
     from rosbags.rosbag2 import Reader
 
-    write_mcap(folder, simulated, rig)
+    FORMATS["mcap"].write(folder, simulated, rig)
     with Reader(folder) as reader:
         return next(bytes(raw) for connection, _, raw in reader.messages() if connection.msgtype == CLOUD)
 

@@ -26,8 +26,7 @@ from lidarslam.compare.comparison import Narrator, compare
 from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.core.tasks.tasks import Where
-from lidarslam.simulation.recording.record import record
-from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.simulation.record import RecordRequest, record
 
 WORLDS = ("office", "street", "hall", "tunnel")
 ROUNDING = 1e-9

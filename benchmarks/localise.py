@@ -41,11 +41,11 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.storage.finished_run import load_map
 
 WRONG_M, WRONG_DEG = 0.5, 3.0

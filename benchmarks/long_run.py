@@ -56,7 +56,7 @@ from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.scan_patterns import Spinning
+from lidarslam.simulation.sensors import Spinning
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 

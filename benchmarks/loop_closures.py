@@ -37,12 +37,11 @@ from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.simulation.motion.carriers import CARRIERS, MOUNTS, mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import CARRIERS, MOUNTS, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import SENSORS, find_sensor
-from lidarslam.simulation.world import Boxes, Route, World
-from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import SENSORS, find_sensor
+from lidarslam.simulation.world import WORLDS, Boxes, Route, World, build_world
 
 ROOMS = "rooms"
 FALSE_M, FALSE_DEG = 0.5, 3.0

@@ -38,11 +38,11 @@ from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
-from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import CARRIERS, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import SENSORS, find_sensor
-from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import SENSORS, find_sensor
+from lidarslam.simulation.world import WORLDS, build_world
 
 # How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
 BEYOND_TRUTH_S = 0.2

@@ -34,11 +34,10 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.scan_patterns import Spinning
-from lidarslam.simulation.sensors.table import SENSORS
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.sensors import SENSORS, Spinning
+from lidarslam.simulation.world import WORLDS
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 

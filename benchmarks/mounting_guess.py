@@ -24,12 +24,12 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting.guess import Guess, guess_mounting
 from lidarslam.datasets.mounting.rotation import transform_of
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.casting.caster import Caster
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import SENSORS, find_sensor
-from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import SENSORS, find_sensor
+from lidarslam.simulation.world import WORLDS, build_world
 
 # Roll, pitch, yaw of the sensor, degrees.
 POSES: dict[str, tuple[tuple[float, float, float], ...]] = {

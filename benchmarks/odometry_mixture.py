@@ -24,8 +24,8 @@ from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.config import LearnedConfig, OdometryConfig
 from lidarslam.odometry.registry import make_odometry
+from lidarslam.simulation.mixture import Excerpt, mixture
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording.mixture import Excerpt, mixture
 
 # What a motion should be better than: degrees, metres, and part of the step.
 _GOOD_DEG, _GOOD_M, _GOOD_SHARE = 0.3, 0.02, 0.03

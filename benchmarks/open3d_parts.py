@@ -37,8 +37,8 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.loops.sparse_submap import principal_components
-from lidarslam.simulation.recording.reference_map import reference_map
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.reference_map import reference_map
+from lidarslam.simulation.world import WORLDS
 
 _THINNED_M, _RADIUS_M, _NEAR_M, _FEW = 0.25, 0.3, 0.1, 20_000
 

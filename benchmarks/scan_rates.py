@@ -35,7 +35,7 @@ from peers import NAMES, run_peer
 
 from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.geometry import rotation_angle
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.world import WORLDS
 
 
 def every_nth(recorded: Recorded, step: int) -> Recorded:

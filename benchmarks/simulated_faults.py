@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.motions import CHANNELS, Motion, Sway
+from lidarslam.simulation.motion import CHANNELS, Motion, Sway
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World
 

@@ -11,7 +11,7 @@ import argparse
 from mapping_accuracy import add_simulation_arguments, print_row, run_kiss, simulate
 
 from lidarslam.odometry.config import KissConfig
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.world import WORLDS
 
 
 def run_one(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None) -> str:

@@ -10,12 +10,11 @@ import time
 from collections.abc import Iterator, Sequence
 from statistics import median
 
-from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import CARRIERS, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import SENSORS, find_sensor
-from lidarslam.simulation.world import World
-from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import SENSORS, find_sensor
+from lidarslam.simulation.world import WORLDS, World, build_world
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

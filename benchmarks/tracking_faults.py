@@ -48,11 +48,10 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.given_motion import motion_along
+from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 
 _POLLUTED_M = 0.2
 # The first scans after a fault may still be on their way back.

@@ -19,7 +19,7 @@ from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.training.preparation import PreparedRecording
 from lidarslam.odometry.training.training import validate
-from lidarslam.simulation.recording.mixture import Ingredients, ingredients_of
+from lidarslam.simulation.mixture import Ingredients, ingredients_of
 from lidarslam.train.data import prepared, simulated
 from lidarslam.train.settings import TrainConfig
 from lidarslam.train.train import TrainRequest, execute

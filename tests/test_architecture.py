@@ -79,7 +79,7 @@ CONFINED = {
     "ray": ("lidarslam.core.tasks.on_ray",),
     "rosbags": (
         "lidarslam.datasets.*",
-        "lidarslam.simulation.writers.*",
+        "lidarslam.simulation.bag_writer",
         "lidarslam.exports.*",
         "lidarslam.run.modes.live.*",
     ),
@@ -517,6 +517,6 @@ def test_what_is_allowed_is_not_told():
         lidarslam__mapping__config="import pydantic\ndef f():\n  import open3d",
         lidarslam__odometry__methods__kiss_worker="import kiss_icp.kiss_icp",
         lidarslam__datasets__bag_file="import rosbags.rosbag1",
-        lidarslam__simulation__writers__rosbag="import rosbags.rosbag2",
+        lidarslam__simulation__bag_writer="import rosbags.rosbag2",
     )
     assert {rule.__name__: rule(allowed) for rule in RULES} == {rule.__name__: [] for rule in RULES}

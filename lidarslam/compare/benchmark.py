@@ -19,9 +19,7 @@ from lidarslam.datasets.published.fetched import fetched, is_url
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 from lidarslam.evaluation.comparison.quantities import find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
-from lidarslam.simulation.recording.folder import README, REFERENCE_MAP
-from lidarslam.simulation.recording.record import record
-from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
 from lidarslam.storage.comparison_folder import RECORDINGS
 
 

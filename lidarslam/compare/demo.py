@@ -17,8 +17,7 @@ from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text.plain_text import as_typed, command_line
 from lidarslam.run.progress import show_count
-from lidarslam.simulation.recording.record import record
-from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.simulation.record import RecordRequest, record
 from lidarslam.storage.comparison_folder import REPORT_HTML
 from lidarslam.storage.finished_run import load_run
 from lidarslam.viewer.drawn_runs import load_drawn_runs

@@ -11,13 +11,12 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.casting.caster import Caster, Hits
-from lidarslam.simulation.casting.mesh import first_ground_triangle
-from lidarslam.simulation.motion.motions import Motion
-from lidarslam.simulation.sensors.imu import MEMS_IMU, ImuModel, sample_imu
-from lidarslam.simulation.sensors.noise import bloom, intensities, measure, ranges_in_grass, reflectivity
-from lidarslam.simulation.sensors.scan_patterns import Rays
-from lidarslam.simulation.sensors.sensor import Sensor
+from lidarslam.simulation.caster import Caster, Hits
+from lidarslam.simulation.imu import MEMS_IMU, ImuModel, sample_imu
+from lidarslam.simulation.mesh import first_ground_triangle
+from lidarslam.simulation.motion import Motion
+from lidarslam.simulation.noise import bloom, intensities, measure, ranges_in_grass, reflectivity
+from lidarslam.simulation.sensors import Rays, Sensor
 from lidarslam.simulation.world import World
 
 # Blades stand every way; half of a beam's power is what they reflect on average.

@@ -1,10 +1,13 @@
 """Worlds: boxes, cylinders and height fields, moving boxes, and a route through them."""
 
 from dataclasses import dataclass, field
+from importlib import import_module
+from typing import cast
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.simulation.choices import choose
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,3 +176,15 @@ def _check(owner: object, **shapes: tuple[int, ...]) -> None:
     for name, shape in shapes.items():
         if getattr(owner, name).shape != shape:
             raise ValueError(f"{type(owner).__name__}.{name} must be {shape}, got {getattr(owner, name).shape}")
+
+
+# Each is a module of lidarslam.simulation.worlds with `build(seed: int) -> World`.
+WORLDS = (
+    "street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace", "town", "corridor", "stairs", "crowd",
+)  # fmt: skip
+
+
+def build_world(name: str, seed: int) -> World:
+    """The world of that name and seed; the same two give the same world, bit for bit."""
+    modules = {world: f"lidarslam.simulation.worlds.{world}" for world in WORLDS}
+    return cast(World, import_module(choose("world", name, modules)).build(seed))

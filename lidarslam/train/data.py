@@ -18,7 +18,7 @@ from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.training.preparation import PreparedRecording, prepare
 from lidarslam.pipeline.scan_stream import in_order
-from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredients_of, mixture
+from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredients_of, mixture
 from lidarslam.train.teacher import MapTeacher
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.

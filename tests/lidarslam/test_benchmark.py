@@ -11,9 +11,9 @@ from lidarslam.compare.benchmark import Benchmark, fill_request, load_benchmark
 from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest
 from lidarslam.core.errors import ConfigError
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.sensors.table import SENSORS
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.motion import CARRIERS
+from lidarslam.simulation.sensors import SENSORS
+from lidarslam.simulation.world import WORLDS
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "benchmarks").glob("*.yaml"))
 

@@ -24,11 +24,9 @@ from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.simulation.formats import FORMATS
 from lidarslam.simulation.recorder import SimulatedScan
-from lidarslam.simulation.writers.interface import Rig
-from lidarslam.simulation.writers.kitti import write_kitti
-from lidarslam.simulation.writers.ply import write_ply_scans
-from lidarslam.simulation.writers.rosbag import write_mcap, write_rosbag1, write_rosbag2
+from lidarslam.simulation.writers import Rig, write_kitti, write_ply_scans
 from lidarslam.storage.finished_run import load_map
 from lidarslam.storage.unfinished import Unfinished
 
@@ -185,9 +183,9 @@ RECORDINGS: dict[str, tuple[Callable[..., None], str, tuple[str, ...]]] = {
     "ply": (write_ply_scans, ".", ("*1.ply", "timestamps.txt", "imu.csv")),
     "pcd": (write_pcd, ".", ("1.pcd", "2.pcd")),
     "npy": (write_npy, ".", ("1.npy", "times.txt", "ground_truth.tum")),
-    "rosbag1": (write_rosbag1, ".", ("*.bag",)),
-    "rosbag2": (write_rosbag2, ".", ("*.db3", "metadata.yaml")),
-    "mcap": (write_mcap, ".", ("*.mcap", "metadata.yaml")),
+    "rosbag1": (FORMATS["rosbag1"].write, ".", ("*.bag",)),
+    "rosbag2": (FORMATS["rosbag2"].write, ".", ("*.db3", "metadata.yaml")),
+    "mcap": (FORMATS["mcap"].write, ".", ("*.mcap", "metadata.yaml")),
     "pcap": (write_pcap, "drive.pcap", ("drive.pcap",)),
 }
 

@@ -21,7 +21,7 @@ from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.sensors.imu import MEMS_IMU, sample_imu
+from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 
 SCANS = 20
 MODEL = replace(MEMS_IMU, T_lidar_imu=make_transform(exp([0.2, -0.1, 1.4, 0.0, 0.0, 0.0])[:3, :3], [0.05, 0.0, -0.1]))

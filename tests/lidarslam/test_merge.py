@@ -29,12 +29,11 @@ from lidarslam.run.modes.merge.parts import MergeRequest
 from lidarslam.run.modes.merge.text import format_merge
 from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.tracking import Progress
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.motions import Motion
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import Motion, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 from lidarslam.storage.directory import FILES
 from lidarslam.storage.finished_run import load_map, load_run
 

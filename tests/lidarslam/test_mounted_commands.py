@@ -12,11 +12,11 @@ from lidarslam import Slam
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 from lidarslam.storage.finished_run import load_map
 
 SCANS = 22  # of which the guess looks at every fourth

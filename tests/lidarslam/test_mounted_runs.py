@@ -15,11 +15,11 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.exports.run_scans import read_run_scans
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 
 SCANS = 17  # of which the guess looks at every fourth
 ROLL = np.round(Rotation.from_euler("x", 90, degrees=True).as_matrix())

@@ -28,7 +28,7 @@ from lidarslam.odometry.training.augmentation import AUGMENTATION
 from lidarslam.odometry.training.config import LossConfig, SimulatedConfig
 from lidarslam.odometry.training.pairs import Pairs
 from lidarslam.odometry.training.training import summarise, validate
-from lidarslam.simulation.recording.mixture import ingredients_of
+from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import data as training_data
 from lidarslam.train.data import Stretch, file_of, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results

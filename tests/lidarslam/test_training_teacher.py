@@ -9,11 +9,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.training.preparation import prepare
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 from lidarslam.train.data import Stretch, draw_weights
 from lidarslam.train.teacher import MapTeacher
 

@@ -11,11 +11,9 @@ import pytest
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.motions import Motion, Sway
+from lidarslam.simulation.motion import Motion, Sway, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.sensor import RangeModel
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
 
 EXACT = RangeModel(0.05, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)

@@ -16,12 +16,11 @@ from lidarslam.mapping.tracking import attempts, start_poses
 from lidarslam.mapping.tracking.budget import Budget, Steps, complete
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.scan_patterns import Spinning
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import Spinning, find_sensor
+from lidarslam.simulation.world import build_world
 
 AT, COUNT = 50, 90
 REGISTRATION_MS, SCORE_MS, BUDGET_MS = 20.0, 0.5, 50.0

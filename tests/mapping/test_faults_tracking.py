@@ -31,15 +31,11 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.scan_patterns import Spinning
-from lidarslam.simulation.sensors.sensor import Sensor
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.world import World
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import Sensor, Spinning, find_sensor
+from lidarslam.simulation.world import World, build_world
 
 AT = 70
 COUNT = 100

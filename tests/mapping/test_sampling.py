@@ -8,7 +8,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.registration.sampled_scan import SampledScan, has_rings
 from lidarslam.mapping.surfels.sampling import SurfelSampler
-from lidarslam.simulation.sensors.table import SENSORS
+from lidarslam.simulation.sensors import SENSORS
 
 
 def shell(rng: np.random.Generator, radius_m: float, count: int = 20_000, stamp: float = 0.0) -> Scan:

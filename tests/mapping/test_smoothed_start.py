@@ -7,11 +7,11 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 
 
 def walk(sensor: str, start: int, count: int = 25, name: str = "office") -> tuple[list[Scan], FloatArray]:

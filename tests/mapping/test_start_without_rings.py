@@ -9,11 +9,11 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import smoothed_start
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 
 
 @pytest.mark.parametrize("seed", [1, 2])

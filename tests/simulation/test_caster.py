@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lidarslam.simulation.casting.caster import Caster, meet_boxes
-from lidarslam.simulation.casting.mesh import box_mesh
+from lidarslam.simulation.caster import Caster, meet_boxes
+from lidarslam.simulation.mesh import box_mesh
 from lidarslam.simulation.world import Boxes, Mover, Route, World
 
 ROUTE = Route(np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0]]), 1.0, 1.0, 3.0, 1.0)

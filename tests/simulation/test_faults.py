@@ -17,11 +17,9 @@ from simulated_faults import (
 )
 
 from lidarslam.core.geometry import inverse, rotation_angle
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.motions import Motion, Sway
+from lidarslam.simulation.motion import Motion, Sway, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.scan_patterns import Spinning
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.sensors import Spinning, find_sensor
 from lidarslam.simulation.world import World
 
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
+from lidarslam.simulation.noise import ranges_in_grass
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording.reference_map import reference_map
-from lidarslam.simulation.sensors.noise import ranges_in_grass
-from lidarslam.simulation.sensors.sensor import RangeModel
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.reference_map import reference_map
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Grass, HeightField
 
 EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)

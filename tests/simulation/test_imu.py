@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.imu import EXACT_IMU, GRAVITY, MEMS_IMU, InertialErrors, bias_paths, sample_imu
+from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.imu import EXACT_IMU, GRAVITY, MEMS_IMU, InertialErrors, bias_paths, sample_imu
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
 
 
 def simulation(yard, carrier="handheld", mount="tilted", scans=150, imu_model=EXACT_IMU):

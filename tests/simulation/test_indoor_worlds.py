@@ -8,12 +8,10 @@ import open3d as o3d
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.casting.mesh import world_mesh
-from lidarslam.simulation.world import Boxes, World
+from lidarslam.simulation.mesh import world_mesh
+from lidarslam.simulation.world import Boxes, World, build_world
 from lidarslam.simulation.worlds.building import UP
-from lidarslam.simulation.worlds.clearance import Clearance
-from lidarslam.simulation.worlds.paths import subdivide_loop
-from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.worlds.paths import Clearance, subdivide_loop
 
 NAMES = ("office", "tunnel", "hall", "stairs", "crowd")
 SEEDS = (0, 1, 2)

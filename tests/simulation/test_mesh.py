@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidarslam.simulation.casting.mesh import (
+from lidarslam.simulation.mesh import (
     CYLINDER_SIDES,
     Mesh,
     box_mesh,

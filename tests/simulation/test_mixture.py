@@ -9,11 +9,11 @@ import pytest
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Excerpt, ingredients_of, mixture
+from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Excerpt, ingredients_of, mixture
-from lidarslam.simulation.sensors.table import SENSORS
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.sensors import SENSORS
+from lidarslam.simulation.world import WORLDS
 
 SEED = 0
 SCANS = 3

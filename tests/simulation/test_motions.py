@@ -8,12 +8,16 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, is_rigid, make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.motions import Sway, rotations
-from lidarslam.simulation.motion.rounded_path import RoundedPath, corner_windows, straightened
-from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.motion.speed_profile import TIME_STEP_S, rest_to_rest, round_and_round
+from lidarslam.simulation.motion import CARRIERS, Sway, motion_along, rotations
+from lidarslam.simulation.route_motion import (
+    TIME_STEP_S,
+    RoundedPath,
+    corner_windows,
+    motion_along_route,
+    rest_to_rest,
+    round_and_round,
+    straightened,
+)
 from lidarslam.simulation.world import Route, World
 
 STEP_S = 0.005

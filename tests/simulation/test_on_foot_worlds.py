@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.casting.caster import Caster
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.motions import Sway
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.motion import Sway, mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.world import World
-from lidarslam.simulation.worlds.on_foot.crowd import COMPANIONS, CROSSING, SPEED_MPS, STANDING
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import World, build_world
+from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, SPEED_MPS, STANDING
 from lidarslam.simulation.worlds.paths import subdivide_loop
-from lidarslam.simulation.worlds.registry import build_world
 
 SEEDS = (0, 1, 2)
 RISE_M, TREAD_M = 0.17, 0.28

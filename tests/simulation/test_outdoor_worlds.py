@@ -8,12 +8,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.simulation.casting.caster import Caster
-from lidarslam.simulation.casting.mesh import CYLINDER_SIDES, box_mesh, cylinder_mesh, merge
-from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.world import World
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.mesh import CYLINDER_SIDES, box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.world import World, build_world
 from lidarslam.simulation.worlds.paths import loop_length, subdivide_loop
-from lidarslam.simulation.worlds.registry import build_world
 
 NAMES = ("street", "park", "forest", "fields", "terrace")
 SEEDS = (0, 3)  # for the street, one block and two

@@ -6,7 +6,7 @@ import pytest
 from lidarslam.simulation.world import Route
 from lidarslam.simulation.worlds import paths
 from lidarslam.simulation.worlds.building import Builder
-from lidarslam.simulation.worlds.street.network import StreetNetwork
+from lidarslam.simulation.worlds.street import StreetNetwork
 
 RECTANGLE = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 10.0], [0.0, 10.0]])
 

@@ -14,13 +14,10 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_table import coordinates
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.recording import sweeps
-from lidarslam.simulation.recording.motion import read_trajectory
-from lidarslam.simulation.recording.record import record
-from lidarslam.simulation.recording.request import RecordRequest
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.formats import FORMATS
+from lidarslam.simulation.record import RecordRequest, read_trajectory, record
+from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import Boxes, HeightField, Route, World
-from lidarslam.simulation.writers.registry import FORMATS
 
 SCANS = 3
 
@@ -43,7 +40,7 @@ def worlds(monkeypatch):
         boxes = Boxes(table[:, :3], table[:, 3:], np.tile(np.eye(3), (len(table), 1, 1)))
         return World(name, seed, Route(corners, 1.0, 1.0, 4.0, 3.0), boxes, height_fields=(floor,))
 
-    monkeypatch.setattr(sweeps, "build_world", build)
+    monkeypatch.setattr("lidarslam.simulation.record.build_world", build)
 
 
 def request(out, **changes):
@@ -341,7 +338,7 @@ def test_help_lists_the_choices_and_an_example():
 
 
 def test_every_sensor_has_a_driver_that_can_be_written():
-    from lidarslam.simulation.sensors.table import SENSORS
-    from lidarslam.simulation.writers.driver_clouds import DRIVERS
+    from lidarslam.simulation.bag_writer import DRIVERS
+    from lidarslam.simulation.sensors import SENSORS
 
     assert {find_sensor(name).driver for name in SENSORS} <= set(DRIVERS)

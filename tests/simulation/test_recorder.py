@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import inverse, transform_points
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.motion import mount_pose
+from lidarslam.simulation.noise import bloom, measure, range_sigma, reflectivity, return_probability
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors.noise import bloom, measure, range_sigma, reflectivity, return_probability
-from lidarslam.simulation.sensors.sensor import RangeModel
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import RangeModel, find_sensor
 
 EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 NOISY = RangeModel(0.3, 100.0, 0.01, 0.0003, 0.003, 0.002)

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from lidarslam.simulation.casting.caster import Caster
-from lidarslam.simulation.casting.mesh import Mesh, box_mesh
-from lidarslam.simulation.casting.mesh_pieces import pieces_near
-from lidarslam.simulation.motion.carriers import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.mesh import Mesh, box_mesh, pieces_near
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording.reference_map import SeenSurfaces, reference_map, sample_seen
-from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.reference_map import SeenSurfaces, reference_map, sample_seen
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import Boxes
 
 # A square of 10 m split into two triangles, facing up.

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.simulation.motion.carriers import MOUNTS, mount_pose
-from lidarslam.simulation.sensors.scan_patterns import RisleyPrisms, Spinning
-from lidarslam.simulation.sensors.table import SENSORS, find_sensor
+from lidarslam.simulation.motion import MOUNTS, mount_pose
+from lidarslam.simulation.sensors import SENSORS, RisleyPrisms, Spinning, find_sensor
 
 # name: rays a sweep, lasers, lowest and highest elevation in degrees
 FACTS = {

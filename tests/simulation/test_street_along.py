@@ -6,16 +6,13 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.casting.caster import Caster
-from lidarslam.simulation.casting.mesh import box_mesh, cylinder_mesh, merge
-from lidarslam.simulation.motion.carriers import find_carrier
-from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.motions import rotations
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.mesh import box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.motion import find_carrier, motion_along, rotations
+from lidarslam.simulation.record import check_clearance, given_path, is_inside, read_trajectory
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording.motion import given_path, read_trajectory
-from lidarslam.simulation.recording.path_clearance import check_clearance, is_inside
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.street.along import FREE_SIDE_M, build_along
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.worlds.along import FREE_SIDE_M, build_along
 
 
 def figure_of_eight(size_m=70.0, rounds=1):

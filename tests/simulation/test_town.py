@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.casting.caster import Caster
-from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import World
+from lidarslam.simulation.worlds import town
+from lidarslam.simulation.worlds.along import FREE_SIDE_M
 from lidarslam.simulation.worlds.paths import subdivide_loop
-from lidarslam.simulation.worlds.street import town
-from lidarslam.simulation.worlds.street.along import FREE_SIDE_M
 
 SEEDS = range(5)
 

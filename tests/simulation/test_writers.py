@@ -15,12 +15,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
+from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer, find_driver
+from lidarslam.simulation.formats import FORMATS, find_format
 from lidarslam.simulation.recorder import SimulatedScan
-from lidarslam.simulation.writers.driver_clouds import DRIVERS, find_driver
-from lidarslam.simulation.writers.interface import CLOCK_START_NS, Rig, clock_ns
-from lidarslam.simulation.writers.kitti import T_CAM_LIDAR, compensate
-from lidarslam.simulation.writers.registry import FORMATS, find_format
-from lidarslam.simulation.writers.rosbag import MessageSerializer
+from lidarslam.simulation.writers import CLOCK_START_NS, T_CAM_LIDAR, Rig, clock_ns, compensate
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 SWEEP_S = 0.1
@@ -77,7 +75,7 @@ def test_an_imu_is_recorded_too(name, driver, tmp_path, sweeps, drive):
 
 @pytest.mark.parametrize("name", BAGS)
 def test_topics_of_both(name, tmp_path, sweeps, drive):
-    find_format(name).writer()(tmp_path / "room", iter(sweeps), replace(make_rig(drive), imu=some_imu()))
+    find_format(name).write(tmp_path / "room", iter(sweeps), replace(make_rig(drive), imu=some_imu()))
     with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(find_format(name).source_in(tmp_path / "room")) as bag:
         assert {c.topic: c.msgcount for c in bag.connections} == {
             "/velodyne_points": 4,
@@ -88,7 +86,7 @@ def test_topics_of_both(name, tmp_path, sweeps, drive):
 
 def write(name, folder, sweeps, rig):
     """The recording that the program's reader finds in a folder with the scans."""
-    find_format(name).writer()(folder, iter(sweeps), rig)
+    find_format(name).write(folder, iter(sweeps), rig)
     return open_recording(find_format(name).source_in(folder))
 
 
@@ -154,7 +152,7 @@ def test_messages_are_laid_out_as_the_driver_lays_them_out(name, driver, tmp_pat
 
 def messages(name, driver, folder, sweeps, drive):
     """Record stamp and message, decoded by rosbags with the definitions in the bag, with the sweep it was made of."""
-    find_format(name).writer()(folder, iter(sweeps), make_rig(drive, driver))
+    find_format(name).write(folder, iter(sweeps), make_rig(drive, driver))
     source = find_format(name).source_in(folder)
     store = MessageSerializer(ros2=name != "rosbag1").store
     with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(source) as reader:
@@ -283,7 +281,7 @@ def test_same_scans_same_bytes(name, tmp_path, sweeps, rig):
     contents = []
     for folder in (tmp_path / "a" / "room", tmp_path / "b" / "room"):
         folder.parent.mkdir()
-        find_format(name).writer()(folder, iter(sweeps[:2]), rig)
+        find_format(name).write(folder, iter(sweeps[:2]), rig)
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         contents.append({path.relative_to(folder): path.read_bytes() for path in files})
     assert contents[0].keys() == contents[1].keys()
@@ -306,13 +304,13 @@ def test_one_scan_is_held_at_a_time(name, tmp_path, sweeps, rig):
             del made, scan
             most = max(most, len(alive))
 
-    find_format(name).writer()(tmp_path / "room", stream(), rig)
+    find_format(name).write(tmp_path / "room", stream(), rig)
     assert most == 1  # the writer's own, when the next one is asked for
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
-    find_format(name).writer()(tmp_path / "room", iter(sweeps[:2]), replace(rig, imu=some_imu()))
+    find_format(name).write(tmp_path / "room", iter(sweeps[:2]), replace(rig, imu=some_imu()))
     patterns = find_format(name).files
     for entry in (tmp_path / "room").iterdir():
         assert any(entry.match(pattern) for pattern in patterns)

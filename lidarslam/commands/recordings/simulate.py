@@ -10,11 +10,11 @@ from lidarslam.commands.shared.names import Registered
 from lidarslam.commands.shared.options import FILE, CommandWithExample, default_out, out_option
 from lidarslam.commands.shared.terminal import say
 
-_WORLD = Registered("lidarslam.simulation.worlds.registry", "WORLDS")
-_SENSOR = Registered("lidarslam.simulation.sensors.table", "SENSORS")
-_CARRIER = Registered("lidarslam.simulation.motion.carriers", "CARRIERS")
-_MOUNT = Registered("lidarslam.simulation.motion.carriers", "MOUNTS")
-_FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
+_WORLD = Registered("lidarslam.simulation.world", "WORLDS")
+_SENSOR = Registered("lidarslam.simulation.sensors", "SENSORS")
+_CARRIER = Registered("lidarslam.simulation.motion", "CARRIERS")
+_MOUNT = Registered("lidarslam.simulation.motion", "MOUNTS")
+_FORMAT = Registered("lidarslam.simulation.formats", "FORMATS")
 
 
 @click.command(
@@ -56,9 +56,7 @@ _FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Simulate a recording, with the exact trajectory and the exact map."""
     from lidarslam.run.progress import show_count
-    from lidarslam.simulation.recording.record import record
-    from lidarslam.simulation.recording.request import RecordRequest
-    from lidarslam.simulation.recording.text import format_summary
+    from lidarslam.simulation.record import RecordRequest, format_summary, record
 
     motion = motion or ("handheld" if trajectory is None else "car")
     out = out or default_out("recordings", options["world"])

@@ -10,7 +10,7 @@ from lidarslam.core.files import replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.map.metrics import MapComparison
 from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD, error_colours
-from lidarslam.simulation.writers.ply import write_ply
+from lidarslam.simulation.writers import write_ply
 
 _SUFFIXES = (".ply", ".rrd")
 _FIELDS = [

@@ -1,4 +1,4 @@
-"""Collecting primitives: the brushes that every world is painted with."""
+"""Walls with closed windows and open doorways."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -173,3 +173,18 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], scale: float)
     rough = gaussian_filter(rng.standard_normal(shape), scale, mode="reflect")
     rough -= rough.mean()
     return np.asarray(rough / max(float(rough.std()), 1e-12))
+
+
+OUTER_WALL_M = 0.2
+_PANE_M, _BAR_M = 0.05, 0.03
+
+
+def glazed_wall(
+    spot: Spot, x: Limits, height: float, windows: list[Opening], doorways: tuple[Opening, ...] = ()
+) -> None:
+    """A wall whose inner face is at y = 0 of the spot; windows are recesses closed by a pane with an upright bar."""
+    spot.pierced_wall(x, (-OUTER_WALL_M, 0.0), height, [*windows, *doorways])
+    for window in windows:
+        middle = 0.5 * (window.x[0] + window.x[1])
+        spot.box(window.x, (-OUTER_WALL_M, -OUTER_WALL_M + _PANE_M), window.z)
+        spot.box((middle - _BAR_M, middle + _BAR_M), (-OUTER_WALL_M, -OUTER_WALL_M + 2.0 * _PANE_M), window.z)

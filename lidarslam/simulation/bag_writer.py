@@ -1,0 +1,258 @@
+"""Bags of ROS 1 and ROS 2 with the point clouds of the sensor's own driver and, if asked for, those of an IMU."""
+
+import heapq
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from lidarslam.core.errors import OutputError
+from lidarslam.core.imu import ImuSamples
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
+from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
+from lidarslam.datasets.ros.made_messages import (
+    POINT_CLOUD2_TYPE,
+    header,
+    point_cloud,
+    transforms,
+    vector,
+    write_chunk_checksums,
+)
+from lidarslam.simulation.choices import choose
+from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.writers import CLOCK_START_NS, Rig, clock_ns
+
+Records = NDArray[np.void]
+_FIRST_RETURN = 0x10
+
+
+@dataclass(frozen=True)
+class DriverCloud:
+    """A driver's topic and point layout."""
+
+    topic: str  # the driver's defaults
+    frame_id: str
+    record: np.dtype[np.void]  # type of a point, padding included
+    columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # beside x, y, z, by the sweep and its stamp_ns
+    imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one beside it
+    imu_frame_id: str = "imu_link"
+    custom_message: bool = False  # Livox's own rather than PointCloud2
+
+    def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
+        """The points (N,) of a sweep whose message is stamped `stamp_ns`."""
+        records = np.zeros(len(simulated.scan), self.record)
+        for column, axis in enumerate("xyz"):
+            records[axis] = simulated.scan.points[:, column]
+        for name, values in self.columns(simulated, stamp_ns).items():
+            records[name] = values
+        return records
+
+
+def find_driver(name: str) -> DriverCloud:
+    """The layout of a driver."""
+    return choose("driver", name, DRIVERS)
+
+
+def _offsets(simulated: SimulatedScan) -> NDArray[np.float64]:
+    offsets = simulated.scan.time_offsets
+    return np.zeros(len(simulated.scan)) if offsets is None else offsets
+
+
+def _rings(simulated: SimulatedScan) -> ArrayLike:
+    return 0 if simulated.scan.rings is None else simulated.scan.rings
+
+
+# Intensities are whole numbers from 0 to 255, the scale of all four drivers.
+def _velodyne(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
+    return {"intensity": simulated.intensities, "ring": _rings(simulated), "time": _offsets(simulated)}
+
+
+def _ouster(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
+    return {  # `ambient`, sunlight, stays zero: the simulated night is dark
+        "intensity": simulated.intensities,
+        "t": np.round(1e9 * _offsets(simulated)),
+        "reflectivity": simulated.intensities,
+        "ring": _rings(simulated),
+        "range": np.round(1e3 * np.linalg.norm(simulated.scan.points, axis=1)),
+    }
+
+
+def _hesai(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:
+    timestamps = stamp_ns / 10**9 + _offsets(simulated)
+    return {"intensity": simulated.intensities, "ring": _rings(simulated), "timestamp": timestamps}
+
+
+def _livox(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
+    return {
+        "offset_time": np.round(1e9 * _offsets(simulated)),
+        "reflectivity": simulated.intensities,
+        "tag": _FIRST_RETURN,
+        "line": _rings(simulated),
+    }
+
+
+_XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+# velodyne_pointcloud, PointXYZIRT: packed
+_VELODYNE_POINT = np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
+# ouster-ros, point type "original": laid out by PCL, which keeps 16 bytes for the coordinates
+_OUSTER_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
+        "offsets": [0, 4, 8, 16, 20, 24, 26, 28, 32],
+        "itemsize": 48,
+    }
+)
+# HesaiLidar_ROS_2.0: packed
+_HESAI_POINT = np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("timestamp", "<f8")])
+# livox_ros_driver2, CustomPoint: 19 bytes
+_LIVOX_POINT = np.dtype([("offset_time", "<u4"), *_XYZ, ("reflectivity", "|u1"), ("tag", "|u1"), ("line", "|u1")])
+
+DRIVERS: dict[str, DriverCloud] = {
+    "velodyne": DriverCloud("/velodyne_points", "velodyne", _VELODYNE_POINT, _velodyne),
+    "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, _ouster, "/ouster/imu", "os_imu"),
+    "hesai": DriverCloud("/lidar_points", "hesai_lidar", _HESAI_POINT, _hesai),
+    "livox": DriverCloud("/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, "/livox/imu", "livox_imu", True),
+}
+
+
+IMU_TYPE = "sensor_msgs/msg/Imu"
+
+
+def imu_messages(store: Typestore, imu: ImuSamples, frame_id: str) -> Iterator[tuple[int, Any]]:
+    """Stamps in nanoseconds of the clock and messages of samples stamped in simulated seconds."""
+    types = store.types
+    orientation, unknown = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
+    no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition has it
+    for number, stamp in enumerate(imu.stamps):
+        stamp_ns = clock_ns(stamp)
+        yield (
+            stamp_ns,
+            types[IMU_TYPE](
+                header=header(store, stamp_ns, frame_id, number),
+                orientation=orientation,
+                orientation_covariance=no_orientation,
+                angular_velocity=vector(store, imu.angular_velocities[number]),
+                angular_velocity_covariance=unknown,
+                linear_acceleration=vector(store, imu.accelerations[number]),
+                linear_acceleration_covariance=unknown,
+            ),
+        )
+
+
+_STATIC_TRANSFORMS = "/tf_static"
+_CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
+_CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
+
+_LIDAR_ID = 192  # the last byte of the sensor's address
+_CDR_ALIGNMENT = 4
+# The newest version that ROS 2 Humble still reads.
+_ROSBAG2_VERSION: Literal[8] = 8
+
+
+def write_bag(
+    folder: Path, scans: Iterable[SimulatedScan], rig: Rig, kind: Literal["rosbag1", "rosbag2", "mcap"]
+) -> None:
+    """Write a `.bag` named like the folder in it, or a rosbag2 folder with an SQLite or an MCAP file."""
+    bag: Rosbag1Writer | Rosbag2Writer
+    if kind == "rosbag1":
+        folder.mkdir()
+        bag = Rosbag1Writer(folder / f"{folder.name}.bag")
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        bag = Rosbag2Writer(folder, version=_ROSBAG2_VERSION, storage_plugin=plugin)
+    serializer = MessageSerializer(ros2=kind != "rosbag1")
+    messages = (_clouds(bag, serializer, scans, rig), _imu(bag, serializer, rig))
+    try:
+        with bag:
+            for message in heapq.merge(*messages, key=lambda message: message[1]):
+                bag.write(*message)
+    except sqlite3.Error as error:
+        raise OutputError(f"{bag.path}: cannot be written ({error}); is the disk full?") from error
+    if kind == "mcap":
+        write_chunk_checksums(folder / f"{folder.name}.mcap")
+
+
+Messages = Iterator[tuple[Any, int, bytes]]
+"""Connection, time of recording in nanoseconds, and bytes of messages in the order of time."""
+
+
+def _clouds(
+    bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", scans: Iterable[SimulatedScan], rig: Rig
+) -> Messages:
+    driver = find_driver(rig.driver)
+    connection = bag.add_connection(driver.topic, serializer.message_type(driver), typestore=serializer.store)
+    # A message is published, and recorded, when its last point has been measured.
+    latency_ns = round(1e9 * rig.sweep_s)
+    for number, simulated in enumerate(scans):
+        stamp_ns = clock_ns(simulated.scan.stamp)
+        records = driver.records(simulated, stamp_ns)
+        yield connection, stamp_ns + latency_ns, serializer.serialize(driver, records, stamp_ns, number)
+
+
+def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", rig: Rig) -> Messages:
+    """Where the IMU is on the LiDAR, then a message a sample."""
+    driver, imu = find_driver(rig.driver), rig.imu
+    if imu is None:
+        return
+    store = serializer.store
+    if imu.T_lidar_imu is not None:
+        placed = bag.add_connection(_STATIC_TRANSFORMS, TRANSFORMS_TYPE, typestore=store)
+        parent = header(store, CLOCK_START_NS, driver.frame_id)
+        message = transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
+        yield placed, CLOCK_START_NS, serializer.serialized(message, TRANSFORMS_TYPE)
+    connection = bag.add_connection(driver.imu_topic, IMU_TYPE, typestore=store)
+    for stamp_ns, sample in imu_messages(store, imu, driver.imu_frame_id):
+        yield connection, stamp_ns, serializer.serialized(sample, IMU_TYPE)
+
+
+class MessageSerializer:
+    """Serialises clouds for ROS 1 (packed) or ROS 2 (CDR)."""
+
+    def __init__(self, ros2: bool) -> None:
+        self._ros2 = ros2
+        self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+        self.store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
+        self.store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
+        if not ros2:  # ROS 2's store has it
+            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+
+    def message_type(self, driver: DriverCloud) -> str:
+        """The name of the driver's message type."""
+        return _CUSTOM_MESSAGE if driver.custom_message else POINT_CLOUD2_TYPE
+
+    def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
+        """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
+        message_header = header(self.store, stamp_ns, driver.frame_id, sequence)
+        message_type = self.message_type(driver)
+        if not driver.custom_message:
+            return self.serialized(point_cloud(self.store, message_header, records), message_type)
+        rsvd = np.zeros(3, np.uint8)
+        message = self.store.types[message_type](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
+        # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
+        # empty list, which ends the message with its length.
+        without_points = self.serialized(message, message_type)[:-4]
+        return without_points + len(records).to_bytes(4, "little") + self._packed(records)
+
+    def serialized(self, message: Any, message_type: str) -> bytes:
+        """The bytes of a message."""
+        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
+        return bytes(serialize(message, message_type))
+
+    def _packed(self, records: Records) -> bytes:
+        """Points one after the other; in CDR each begins at a multiple of four bytes."""
+        size = records.dtype.itemsize
+        if not self._ros2 or not len(records):
+            return records.tobytes()
+        aligned = np.zeros((len(records), -(-size // _CDR_ALIGNMENT) * _CDR_ALIGNMENT), np.uint8)
+        aligned[:, :size] = np.frombuffer(records.tobytes(), np.uint8).reshape(-1, size)
+        return aligned.tobytes()[: aligned.size - (aligned.shape[1] - size)]  # nothing follows that needs alignment

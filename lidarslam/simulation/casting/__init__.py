@@ -1,1 +1,0 @@
-"""Casting rays into worlds."""

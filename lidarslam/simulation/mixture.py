@@ -1,0 +1,105 @@
+"""Recordings in variety, for training: worlds, sensors, carriers and mountings, drawn by a seed.
+
+The ingredients are listed here and not taken from the registries: what is added there leaves the recordings of a
+seed, the prepared training data and the figures measured on them as they are, and is new to the shipped network.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.scan import Scan, ScanSequence
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.motion import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
+
+# Drawn by turns.
+MIXED_WORLDS = ("street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace")
+# How often each is drawn, relative to the others.
+SENSOR_WEIGHTS = {
+    "vlp-16": 3.0, "hdl-32e": 1.0, "hdl-64e": 1.0, "hdl-64e-calibrated": 1.0, "os0-64": 1.0, "os1-64": 1.5,
+    "os1-128": 1.5, "xt32": 1.0, "livox": 1.0,
+}  # fmt: skip
+_CARRIER_WEIGHTS = {
+    "car": 1.5, "handheld": 1.5, "legged": 1.0, "tracked": 1.0, "tracked-harsh": 1.0, "drone": 1.0,
+}  # fmt: skip
+# Worlds with roads, in which a car is at speed from the first scan on.
+_ROADS = frozenset({"street", "park", "fields", "terrace"})
+_FAST_WEIGHT = 3.0
+_FAST_MPS = (5.0, 30.0)
+_MOUNT_WEIGHTS = {"upright": 0.7, "upside-down": 0.15, "tilted": 0.15}
+# A mixture's worlds are numbered from here, far from the small seeds that people try things out with.
+_FIRST_SEED = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """Some consecutive scans of a recording, as a recording of their own."""
+
+    whole: ScanSequence
+    first: int
+    count: int
+
+    @property
+    def name(self) -> str:
+        """The recording's, and where in it."""
+        return f"{self.whole.name}@{self.first}"
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The recording's."""
+        return self.whole.ground_truth
+
+    def __len__(self) -> int:
+        return self.count
+
+    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)` of the excerpt."""
+        chosen = range(self.first, self.first + self.count)[start:stop:step]
+        return self.whole.scans(chosen.start, chosen.stop, chosen.step)
+
+
+@dataclass(frozen=True)
+class Ingredients:
+    """The names of a recording's parts; `speed_mps` where it is not the carrier's own."""
+
+    world: str
+    sensor: str
+    carrier: str
+    mount: str
+    speed_mps: float | None = None
+
+
+def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Excerpt]:
+    """Recordings of so many scans each; number i of a seed is the same for any `first`."""
+    for number in range(first, first + recordings):
+        rng = np.random.default_rng([seed, number])
+        chosen = _draw(rng, number)
+        sensor = find_sensor(chosen.sensor)
+        world_seed = _FIRST_SEED * (seed + 1) + number
+        world = build_world(chosen.world, world_seed)
+        motion = motion_along_route(chosen.carrier, world, world_seed, chosen.speed_mps)
+        start = int(rng.integers(max(1, int(motion.duration_s * sensor.rate_hz) - scans)))
+        T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
+        yield Excerpt(Simulation(world, sensor, motion, T_body_lidar, start + scans, world_seed), start, scans)
+
+
+def ingredients_of(number: int, seed: int) -> Ingredients:
+    """The parts of a recording of a mixture; its world is not built."""
+    return _draw(np.random.default_rng([seed, number]), number)
+
+
+def _draw(rng: np.random.Generator, number: int) -> Ingredients:
+    world = MIXED_WORLDS[number % len(MIXED_WORLDS)]
+    carriers = _CARRIER_WEIGHTS | ({"car-fast": _FAST_WEIGHT} if world in _ROADS else {})
+    sensor, carrier, mount = (_pick(rng, weights) for weights in (SENSOR_WEIGHTS, carriers, _MOUNT_WEIGHTS))
+    return Ingredients(world, sensor, carrier, mount, float(rng.uniform(*_FAST_MPS)) if carrier == "car-fast" else None)
+
+
+def _pick(rng: np.random.Generator, weights: dict[str, float]) -> str:
+    shares = np.array(list(weights.values()))
+    return str(rng.choice(list(weights), p=shares / shares.sum()))

@@ -1,0 +1,301 @@
+"""Motions of a body through a world: carriers, how they lean on the ground, and trajectories that are given."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline, make_smoothing_spline
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.choices import choose
+from lidarslam.simulation.world import World
+
+# Columns of `Motion.base`.
+CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "activity")
+
+
+@dataclass(frozen=True, eq=False)
+class Sway:
+    """K sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest."""
+
+    axes: tuple[int, ...] = ()  # indices into x, y, z, roll, pitch, yaw
+    amplitudes: tuple[float, ...] = ()  # metres or radians
+    frequencies_hz: tuple[float, ...] = ()
+    phases: tuple[float, ...] = ()
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Deflections (N, 6) at times (N,), full size."""
+        deflections = np.zeros((len(times), 6))
+        sines = zip(self.axes, self.amplitudes, self.frequencies_hz, self.phases, strict=True)
+        for axis, amplitude, frequency, phase in sines:
+            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency * times + phase)
+        return deflections
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The motion of a body, x forwards and z up, whose origin is on the ground under it (or which flies).
+
+    Cubic splines go through `base`: world position, roll, pitch, yaw and activity (0 to 1), with
+    R_world_body = Rz(yaw) Ry(pitch) Rx(roll).
+    """
+
+    name: str  # of the carrier, or "given"
+    times: FloatArray  # (K,) from 0 to `duration_s`
+    base: FloatArray  # (K, 7)
+    sway: Sway
+    sensor_height_m: float  # of a LiDAR above the body's origin
+    repeats: bool = True  # another lap follows a lap; else the body stays where it is in the end
+    rests: bool = True  # a lap begins and ends at rest; else its last pose is its first, whole turns of yaw aside
+
+    def __post_init__(self) -> None:
+        if self.base.shape != (len(self.times), len(CHANNELS)) or self.times[0] != 0.0:
+            raise ValueError(f"Motion.base must be ({len(self.times)}, {len(CHANNELS)}), got {self.base.shape}")
+
+    @property
+    def duration_s(self) -> float:
+        """Time of one lap."""
+        return float(self.times[-1])
+
+    @cached_property
+    def _spline(self) -> "CubicSpline[np.float64]":
+        if self.repeats and not self.rests:
+            return _closed_spline(self.times, self.base)
+        return CubicSpline(self.times, self.base, bc_type="clamped" if self.repeats else "natural")
+
+    def pose_at(self, times: FloatArray) -> FloatArray:
+        """T_world_body (N, 4, 4) at times (N,), seconds from the start; twice differentiable."""
+        since = np.maximum(times, 0.0)
+        lap_time = np.mod(since, self.duration_s) if self.repeats else np.minimum(since, self.duration_s)
+        state = self._spline(lap_time)
+        x, y, z, roll, pitch, yaw = (state[:, :6] + state[:, 6:] * self.sway.at(times)).T
+        # Sway along x and y is the body's, not the world's.
+        c, s = np.cos(yaw), np.sin(yaw)
+        dx, dy = x - state[:, 0], y - state[:, 1]
+        position = np.stack([state[:, 0] + c * dx - s * dy, state[:, 1] + s * dx + c * dy, z], axis=-1)
+        return make_transform(rotations(roll, pitch, yaw), position)
+
+
+def _closed_spline(times: FloatArray, values: FloatArray) -> "CubicSpline[np.float64]":
+    """Through values (K, D) at times (K,), with equal derivatives at either end: a periodic spline and a trend."""
+    slope = (values[-1] - values[0]) / times[-1]
+    level = values - np.multiply.outer(times, slope)
+    level[-1] = level[0]
+    spline = CubicSpline(times, level, bc_type="periodic")
+    spline.c[2] += slope
+    spline.c[3] += np.multiply.outer(times[:-1], slope)
+    return spline
+
+
+def rotations(roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Rz(yaw) Ry(pitch) Rx(roll), (N, 3, 3), of angles (N,) in radians."""
+    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (np.cos, np.sin))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0).copy()
+
+
+@dataclass(frozen=True)
+class Swing:
+    """One sine of a carrier's sway."""
+
+    axis: str  # "x", "y", "z" (metres; forwards, left, up), "roll", "pitch" or "yaw" (degrees)
+    amplitude: float
+    frequency_hz: float  # before the seed varies it by a tenth
+    stepwise: bool = False  # all such swings follow the carrier's gait, at one common frequency
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """A kind of motion, by its name on the command line."""
+
+    name: str
+    speed_mps: float  # where nothing slows it down
+    acceleration: float  # limits along and across, m/s^2
+    side_acceleration: float
+    turn_rate_deg: float  # about z, degrees a second (squared)
+    turn_acceleration_deg: float
+    stop_angle_deg: float  # at sharper corners it stops and turns on the spot
+    half_width_m: float  # of its body, for staying within the route's free side
+    footprint_m: float  # radius over which it averages the ground
+    sensor_height_m: float  # of the LiDAR above the body's origin, which is on the ground or is the flying body
+    smoothing_s: float  # half the time over which accelerations set in
+    swings_deg: tuple[float, ...] = ()  # turns there and back before it takes a corner's new direction
+    leans_with_ground: bool = True  # takes the ground's pitch and roll
+    banks: bool = False  # leans into its accelerations, as what flies must
+    keeps_going: bool = False  # is at speed when a lap begins and ends; else laps begin and end at rest
+    flight_height_m: float = 0.0  # above the ground, where the route is high enough; 0 for what does not fly
+    sway: tuple[Swing, ...] = ()  # while it moves
+
+
+_SUSPENSION = (Swing("pitch", 0.25, 1.3), Swing("roll", 0.25, 1.1), Swing("z", 0.01, 1.3))
+_RUMBLE = (Swing("z", 0.0015, 6.0), Swing("roll", 0.25, 4.3), Swing("pitch", 0.25, 5.1))
+# Heights: 1.73 m is KITTI's. The legged robot's gait of 2 Hz and its amplitudes are those of a trotting quadruped of
+# 30 to 50 kg, the pedestrian's of a LiDAR on a hand-held stick; both are round figures, not measurements.
+_TABLE = (
+    Carrier("car", 12.0, 1.8, 2.4, 45.0, 60.0, 135.0, 1.0, 1.3, 1.73, smoothing_s=0.5, sway=_SUSPENSION),
+    Carrier(
+        "handheld", 1.3, 0.8, 1.0, 80.0, 200.0, 135.0, 0.3, 0.4, 1.5, smoothing_s=0.3, leans_with_ground=False,
+        sway=(
+            Swing("z", 0.02, 1.8, stepwise=True), Swing("y", 0.02, 0.9, stepwise=True),
+            Swing("pitch", 1.5, 1.8, stepwise=True), Swing("roll", 1.5, 0.9, stepwise=True),
+            Swing("yaw", 8.0, 0.23), Swing("pitch", 4.0, 0.31), Swing("roll", 3.0, 0.37), Swing("y", 0.06, 0.13),
+        ),
+    ),
+    Carrier(
+        "legged", 1.1, 0.8, 0.8, 70.0, 200.0, 135.0, 0.35, 0.5, 0.75, smoothing_s=0.3,
+        sway=(
+            Swing("z", 0.02, 2.0, stepwise=True), Swing("y", 0.015, 2.0, stepwise=True),
+            Swing("roll", 2.5, 2.0, stepwise=True), Swing("pitch", 1.8, 2.0, stepwise=True),
+            Swing("yaw", 1.0, 2.0, stepwise=True), Swing("y", 0.05, 0.11),
+        ),
+    ),
+    Carrier("tracked", 1.2, 0.8, 1.0, 120.0, 500.0, 10.0, 0.35, 0.4, 0.6, smoothing_s=0.06, sway=_RUMBLE),
+    Carrier(
+        "tracked-harsh", 1.2, 0.8, 1.0, 180.0, 900.0, 10.0, 0.35, 0.4, 0.6, smoothing_s=0.06,
+        swings_deg=(90.0, -90.0), sway=_RUMBLE,
+    ),
+    Carrier(
+        "drone", 2.5, 1.5, 1.5, 60.0, 150.0, 135.0, 0.4, 1.5, 0.0, smoothing_s=0.4, leans_with_ground=False,
+        banks=True, flight_height_m=2.0,
+        sway=(
+            Swing("z", 0.25, 0.09), Swing("y", 0.08, 0.17), Swing("x", 0.03, 0.29), Swing("yaw", 3.0, 0.13),
+            Swing("roll", 0.6, 0.9), Swing("pitch", 0.6, 0.8),
+        ),
+    ),
+    Carrier(
+        "car-fast", 20.0, 2.5, 3.5, 45.0, 60.0, 135.0, 1.0, 1.3, 1.73, smoothing_s=0.5, keeps_going=True,
+        sway=_SUSPENSION,
+    ),
+    # Accelerations of 3.3 m/s^2 take a bank of 18.6 degrees; with the sway it is 20.
+    Carrier(
+        "drone-agile", 7.0, 3.3, 3.3, 140.0, 500.0, 135.0, 0.4, 1.5, 0.0, smoothing_s=0.3, leans_with_ground=False,
+        banks=True, flight_height_m=2.0,
+        sway=(
+            Swing("z", 0.25, 0.17), Swing("y", 0.08, 0.23), Swing("yaw", 4.0, 0.21),
+            Swing("roll", 0.8, 1.1), Swing("pitch", 0.8, 0.9),
+        ),
+    ),
+)  # fmt: skip
+CARRIERS: dict[str, Carrier] = {carrier.name: carrier for carrier in _TABLE}
+
+# Rotations of the LiDAR on the body: rotation vectors, degrees. Tilted: looking down to the front and a little aside.
+MOUNTS: dict[str, tuple[float, float, float]] = {
+    "upright": (0.0, 0.0, 0.0),
+    "upside-down": (180.0, 0.0, 0.0),
+    "tilted": (6.0, 25.0, 0.0),
+}
+
+
+def find_carrier(name: str) -> Carrier:
+    """The carrier of that name."""
+    return choose("motion", name, CARRIERS)
+
+
+def mount_pose(name: str, height_m: float) -> FloatArray:
+    """T_body_lidar (4, 4) of a LiDAR mounted so, that far above the body's origin."""
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_rotvec(np.deg2rad(choose("mount", name, MOUNTS))).as_matrix()
+    return make_transform(R, [0.0, 0.0, height_m])
+
+
+_SAMPLES = 24
+_BLOCK = 4096
+
+
+class Ground(NamedTuple):
+    """Planes that fit the ground under footprints."""
+
+    height: FloatArray  # (N,) z at the footprint's middle
+    slope: FloatArray  # (N, 2) rise for each metre in x and y
+
+    def pitch_and_roll(self, yaw: FloatArray, rise: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Pitch and roll (N,) of a body of that yaw (N,) on the planes, which rise by `rise` more for each metre."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        pitch = -np.arctan(c * self.slope[:, 0] + s * self.slope[:, 1] + rise)
+        return pitch, np.arctan(c * self.slope[:, 1] - s * self.slope[:, 0])
+
+
+def ground_under(world: World, xy: FloatArray, radius_m: float) -> Ground:
+    """Fit planes to the ground within a radius of (N, 2) positions, by weighted least squares.
+
+    Samples are spread over the disc like the seeds of a sunflower, with weights that vanish at its rim: triangle edges
+    pass gently under the body.
+    """
+    k = np.arange(_SAMPLES) + 0.5
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    disc = np.sqrt(k / _SAMPLES)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    weights = (1.0 - (disc**2).sum(axis=1)) ** 2
+    weights /= weights.sum()
+    offsets = radius_m * disc
+    offsets -= weights @ offsets
+    fit = np.linalg.solve(offsets.T @ (weights[:, None] * offsets), (weights[:, None] * offsets).T)
+    heights = np.empty((len(xy), _SAMPLES))
+    for start in range(0, len(xy), _BLOCK):
+        samples = xy[start : start + _BLOCK, None] + offsets
+        heights[start : start + _BLOCK] = world.ground_at(samples.reshape(-1, 2)).reshape(-1, _SAMPLES)
+    return Ground(heights @ weights, heights @ fit.T)
+
+
+_STEEPEST_DEG = 80.0
+_FEWEST_TO_SMOOTH = 5
+
+
+def motion_along(
+    trajectory: Trajectory, world: World | None, on_ground: bool = True, carrier: str = "car", smoothing_s: float = 0.0
+) -> Motion:
+    """Follow a trajectory in its own time, on smooth splines; after the last pose the body stays where it is.
+
+    The trajectory's world frame is the world's; the world has to be made around it (`worlds.street.along`), or the
+    path be checked (`path_clearance`).
+
+    Args:
+        trajectory: poses of a frame with x forwards and z up.
+        world: gives the ground, if the motion is on it.
+        on_ground: take position and heading from the trajectory, height, roll and pitch from the ground under the
+            carrier; else take the poses as they are, for what flies or is carried.
+        carrier: whose footprint and sensor height are meant when on the ground.
+        smoothing_s: time within which the trajectory's noise is evened out: centimetres of a GPS receiver at 10 Hz
+            are accelerations that no car survives, which 0.25 s removes. 0 goes through every pose.
+
+    Raises:
+        InputError: the trajectory has fewer than two poses, points straight up or down, or on the ground moves along
+            its own z axis, as cameras' trajectories do.
+    """
+    if len(trajectory) < 2:
+        raise InputError(f"a motion needs two poses or more, the trajectory has {len(trajectory)}")
+    angles = Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_euler("ZYX")
+    if np.abs(angles[:, 1]).max() > np.deg2rad(_STEEPEST_DEG):
+        raise InputError(f"a motion cannot look up or down by more than {_STEEPEST_DEG:g} degrees; the trajectory does")
+    steps = np.abs(trajectory.relative_motions()[:, :3, 3]).sum(axis=0)
+    if on_ground and steps[2] > steps[0]:
+        raise InputError("the trajectory moves along its z axis, not along x; is it in the frame of a camera?")
+    times = trajectory.stamps - trajectory.stamps[0]
+    xyz = _smoothed(times, trajectory.positions, smoothing_s)
+    yaw, pitch, roll = _smoothed(times, np.unwrap(angles, axis=0), smoothing_s).T
+    height = 0.0
+    if on_ground and world is not None:
+        body = find_carrier(carrier)
+        height = body.sensor_height_m
+        ground = ground_under(world, xyz[:, :2], body.footprint_m)
+        pitch, roll = ground.pitch_and_roll(yaw)
+        xyz = np.column_stack([xyz[:, :2], ground.height])
+    base = np.column_stack([xyz, roll, pitch, yaw, np.zeros(len(xyz))])
+    return Motion("given", times, base, Sway(), height, repeats=False)
+
+
+def _smoothed(times: FloatArray, values: FloatArray, smoothing_s: float) -> FloatArray:
+    """Values (N, D) of the smoothing spline that follows what lasts longer."""
+    if smoothing_s <= 0.0 or len(times) < _FEWEST_TO_SMOOTH:
+        return values
+    # Of the smoothing spline's balance, lam * integral(f''^2), the response to a frequency w is 1 / (1 + lam dt w^4).
+    balance = smoothing_s**4 / float(np.median(np.diff(times)))
+    return np.column_stack([make_smoothing_spline(times, column, lam=balance)(times) for column in values.T])

@@ -1,0 +1,466 @@
+"""One recording on disk: the scans in files of a format, the exact trajectory, the exact map, a README."""
+
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.pose_text import read_kitti_poses
+from lidarslam.core.tasks.start import open_tasks
+from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, small_length
+from lidarslam.core.text.trajectory_io import read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.formats import FORMATS, find_format
+from lidarslam.simulation.mesh import world_mesh
+from lidarslam.simulation.motion import Carrier, Motion, find_carrier, motion_along, mount_pose
+from lidarslam.simulation.recorder import SimulatedScan, Simulation
+from lidarslam.simulation.reference_map import KeyArray, ReferenceMap, SeenSurfaces, sample_seen
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import Sensor, find_sensor
+from lidarslam.simulation.world import World, build_world
+from lidarslam.simulation.worlds.along import build_along
+from lidarslam.simulation.writers import Rig, as_records, clock_s, write_ply
+
+
+@dataclass(frozen=True)
+class RecordRequest:
+    """A recording to be made; the same request gives the same bytes."""
+
+    out: Path  # the folder it becomes
+    world: str  # names in their registries
+    sensor: str
+    motion: str
+    mount: str
+    scans: int | None  # None: 300, or as many as the trajectory lasts
+    seed: int  # of the world, the motion and the noise
+    format: str
+    trajectory: Path | None = None  # TUM or KITTI file that `motion` moves along instead of the world's route
+    speed_mps: float | None = None  # where no bend slows it down, instead of the carrier's own and the route's limit
+    imu: bool = False  # whether an IMU is recorded too
+    overwrite: bool = False  # whether an earlier recording in `out` is replaced
+    where: Where = SERIAL  # whether scans are made one after another or side by side
+
+    @property
+    def moved(self) -> str:
+        """The carrier, and its way or speed where it is not the usual one."""
+        if self.trajectory is not None:
+            return f"{self.motion} along {self.trajectory.name}"
+        return self.motion + (f" at {self.speed_mps:g} m/s" if self.speed_mps is not None else "")
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """A recording that was made."""
+
+    source: Path  # the argument for `lidarslam run`
+    rate_hz: float  # of the sensor, sweeps a second
+    scans: int
+    points_per_scan: int  # mean
+    duration_s: float  # from the first stamp to the last
+    length_m: float
+    map_points: int
+    map_spacing_m: float  # between the points of the reference map
+    size_mb: float  # of the whole folder
+
+
+README = "README.md"
+GROUND_TRUTH = "ground_truth.tum"  # where every reader of recordings without a layout of their own looks for it
+REFERENCE_MAP = "map.ply"  # no digit in the name, or the reader of scan folders would take it for a scan
+MADE_BY = "Made by `lidarslam simulate`"
+
+_FILES = (README, GROUND_TRUTH, REFERENCE_MAP, *{name for row in FORMATS.values() for name in row.files})
+
+
+@contextlib.contextmanager
+def new_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
+    """A path to make a folder at; it becomes `out` when the block ends without an error, else nothing is left of it.
+
+    Its last part is that of `out`, as formats name files after their folder. With `overwrite` an earlier simulated
+    recording is replaced, but nothing that holds other files too.
+
+    Raises:
+        OutputError: there is something already, or it cannot be written.
+    """
+    out = out.resolve()
+    try:
+        _refuse_to_replace(out, overwrite)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        # Beside its final place, so that renaming is enough; hidden, so that a killed process leaves nothing to find.
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as workplace:
+            folder = Path(workplace) / out.name
+            yield folder
+            _refuse_to_replace(out, overwrite)
+            if out.exists():
+                out.rename(Path(workplace) / "earlier")
+            folder.rename(out)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+
+
+def _refuse_to_replace(out: Path, overwrite: bool) -> None:
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out}: a file is in the way; name another folder")
+    names = sorted(entry.name for entry in out.iterdir()) if out.exists() else []
+    if not names:
+        return
+    readme = out / README
+    if not readme.is_file() or MADE_BY not in readme.read_text(encoding="utf-8", errors="replace"):
+        raise OutputError(f"{out}: holds other files ({_listing(names)}); name another folder")
+    if not overwrite:
+        raise OutputError(f"{out}: holds a recording already; name another folder, or replace it with --overwrite")
+    others = [name for name in names if not any(fnmatchcase(name, pattern) for pattern in _FILES)]
+    if others:
+        raise OutputError(f"{out}: holds more than a simulated recording ({_listing(others)}); move that away first")
+
+
+def _listing(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+_README = """\
+# Simulated recording: {world}, {sensor}
+
+{made_by} (version {version}); the same command makes the same recording again:
+
+    {simulate}
+
+| | |
+|---|---|
+| world | {world}, seed {seed} |
+| sensor | {sensor}, {rate_hz:g} Hz |
+| mounted | {mount} |
+| moved | {moved} |
+| scans | {scans:,} in {duration_s:.1f} s, {length_m:.1f} m |
+| points | {points_per_scan:,} a scan |
+
+## Files
+
+- **The scans** are in {layout}.
+{imu}- **{ground_truth}**: the exact pose of the sensor at each scan's stamp, T_world_lidar, as
+  `stamp tx ty tz qx qy qz qw`.
+- **{reference_map}**: {map_points:,} points with normals, exact, on the surfaces that the sensor saw, about
+  {spacing} apart, in the same world frame; nothing that moves is in it.
+
+## Frames and times
+
+- **world**: z is up; the trajectory need not begin at the origin.
+- **lidar**: the frame of the points; x forward, y to the left, z up as the sensor is built.
+- A scan is one sweep, and its **stamp** is the sweep's start. The sensor moves during the sweep: every ray is cast
+  from the pose at its own time.
+
+## Use
+
+    {info}
+    {run}
+
+`run` finds the ground truth by itself and writes the errors to metrics.json.
+"""
+
+_IMU = """\
+- **The IMU** is a MEMS unit of 200 Hz on the LiDAR, with noise and walking biases;
+  {where}.
+"""
+
+
+def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
+    """The README as Markdown."""
+    return _README.format(
+        **vars(request) | vars(summary) | {"imu": _imu(request)},
+        made_by=MADE_BY,
+        version=version("lidarslam"),
+        simulate=_simulate_command(request, summary),
+        moved=request.moved,
+        layout=find_format(request.format).layout,
+        ground_truth=GROUND_TRUTH,
+        reference_map=REFERENCE_MAP,
+        spacing=small_length(summary.map_spacing_m),
+        info=command_line("lidarslam", "info", str(summary.source)),
+        run=_run_command(summary),
+    )
+
+
+def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
+    """The last lines of `lidarslam simulate`."""
+    how = f"{request.mount}, {request.moved}"
+    lines = (
+        f"{count(summary.scans, 'scan')} of a {request.sensor} ({how}) in {request.world}, seed {request.seed}",
+        f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points per scan,"
+        f" reference map of {summary.map_points:,} points",
+        f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what",
+        f"next: {_run_command(summary, as_typed('lidarslam'))}",
+    )
+    return joined(lines)
+
+
+def _imu(request: RecordRequest) -> str:
+    return _IMU.format(where=find_format(request.format).imu) if request.imu else ""
+
+
+def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
+    """The command that makes the same recording again."""
+    words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
+    words += ["--trajectory", str(request.trajectory)] if request.trajectory is not None else []
+    words += ["--motion", request.motion]
+    words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
+    words += ["--mount", request.mount, "--scans", str(summary.scans), "--seed", str(request.seed)]
+    words += ["--imu"] if request.imu else []
+    return command_line(*words, "--format", request.format)
+
+
+def _run_command(summary: RecordingSummary, program: str = "lidarslam") -> str:
+    return command_line(program, "run", str(summary.source))
+
+
+_TIME_STEP_S = 0.02
+_LOWEST_M = 0.3  # kerbs and bumps under a carrier are not in its way
+
+
+def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None:
+    """Refuse a trajectory on which the carrier's body meets a static surface, from the first scan to the last.
+
+    The body is a ball of the carrier's half width round the sensor; on the ground, one above the wheels as well.
+
+    Args:
+        simulation: whose motion follows the trajectory.
+        carrier: moves along it.
+        name: of the trajectory, for the message.
+
+    Raises:
+        InputError: the way leads through something solid or off the world's ground; says where and when.
+    """
+    world = simulation.world
+    times = np.arange(0.0, simulation.scan_count / simulation.sensor.rate_hz + _TIME_STEP_S, _TIME_STEP_S)
+    positions = simulation.motion.pose_at(times)[:, :3, 3]
+    on_ground = [carrier.half_width_m + _LOWEST_M, carrier.sensor_height_m]
+    is_blocked = np.zeros(len(times), dtype=bool)
+    for height in on_ground if carrier.leans_with_ground else [0.0]:
+        body = positions + np.array([0.0, 0.0, height])
+        is_blocked |= simulation.distance_to_surfaces(body) < carrier.half_width_m
+        # A surface cannot be crossed without coming near it, so that only the start can be deep inside something.
+        is_blocked[0] |= is_inside(world, body[0])
+    for refused, whither in (
+        (is_blocked, "through something solid"),
+        (_is_off_ground(world, positions), "off the ground"),
+    ):
+        if refused.any():
+            x, y, z = positions[refused.argmax()]
+            raise InputError(
+                f"{name}: leads {whither} in {world.name}, seed {world.seed}, at x {x:.1f}, y {y:.1f}, z {z:.1f} m,"
+                f" {times[refused.argmax()]:.1f} s after its start; only --world street is built around a trajectory"
+            )
+
+
+def is_inside(world: World, point: FloatArray) -> bool:
+    """Whether a point (3,) is inside a box or a cylinder, under the ground, or above the ceiling of a tunnel."""
+    boxes, cylinders = world.boxes, world.cylinders
+    local = np.einsum("nji,nj->ni", boxes.R_world_box, point - boxes.centres)
+    in_box = (np.abs(local) < boxes.half_sizes).all(axis=1).any()
+    axis = cylinders.ends - cylinders.starts
+    along = np.einsum("ni,ni->n", point - cylinders.starts, axis) / np.einsum("ni,ni->n", axis, axis)
+    aside = np.linalg.norm(point - cylinders.starts - along[:, None] * axis, axis=1)
+    in_cylinder = ((along > 0.0) & (along < 1.0) & (aside < cylinders.radii)).any()
+    levels = [float(field.height_at(point[None, :2])[0]) for field in world.height_fields]
+    is_in_rock = bool(levels) and (point[2] < levels[0] or any(point[2] > level for level in levels[1:]))
+    return bool(in_box or in_cylinder or is_in_rock)
+
+
+def _is_off_ground(world: World, positions: FloatArray) -> NDArray[np.bool_]:
+    if not world.height_fields:
+        return np.zeros(len(positions), dtype=bool)
+    ground = world.height_fields[0]
+    far = ground.origin_xy + ground.cell_m * (np.array(ground.heights.shape) - 1.0)
+    return np.asarray(((positions[:, :2] < ground.origin_xy) | (positions[:, :2] > far)).any(axis=1))
+
+
+_SCANS = 300
+_KITTI_RATE_HZ = 10.0
+# KITTI's poses jump by centimetres, as the GPS behind them did: at 10 Hz more than a car's acceleration.
+_KITTI_SMOOTHING_S = 0.25
+_KITTI_COLUMNS = 12
+_PATH_STEP_S = 0.05
+# KITTI's pose files are in the frame of a camera: x to the right, y down, z forward.
+_T_CAM_BODY = make_transform([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], np.zeros(3))
+
+
+def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[Motion, int]:
+    """The motion and the number of scans: as many as asked for, else 300 or as long as the trajectory lasts.
+
+    Carriers that lean with the ground follow a trajectory on the ground, the others take its poses as they are.
+
+    Raises:
+        InputError: there is no such carrier, it cannot go along the route, or the trajectory cannot be followed, is too
+            short, or comes with a speed.
+    """
+    if request.trajectory is None:
+        motion = motion_along_route(request.motion, world, request.seed, request.speed_mps)
+        return motion, request.scans or _SCANS
+    if request.speed_mps is not None:
+        raise InputError(f"{request.trajectory}: a trajectory has its own speed; leave out --speed")
+    trajectory = read_trajectory(request.trajectory)
+    motion = _along(request.trajectory, trajectory, world, find_carrier(request.motion))
+    most = int(trajectory.duration_s * sensor.rate_hz + 1e-6)  # the last sweep has to end before the trajectory does
+    if not 1 <= (request.scans or most) <= most:
+        raise InputError(
+            f"{request.trajectory}: lasts {trajectory.duration_s:.1f} s, enough for {most} scans of a {sensor.name},"
+            f" got --scans {request.scans or 1}"
+        )
+    return motion, request.scans or most
+
+
+def _along(path: Path, trajectory: Trajectory, world: World | None, carrier: Carrier) -> Motion:
+    on_ground = carrier.leans_with_ground and world is not None
+    return motion_along(trajectory, world, on_ground, carrier.name, _KITTI_SMOOTHING_S if _is_kitti(path) else 0.0)
+
+
+def given_path(path: Path, motion: str) -> FloatArray:
+    """Way of a carrier along a trajectory: (N, 2), or for carriers that do not follow the ground (N, 3).
+
+    The third column is the height of the ground that fits the trajectory: as far below it as the carrier holds or
+    flies the sensor. Raises InputError as `plan_motion` does.
+    """
+    trajectory, carrier = read_trajectory(path), find_carrier(motion)
+    given = _along(path, trajectory, None, carrier)
+    steps = max(1, int(np.ceil(given.duration_s / _PATH_STEP_S)))
+    positions = given.pose_at(np.linspace(0.0, given.duration_s, steps + 1))[:, :3, 3]
+    if carrier.leans_with_ground:
+        return np.asarray(positions[:, :2])
+    return positions - [0.0, 0.0, carrier.sensor_height_m + carrier.flight_height_m]
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """A TUM file, or a KITTI pose file with the poses of a camera at 10 Hz; x forwards, z up.
+
+    Raises:
+        InputError: it is neither.
+    """
+    if not _is_kitti(path):
+        return read_tum(path)
+    T_cam0_cam = read_kitti_poses(path)
+    stamps = np.arange(len(T_cam0_cam)) / _KITTI_RATE_HZ
+    return Trajectory(stamps, inverse(_T_CAM_BODY) @ T_cam0_cam @ _T_CAM_BODY)
+
+
+def _is_kitti(path: Path) -> bool:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from error
+    words = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
+    return next((len(found) for found in words if found), 0) == _KITTI_COLUMNS
+
+
+# Scans of a task.
+_CHUNK = 10
+
+
+def make_simulation(request: RecordRequest) -> Simulation:
+    """The simulation that was asked for; a street is built along the trajectory, if there is one."""
+    sensor = find_sensor(request.sensor)
+    if request.world == "street" and request.trajectory is not None:
+        world = build_along(given_path(request.trajectory, request.motion), request.seed)
+    else:
+        world = build_world(request.world, request.seed)
+    motion, scans = plan_motion(request, world, sensor)
+    T_body_lidar = mount_pose(request.mount, motion.sensor_height_m)
+    simulation = Simulation(world, sensor, motion, T_body_lidar, scans, request.seed)
+    if request.trajectory is not None:
+        check_clearance(simulation, find_carrier(request.motion), str(request.trajectory))
+    return simulation
+
+
+def make_scans(request: RecordRequest, simulation: Simulation, seen: SeenSurfaces) -> Iterator[SimulatedScan]:
+    """The scans of a simulation of the request, in order; the surfaces they saw are added."""
+    if request.where.is_serial:
+        for index in range(len(simulation)):
+            yield _sweep(simulation, index, seen)
+        return
+    alone, count = replace(request, where=SERIAL), len(simulation)
+    chunks = [(alone, range(first, min(first + _CHUNK, count))) for first in range(0, count, _CHUNK)]
+    with open_tasks(request.where) as tasks:
+        for made, keys in tasks.run(_chunk, chunks, ahead=2 * tasks.slots):
+            seen.add_keys(keys)
+            yield from made
+
+
+def _sweep(simulation: Simulation, index: int, seen: SeenSurfaces) -> SimulatedScan:
+    echoes = simulation.echoes(index)
+    seen.add_sweep(echoes, simulation.sensor.ranging.min_range_m)
+    return simulation.scan(index, echoes)
+
+
+def _chunk(task: tuple[RecordRequest, range]) -> tuple[list[SimulatedScan], KeyArray]:
+    """Some scans, as far as they are written, and the keys of what they saw."""
+    request, indices = task
+    simulation, seen = _simulation_of_process(request), SeenSurfaces()
+    made = [replace(_sweep(simulation, index, seen), true_ranges=None, moving=None) for index in indices]
+    return made, seen.keys()
+
+
+@lru_cache(maxsize=1)
+def _simulation_of_process(request: RecordRequest) -> Simulation:
+    """Built once in each process."""
+    return make_simulation(request)
+
+
+Progress = Callable[[int, int], None]
+"""Called after every scan with its number from 1 and how many there will be."""
+
+
+def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
+    """Make the recording's folder; it appears when everything in it is complete.
+
+    Raises:
+        InputError: no world, sensor, motion, mount or format has that name, the format holds no IMU, or the
+            trajectory cannot be followed or leads through something solid.
+        OutputError: the folder holds something already, or cannot be written.
+    """
+    chosen = find_format(request.format)
+    if request.imu and not chosen.imu:
+        raise InputError(f"the format {request.format} has no place for an IMU; choose another, or leave out --imu")
+    with new_folder(request.out, request.overwrite) as folder:
+        simulation = make_simulation(request)
+        sensor, spacing_m = simulation.sensor, simulation.world.map_spacing_m
+        seen = SeenSurfaces()
+        counts: list[int] = []
+
+        def scans() -> Iterator[SimulatedScan]:
+            for simulated in make_scans(request, simulation, seen):
+                counts.append(len(simulated.scan))
+                yield simulated
+                progress(len(counts), len(simulation))
+
+        imu = simulation.imu if request.imu else None
+        chosen.write(folder, scans(), Rig(sensor.driver, sensor.period_s, simulation.T_world_lidar_at, imu))
+        truth = simulation.ground_truth
+        stamps = np.array([clock_s(stamp, chosen.clock_start_ns) for stamp in truth.stamps])
+        write_tum(folder / GROUND_TRUTH, Trajectory(stamps, truth.T_world_lidar))
+        true_map = sample_seen(world_mesh(simulation.world), seen, spacing_m)
+        _write_map(folder / REFERENCE_MAP, true_map)
+        summary = RecordingSummary(
+            source=chosen.source_in(request.out),
+            rate_hz=sensor.rate_hz,
+            scans=len(simulation),
+            points_per_scan=sum(counts) // len(simulation),
+            duration_s=truth.duration_s,
+            length_m=truth.length_m,
+            map_points=len(true_map.points),
+            map_spacing_m=spacing_m,
+            size_mb=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6,
+        )
+        (folder / README).write_text(format_readme(request, summary), encoding="utf-8")
+    return summary
+
+
+def _write_map(path: Path, true_map: ReferenceMap) -> None:
+    columns = zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack(true_map).T, strict=True)
+    write_ply(path, as_records({name: ("<f4", values) for name, values in columns}))

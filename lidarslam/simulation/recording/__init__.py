@@ -1,1 +1,0 @@
-"""Recording a simulated sensor."""

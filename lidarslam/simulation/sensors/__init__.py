@@ -1,1 +1,0 @@
-"""LiDAR models: scan patterns and noise."""

@@ -1,0 +1,256 @@
+"""A street along a given path, such as one that a car drove with a real LiDAR: as long as it takes, nothing in the way.
+
+Everything keeps its distance from all of the path, so also from where it crosses itself, comes back or turns round.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.world import HeightField, Mover, Route, World
+from lidarslam.simulation.worlds import outdoor
+from lidarslam.simulation.worlds.building import Builder, heading, left_of, smooth_noise
+from lidarslam.simulation.worlds.houses import house
+from lidarslam.simulation.worlds.outdoor import on_slope, upright
+from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along, prune
+from lidarslam.simulation.worlds.street import (
+    KERB_WIDTH_M,
+    RISE_M,
+    STONE_M,
+    furnish_pavement,
+    house_pose,
+    lay_kerbs,
+    pave,
+)
+
+_STEP_M = 0.5
+# The road goes on straight for this long before the path and behind it.
+_BEYOND_M = 12.0
+# Directions are averaged over this length: a path has jitter, and a row of houses none.
+_SMOOTH_M = 3.0
+HALF_WIDTH_M = 5.0
+FREE_SIDE_M = 2.5
+_FRONT_M = HALF_WIDTH_M + 3.8
+_CAR_M = (5.4, 2.0)
+_MARGIN_M = 45.0
+# Above this the ground's grid becomes wider, so that a path of kilometres takes no more memory than this.
+_MOST_GROUND_POINTS = 600_000
+_LONGEST_SIDE_M = 5_000.0
+# A longer street has plainer houses and fewer things, so that the number of primitives grows slowly.
+_FULL_M = 700.0
+
+
+def build_along(path: FloatArray, seed: int, fullness: float | None = None) -> World:
+    """A street with the path in its middle; within `FREE_SIDE_M` of the path, at any height, there is only the road.
+
+    The route goes along the path and back.
+
+    Args:
+        path: (N, 2) polyline, or (N, 3) with the height of the ground; else the ground is gently hilly.
+        seed: of everything that the path leaves open.
+        fullness: share of houses with ornaments, and of kerbs with cars and trees; None: less the longer the path.
+
+    Raises:
+        InputError: the path is shorter than 1 m, or extends over more than 5 km.
+    """
+    extent = np.ptp(path[:, :2], axis=0)
+    length = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()
+    if length < 1.0 or extent.max() > _LONGEST_SIDE_M:
+        raise InputError(
+            f"a street is made along 1 m or more and within {_LONGEST_SIDE_M / 1e3:g} km; the path is {length:.1f} m"
+            f" long within {extent.max():.1f} m"
+        )
+    rng = np.random.default_rng(seed)
+    course = Course.along(path)
+    ground = _ground(rng, course)
+    there = course.points[:: round(2.0 / _STEP_M), :2]
+    route = Route(on_ground(np.concatenate([there, there[-2:0:-1]]), ground), 2.0, FREE_SIDE_M, 4.0, 11.0)
+    fullness = min(1.0, _FULL_M / course.length_m) if fullness is None else fullness
+    taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
+    rows = _Rows(rng, course, ground, fullness, taken)
+    rows.build(replace(route, free_height_m=1e3))
+    return World("street", seed, route, *rows.solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """An open path, as points half a metre apart."""
+
+    points: FloatArray  # (N, 2) or (N, 3)
+
+    @classmethod
+    def along(cls, path: FloatArray) -> "Course":
+        """The course of a polyline (M, 2) or (M, 3), at least one metre long, longer than it at either end."""
+        at = lengths_along(path[:, :2])
+        points = points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / _STEP_M)) + 1)))
+        first, last = (np.append(-left_of(left), np.zeros(path.shape[1] - 2)) for left in cls(points).lefts[[0, -1]])
+        ahead = _STEP_M * np.arange(1, int(_BEYOND_M / _STEP_M) + 1)[:, None]
+        return cls(np.concatenate([points[0] - ahead[::-1] * first, points, points[-1] + ahead * last]))
+
+    @property
+    def length_m(self) -> float:
+        """About how long it is."""
+        return _STEP_M * (len(self.points) - 1)
+
+    @cached_property
+    def lefts(self) -> FloatArray:
+        """(N, 2) unit, to the left of the way."""
+        smooth = gaussian_filter1d(self.points[:, :2], _SMOOTH_M / _STEP_M, axis=0, mode="nearest")
+        ahead = np.gradient(smooth, axis=0)
+        return left_of(ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9))
+
+    @cached_property
+    def tree(self) -> "cKDTree[None]":
+        """Of the points' x and y."""
+        return cKDTree(self.points[:, :2])
+
+    def sides(self) -> Iterator["Course"]:
+        """The course and its reverse: what is placed along the left of each is placed on both sides."""
+        yield self
+        yield Course(self.points[::-1])
+
+    def beside(self, at_m: FloatArray | float, left_m: float) -> FloatArray:
+        """Places (..., 2) to the left of the course, at lengths (...) along it."""
+        place = np.clip(np.asarray(at_m) / _STEP_M, 0, len(self.points) - 1).round().astype(int)
+        return np.asarray(self.points[place, :2] + left_m * self.lefts[place])
+
+    def distance(self, xy: FloatArray) -> FloatArray:
+        """Distance (M,) of points (M, 2) from the nearest part of the course."""
+        nearest = self.tree.query(xy)[0]
+        return np.asarray(np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0)))  # nearer between two points
+
+
+def _ground(rng: np.random.Generator, course: Course) -> HeightField:
+    low = np.floor(course.points[:, :2].min(axis=0) - _MARGIN_M)
+    high = course.points[:, :2].max(axis=0) + _MARGIN_M
+    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
+    distance, nearest = map(np.asarray, course.tree.query(grid_nodes(low, high, cell)))
+    if course.points.shape[1] == 3:
+        hills = gaussian_filter(course.points[nearest, 2], 6.0 / cell, mode="nearest")
+    else:
+        hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
+    return HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
+
+
+@dataclass
+class _Rows:
+    """Puts things beside a course, none on another, none near any part of the course."""
+
+    rng: np.random.Generator
+    course: Course
+    ground: HeightField
+    fullness: float
+    taken: NDArray[np.bool_]  # (X, Y) cells of one metre of the ground
+    solid: Builder = field(default_factory=Builder)
+    _loose: Builder = field(default_factory=Builder)  # may reach into the free space, and is pruned
+
+    def build(self, free: Route) -> None:
+        """Add everything; houses first, they need most room."""
+        for side in self.course.sides():
+            self._houses(side)
+        for side in self.course.sides():
+            self._cars(side)
+            self._pavement(side)
+        self.solid.place(prune(self._loose, free, margin_m=0.02), np.eye(4))
+        lay_kerbs(self.solid, self._kerb_stones(), self.ground)
+
+    def _claim(self, footprint: FloatArray, nearest_m: float) -> bool:
+        """Take the cells of points (M, 2) if they are free and keep that distance from the course; whether they did."""
+        x, y = np.floor(footprint - self.ground.origin_xy).astype(int).T
+        # Most are refused by their first point, which saves the search for all.
+        is_free = self.course.distance(footprint[:1])[0] >= nearest_m and not self.taken[x, y].any()
+        is_free = is_free and self.course.distance(footprint).min() >= nearest_m
+        self.taken[x, y] |= is_free
+        return bool(is_free)
+
+    def _houses(self, side: Course) -> None:
+        at = 0.0
+        while at < side.length_m:
+            wide, depth = self.rng.uniform(7.5, 15.0), self.rng.uniform(8.0, 11.0)
+            for width, setback in product((wide, 6.5), (0.0, 1.5, 3.5)):
+                start, end = side.beside(np.array([at, at + width]), _FRONT_M + setback)
+                front = float(np.linalg.norm(end - start))
+                if at + width > side.length_m or not 5.0 < front < 20.0:
+                    continue
+                along = (end - start) / front
+                # Fronts are straight where the road bends, and may come a metre closer.
+                if self._claim(_rectangle(start, along, front, depth), _FRONT_M - 1.0):
+                    self._house(start, along, front - 0.02, depth)
+                    at += width
+                    break
+            else:
+                at += 2.0
+
+    def _house(self, origin: FloatArray, along: FloatArray, width: float, depth: float) -> None:
+        """A house, or one time in eight a gap with a tree."""
+        if self.rng.random() < 0.12:
+            tree = outdoor.broadleaf(self.rng, self.rng.uniform(6.0, 9.0), 0.16, 24)
+            where = origin + 0.5 * width * along + 4.0 * left_of(along)
+            self._loose.place(tree, upright(self.ground, where, 0.0))
+            return
+        is_plain = bool(self.rng.random() > self.fullness)
+        part = house(self.rng, width, depth, (not is_plain, not is_plain), is_plain=is_plain)
+        self.solid.place(part, house_pose(self.ground, origin, along, width))
+
+    def _cars(self, side: Course) -> None:
+        taken = self.fullness * self.rng.uniform(0.45, 0.8)
+        for at in np.arange(4.0, side.length_m - 4.0, 6.0):
+            if self.rng.random() > taken:
+                continue
+            where = side.beside(at, HALF_WIDTH_M - 1.15 + self.rng.uniform(-0.08, 0.08))
+            ahead = -left_of(side.lefts[min(round(at / _STEP_M), len(side.points) - 1)])
+            footprint = _rectangle(where - 0.5 * (_CAR_M[0] * ahead + _CAR_M[1] * left_of(ahead)), ahead, *_CAR_M)
+            # Not on the pavement behind a bend, nor where another part of the path has its lane.
+            on_road = self.course.distance(footprint).max() <= HALF_WIDTH_M + 0.3
+            if on_road and self._claim(footprint, FREE_SIDE_M + 0.2):
+                yaw = heading(ahead) + np.pi * (self.rng.random() < 0.85)
+                self.solid.place(outdoor.car(self.rng), on_slope(self.ground, where, yaw, 3.0, 1.6))
+
+    def _pavement(self, side: Course) -> None:
+        for k, at in enumerate(np.arange(self.rng.uniform(1.0, 7.0), side.length_m, 8.0)):
+            where = side.beside(at, HALF_WIDTH_M + 0.9)
+            if self._claim(where[None], HALF_WIDTH_M + 0.7):
+                pose = upright(self.ground, where, heading(where - side.beside(at, HALF_WIDTH_M + 1.9)))
+                lamp_height = self.rng.uniform(5.0, 7.5) if k % 4 == 0 else 0.0
+                has_tree = bool(self.rng.random() < 0.45 * self.fullness)
+                furnish_pavement(self._loose, self._loose, self.rng, pose, lamp_height, has_tree)
+
+    def _kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Stones along the edges of the road, but not where another part of the path has its road."""
+        middle = HALF_WIDTH_M + RISE_M - 0.5 * KERB_WIDTH_M
+        laid: set[tuple[int, ...]] = set()
+        for side in self.course.sides():
+            for at in np.arange(0.0, side.length_m, STONE_M):
+                start, end = side.beside(np.array([at, at + STONE_M]), middle)
+                place = tuple(np.floor(0.5 * (start + end)).astype(int).tolist())
+                off = self.course.distance(np.stack([start, end, 0.5 * (start + end)]))
+                is_outside = (off > HALF_WIDTH_M + np.array([0.2, 0.2, -0.1])).all()
+                if is_outside and np.linalg.norm(end - start) > 0.5 and place not in laid:
+                    laid.add(place)
+                    yield start, end
+
+    def people(self) -> Iterator[Mover]:
+        """Pedestrians who walk up and down the pavement."""
+        rng = self.rng
+        for side in self.course.sides():
+            apart = max(40.0, side.length_m / 12.0)
+            for start in np.arange(rng.uniform(5.0, 20.0), side.length_m - 40.0, apart):
+                at = np.arange(start, start + rng.uniform(20.0, 35.0), 1.0)
+                there = side.beside(at, HALF_WIDTH_M + rng.uniform(1.9, 2.4))
+                if self._claim(there, HALF_WIDTH_M + 1.4):
+                    waypoints = on_ground(np.concatenate([there, there[-2:0:-1]]), self.ground)
+                    yield Mover(outdoor.pedestrian(rng).boxes, waypoints, rng.uniform(0.9, 1.5), 0.0)
+
+
+def _rectangle(origin: FloatArray, along: FloatArray, width: float, depth: float) -> FloatArray:
+    """Points (M, 2) all over a rectangle, less than a cell apart, from its corner (2,) along (2,) and to its left."""
+    x, y = (np.linspace(0.0, size, int(np.ceil(size / 0.7)) + 1) for size in (width, depth))
+    return np.asarray((origin + x[:, None, None] * along + y[:, None] * left_of(along)).reshape(-1, 2))

@@ -1,0 +1,107 @@
+"""A foyer full of people: some go along with the carrier, others stand or cross its way."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.simulation.world import Mover, Route, World
+from lidarslam.simulation.worlds import interior, outdoor, paths
+from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Spot, glazed_wall, left_of, rotation_z
+from lidarslam.simulation.worlds.interior import Furnisher, Room
+from lidarslam.simulation.worlds.office import draw_room_ceiling
+from lidarslam.simulation.worlds.paths import Clearance
+
+# The route's limit: every carrier that walks or drives keeps it, and so do those who go along.
+SPEED_MPS = 0.9
+COMPANIONS, STANDING, CROSSING = 15, 8, 7
+_ROUTE_FROM_WALLS_M, _FREE_SIDE_M, _FREE_HEIGHT_M = 5.2, 0.6, 2.2
+_CROWD_SIDE_M = 3.4  # how far from the route the people are; furniture is farther
+_LANES_M = (-2.1, -1.15, 1.15, 2.1)
+_SLOTS_M = np.arange(-6.0, 6.5, 1.6)  # ahead of the carrier
+_JITTER_M = 0.15
+# A carrier rests and then picks up speed, while those who go along are on the move: by so much they are ahead then.
+_HEAD_START_M = 1.9
+
+
+def build(seed: int) -> World:
+    """The foyer of that seed; the floor is at z = 0, and at the start of the first lap thirty people are near."""
+    rng = np.random.default_rng(seed)
+    room, height = Room(np.zeros(2), rng.uniform([26.0, 20.0], [32.0, 24.0])), rng.uniform(3.6, 5.0)
+    low, high = room.low + _ROUTE_FROM_WALLS_M, room.high - _ROUTE_FROM_WALLS_M
+    corners = np.array([[low[0], low[1], 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
+    route = Route(corners, 0.8, _FREE_SIDE_M, _FREE_HEIGHT_M, SPEED_MPS)
+    builder = Builder()
+    _draw_shell(room, height, builder, rng)
+    put = Furnisher(builder, Clearance(replace(route, free_side_m=_CROWD_SIDE_M + 0.4)), rng)
+    _furnish(room, height, put)
+    return World("crowd", seed, route, *builder.solids, movers=draw_people(route, rng))
+
+
+def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:
+    """Floor, ceiling with lamps, and walls with windows on two sides."""
+    low, high = room.low - OUTER_WALL_M, room.high + OUTER_WALL_M
+    for z in (-0.2, height):
+        builder.block((*low, z), (*high, z + 0.2))
+    draw_room_ceiling(room, height, builder, rng)
+    corners = [room.low, np.array([room.high[0], room.low[1]]), room.high, np.array([room.low[0], room.high[1]])]
+    for side, corner in enumerate(corners):
+        length = float((room.high - room.low)[side % 2])
+        wide = rng.uniform(1.6, 3.0)
+        places = np.arange(1.5, length - wide - 1.0, wide + 1.2)[: 20 * (side < 2)]
+        windows = [Opening((float(x), float(x) + wide), (0.8, height - 0.7)) for x in places]
+        spot = Spot(builder, np.append(corner, 0.0), 0.5 * np.pi * side)
+        glazed_wall(spot, (-OUTER_WALL_M, length + OUTER_WALL_M), height, windows)
+
+
+def _furnish(room: Room, height: float, put: Furnisher) -> None:
+    """Pillars and a counter first, then seats, tables, cabinets and plants."""
+    for _ in range(10):
+        put.at_wall(room, put.drawn((0.4, (0.15, 0.3), height)), interior.pilaster)
+    put.at_wall(room, (4.0, 0.7, 2.2), interior.counter)
+    for _ in range(4):
+        put.on_floor(room, (0.5, 0.5, height), interior.crate, tries=60)
+        put.on_floor(room, (0.9, 0.9, 0.8), interior.round_table, tries=60)
+    put.some(room, interior.sofa, (3, 6), ((1.3, 2.3), 0.9, 0.9))
+    put.some(room, interior.cabinet, (4, 8), ((0.6, 1.8), (0.3, 0.5), (0.8, 2.0)))
+    put.some(room, interior.plant, (4, 8), (0.75, 0.75, (0.8, 1.6)))
+    for _ in range(8):
+        put.at_wall(room, put.drawn(((0.6, 1.8), 0.04, 1.0)), interior.board, z=1.0)
+
+
+def draw_people(route: Route, rng: np.random.Generator) -> tuple[Mover, ...]:
+    """Those who go along, those who stand and those who cross, in this order.
+
+    Whoever goes along keeps beside the route. Whoever crosses it to and fro is at one end of the way when the carrier
+    comes by on its first lap.
+    """
+    loop = _from_start(route)
+    ahead = (loop[1] - loop[0]) / np.linalg.norm(loop[1] - loop[0])
+    slots = [(lane, slot) for lane in _LANES_M for slot in _SLOTS_M]
+    people = []
+    for k in rng.permutation(len(slots))[:COMPANIONS]:
+        lane, slot = np.array(slots[int(k)]) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
+        line = paths.offset_loop(loop, lane)
+        people.append(_person(rng, line, SPEED_MPS, slot - _HEAD_START_M))
+    for along in np.linspace(-6.0, 6.0, STANDING) + rng.uniform(-0.5, 0.5, STANDING):
+        where = loop[0] + along * ahead + rng.choice([-1.0, 1.0]) * rng.uniform(2.8, _CROWD_SIDE_M) * left_of(ahead)
+        people.append(_person(rng, where[None], 0.0, 0.0))
+    for along in np.linspace(3.0, 0.4 * np.linalg.norm(loop[1] - loop[-1]), CROSSING):
+        ends = loop[0] + along * ahead + np.outer(rng.permutation([-1.0, 1.0]), 3.0 * left_of(ahead))
+        speed = rng.uniform(0.9, 1.4)
+        people.append(_person(rng, ends, speed, -speed * (along + _HEAD_START_M) / SPEED_MPS))
+    return tuple(people)
+
+
+def _from_start(route: Route) -> FloatArray:
+    """The route (M, 2) from the middle of its first and longest leg, where a lap begins."""
+    xy = route.waypoints[:, :2]
+    return np.concatenate([[0.5 * (xy[0] + xy[1])], xy[1:], xy[:1]])
+
+
+def _person(rng: np.random.Generator, line: FloatArray, speed_mps: float, start_m: float) -> Mover:
+    """A pedestrian on a closed line (M, 2); one who stands looks anywhere."""
+    part = Builder()
+    yaw = 0.0 if speed_mps else rng.uniform(-np.pi, np.pi)
+    part.place(outdoor.pedestrian(rng), make_transform(rotation_z(yaw), np.zeros(3)))
+    return Mover(part.boxes, np.column_stack([line, np.zeros(len(line))]), speed_mps, start_m)

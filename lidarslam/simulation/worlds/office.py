@@ -1,0 +1,435 @@
+"""An office floor: corridors that close a loop around sharp corners, and rooms off them."""
+
+from dataclasses import dataclass, replace
+from itertools import combinations, groupby
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.world import Route, World
+from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Opening, Spot, heading, left_of
+from lidarslam.simulation.worlds.interior import (
+    KINDS,
+    WALL_M,
+    Furnisher,
+    Room,
+    furnish_corridor,
+    furnish_room,
+    radiator,
+)
+from lidarslam.simulation.worlds.paths import Clearance, loop_length
+
+CORRIDOR, OUTSIDE, _UNKNOWN = 0, -1, -2
+# The grid's columns and rows that can be corridors; the others are rooms. Nodes are where two of them cross.
+_COLUMNS, _ROWS = (1, 4, 7), (1, 3, 5)
+_LOOPS: tuple[tuple[tuple[int, int], ...], ...] = (
+    ((0, 0), (2, 0), (2, 2), (0, 2)),
+    ((0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)),
+    ((0, 0), (1, 0), (1, 2), (2, 2), (2, 1), (0, 1)),
+    ((0, 0), (2, 0), (2, 2), (1, 2), (1, 1), (0, 1)),
+)
+
+Labels = npt.NDArray[np.int64]
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class WallLine:
+    """A straight wall's middle line from a to b (2,), and the labels to its left and right, seen from a to b."""
+
+    a: FloatArray
+    b: FloatArray
+    left: int
+    right: int
+
+    @property
+    def length(self) -> float:
+        """Distance from a to b."""
+        return float(np.linalg.norm(self.b - self.a))
+
+    @property
+    def direction(self) -> FloatArray:
+        """(2,) unit vector from a to b."""
+        return np.asarray((self.b - self.a) / self.length)
+
+    @property
+    def to_left(self) -> FloatArray:
+        """(2,) unit vector to the left of the direction."""
+        return left_of(self.direction)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A floor plan."""
+
+    loop: FloatArray  # (M, 2) corners of the closed way along the middle of the corridors
+    corridors: tuple[Room, ...]  # overlapping where they cross
+    rooms: dict[int, Room]  # by label
+    walls: tuple[WallLine, ...]  # every wall once
+    extent: FloatArray  # (2, 2) low and high corner of all
+
+
+def draw_plan(rng: np.random.Generator) -> Plan:
+    """A plan no two seeds share."""
+    xs = _grid_lines(rng, "rcrrcrrcr", (2.7, 3.6))
+    ys = _grid_lines(rng, "rcrcrcr", (3.3, 4.3))
+    nodes = _loop_nodes(rng)
+    labels = np.full((9, 7), _UNKNOWN)
+    spans = _corridor_spans(nodes, rng)
+    for (i0, i1), (j0, j1) in spans:
+        labels[i0:i1, j0:j1] = CORRIDOR
+    _label_rooms(labels, rng)
+
+    def between(columns: Span, rows: Span) -> Room:
+        return Room(np.array([xs[columns[0]], ys[rows[0]]]), np.array([xs[columns[1]], ys[rows[1]]]))
+
+    cells = [between((_COLUMNS[i], _COLUMNS[i] + 1), (_ROWS[j], _ROWS[j] + 1)) for i, j in nodes]
+    rooms = {}
+    for label in range(1, int(labels.max()) + 1):
+        i, j = np.nonzero(labels == label)
+        if len(i):
+            rooms[label] = between((i.min(), i.max() + 1), (j.min(), j.max() + 1))
+    return Plan(
+        loop=np.array([0.5 * (cell.low + cell.high) for cell in cells]),
+        corridors=tuple(between(*span) for span in spans),
+        rooms=rooms,
+        walls=_walls(xs, ys, labels),
+        extent=np.array([[xs[0], ys[0]], [xs[-1], ys[-1]]]),
+    )
+
+
+def _grid_lines(rng: np.random.Generator, kinds: str, block_m: tuple[float, float]) -> FloatArray:
+    """Grid lines from the kinds of space between them: (r)oom or (c)orridor; the outer rooms are deeper."""
+    sizes = [rng.uniform(1.6, 2.4) if kind == "c" else rng.uniform(*block_m) for kind in kinds]
+    sizes[0], sizes[-1] = rng.uniform(3.6, 5.2, 2)
+    return np.concatenate([[0.0], np.cumsum(sizes)])
+
+
+def _loop_nodes(rng: np.random.Generator) -> list[tuple[int, int]]:
+    """One of the loops, mirrored and turned round."""
+    nodes = list(_LOOPS[int(rng.integers(len(_LOOPS)))])
+    mirror_i, mirror_j, backwards = rng.random(3) < 0.5
+    nodes = [(2 - i if mirror_i else i, 2 - j if mirror_j else j) for i, j in nodes]
+    return nodes[::-1] if backwards else nodes
+
+
+def _corridor_spans(nodes: list[tuple[int, int]], rng: np.random.Generator) -> list[tuple[Span, Span]]:
+    """Cell ranges ((i0, i1), (j0, j1)) of the loop's corridors, and of side corridors that branch off."""
+    legs = list(zip(nodes, nodes[1:] + nodes[:1], strict=True))
+    for i, j in nodes:
+        for other in ((1, j), (i, 1)):
+            if other != (i, j) and rng.random() < 0.25:
+                legs.append(((i, j), other))
+    spans = set()
+    for (i0, j0), (i1, j1) in legs:
+        columns, rows = (_COLUMNS[i0], _COLUMNS[i1]), (_ROWS[j0], _ROWS[j1])
+        spans.add(((min(columns), max(columns) + 1), (min(rows), max(rows) + 1)))
+    return sorted(spans)
+
+
+def _label_rooms(labels: Labels, rng: np.random.Generator) -> None:
+    """Give every cell that is not corridor to a rectangular room; a room that touches no corridor lies outside."""
+    label = 0
+    for j in range(labels.shape[1]):
+        for i in np.flatnonzero(labels[:, j] == _UNKNOWN):
+            joins = i > 0 and labels[i - 1, j] > CORRIDOR and _may_join(int(i), rng)
+            label += not joins
+            labels[i, j] = label
+    padded = np.pad(labels, 1, constant_values=OUTSIDE) == CORRIDOR
+    touches = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+    labels[(labels > CORRIDOR) & ~np.isin(labels, labels[touches])] = OUTSIDE
+
+
+def _may_join(i: int, rng: np.random.Generator) -> bool:
+    """Whether the cell in column i joins the one before: a corridor's column that is none always, others at times."""
+    always = i in (_COLUMNS[0], _COLUMNS[1], _COLUMNS[2] + 1)
+    return always or (i - 1 not in _COLUMNS and bool(rng.random() < 0.45))
+
+
+def _walls(xs: FloatArray, ys: FloatArray, labels: Labels) -> tuple[WallLine, ...]:
+    """A wall wherever two labels meet, as long as the two stay the same."""
+    padded = np.pad(labels, 1, constant_values=OUTSIDE)
+    walls: list[WallLine] = []
+    for i, x in enumerate(xs):
+        for j0, j1, pair in _runs(padded[i, 1:-1], padded[i + 1, 1:-1]):
+            walls.append(WallLine(np.array([x, ys[j0]]), np.array([x, ys[j1]]), *pair))
+    for j, y in enumerate(ys):
+        for i0, i1, pair in _runs(padded[1:-1, j + 1], padded[1:-1, j]):
+            walls.append(WallLine(np.array([xs[i0], y]), np.array([xs[i1], y]), *pair))
+    return tuple(walls)
+
+
+def _runs(left: Labels, right: Labels) -> list[tuple[int, int, tuple[int, int]]]:
+    """Maximal runs (start, stop, pair) of equal pairs whose two labels differ."""
+    runs, start = [], 0
+    for pair, members in groupby(zip(left.tolist(), right.tolist(), strict=True)):
+        stop = start + len(list(members))
+        if pair[0] != pair[1]:
+            runs.append((start, stop, pair))
+        start = stop
+    return runs
+
+
+# How long the route may get, drawn between these.
+_ROUTE_LENGTHS_M = (76.0, 89.0)
+_FREE_SIDE_M = 0.4
+DOOR_HEIGHT_M = 2.12
+# From a wall's middle line to where a walker would turn.
+_TURN_M = 1.0
+
+
+@dataclass(frozen=True)
+class Door:
+    """A door from a corridor into a room."""
+
+    wall: int  # index of the wall that it is in
+    along: float  # of its middle, from the wall's start
+    width: float  # clear
+    room: int  # label
+    opened: float  # angle of the leaf, 0 when closed
+    hinge: float  # +1 or -1, the side that it hangs on, along the wall
+
+
+@dataclass(frozen=True)
+class _Visit:
+    """A way (K, 2) from a leg of the loop into a room, around in it, and back to the same point."""
+
+    door: Door
+    leg: int
+    along: float
+    path: FloatArray
+
+    @property
+    def length(self) -> float:
+        return loop_length(self.path)
+
+    def excludes(self, other: "_Visit") -> bool:
+        """Whether two visits are to the same room, or branch off the loop too close to one another."""
+        is_close = self.leg == other.leg and abs(self.along - other.along) < 1.0
+        return self.door.room == other.door.room or is_close
+
+
+def into_room(wall: WallLine) -> FloatArray:
+    """(2,) unit vector from the corridor into the room at a wall that has one to each side."""
+    return wall.to_left if wall.right == CORRIDOR else -wall.to_left
+
+
+def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]:
+    """A door or two for every room, and the route, which goes through open ones as long as it does not get too long."""
+    candidates: list[Door] = []
+    for label in plan.rooms:
+        walls = [k for k, w in enumerate(plan.walls) if {w.left, w.right} == {CORRIDOR, label} and w.length > 1.75]
+        if not walls:
+            continue
+        for k in rng.permutation(walls)[: 2 if rng.random() < 0.25 else 1]:
+            along = rng.uniform(0.85, plan.walls[k].length - 0.85)
+            opened = rng.choice([0.0, rng.uniform(0.3, 1.1), rng.uniform(1.6, 1.8)], p=[0.45, 0.25, 0.3])
+            candidates.append(Door(int(k), along, rng.uniform(0.85, 1.1), label, opened, rng.choice([-1.0, 1.0])))
+    visits = _choose_visits(plan, candidates, rng)
+    # A second door into a visited room is shut: its leaf would stand in the way.
+    visited = {visit.door.room for visit in visits.values()}
+    others = [replace(door, opened=0.0) if door.room in visited else door for door in candidates]
+    doors = [visits[k].door if k in visits else door for k, door in enumerate(others)]
+    parts: list[FloatArray] = []
+    for leg, corner in enumerate(plan.loop):
+        visited_here = sorted((v for v in visits.values() if v.leg == leg), key=lambda v: v.along)
+        parts += [corner[None], *(visit.path for visit in visited_here)]
+    way = np.concatenate(parts)
+    waypoints = np.column_stack([way, np.zeros(len(way))])
+    return doors, Route(waypoints, 0.3, _FREE_SIDE_M, DOOR_HEIGHT_M - 0.07, 1.2)
+
+
+def _choose_visits(plan: Plan, doors: list[Door], rng: np.random.Generator) -> dict[int, _Visit]:
+    """Visits by the index of their door: in random order while the route has length to spare."""
+    length = loop_length(plan.loop)
+    longest = rng.uniform(*_ROUTE_LENGTHS_M)
+    chosen: dict[int, _Visit] = {}
+    for k in rng.permutation(len(doors)):
+        visit = _visit(plan, doors[k], rng)
+        if visit is None or length + visit.length > longest or any(map(visit.excludes, chosen.values())):
+            continue
+        chosen[int(k)] = visit
+        length += visit.length
+    return chosen
+
+
+def _visit(plan: Plan, door: Door, rng: np.random.Generator) -> _Visit | None:
+    """The way in through a door and around a rectangle, or None where room or loop does not allow it."""
+    wall, room = plan.walls[door.wall], plan.rooms[door.room]
+    threshold, inwards = wall.a + door.along * wall.direction, into_room(wall)
+    leg = _leg_at(plan.loop, threshold, inwards)
+    sides = _extent(room, threshold, wall.direction)
+    side = 1.0 if sides[1] > -sides[0] else -1.0
+    across = max(sides[1], -sides[0]) - _TURN_M
+    depth = _extent(room, threshold, inwards)[1] - _TURN_M
+    if leg is None or across < 1.2 or depth < _TURN_M + 0.9:
+        return None
+    index, start, along = leg
+    across, depth = min(across, rng.uniform(1.6, 2.6)), min(depth, rng.uniform(2.4, 3.4))
+    near, far, aside = threshold + _TURN_M * inwards, threshold + depth * inwards, across * (side * wall.direction)
+    path = np.stack([start, near, near + aside, far + aside, far, start])
+    # The leaf hangs on the side that the way does not turn to, and lies back against the wall.
+    open_door = Door(door.wall, door.along, rng.uniform(1.1, 1.2), door.room, rng.uniform(1.65, 1.8), -side)
+    return _Visit(open_door, index, along, path)
+
+
+def _leg_at(loop: FloatArray, threshold: FloatArray, inwards: FloatArray) -> tuple[int, FloatArray, float] | None:
+    """(leg, point on it, distance along it) of the loop's leg that runs past a door, well away from its ends."""
+    for leg, (a, b) in enumerate(zip(loop, np.roll(loop, -1, axis=0), strict=True)):
+        direction = (b - a) / np.linalg.norm(b - a)
+        along = float((threshold - a) @ direction)
+        aside = float((threshold - a - along * direction) @ inwards)
+        if abs(direction @ inwards) < 0.5 and 0.6 < aside < 1.5 and 0.9 < along < np.linalg.norm(b - a) - 0.9:
+            return leg, a + along * direction, along
+    return None
+
+
+def _extent(room: Room, origin: FloatArray, direction: FloatArray) -> tuple[float, float]:
+    """How far the room reaches from the origin against and along an axis-parallel direction."""
+    ends = sorted(((room.low - origin) @ direction, (room.high - origin) @ direction))
+    return float(ends[0]), float(ends[1])
+
+
+_FACADE_M = 0.36
+_FRAME_M = 0.06
+_SILL_M, _LINTEL_M = 0.92, 2.2
+
+
+def build(seed: int) -> World:
+    """The office of that seed; the floor is at z = 0, the route 40 to 90 m long and into some of the rooms."""
+    rng = np.random.default_rng(seed)
+    plan = draw_plan(rng)
+    doors, route = draw_doors(plan, rng)
+    height = rng.uniform(2.6, 3.2)
+    builder, clearance = Builder(), Clearance(route)
+    draw_slabs(plan, height, builder)
+    draw_walls(plan, doors, height, builder, clearance)
+    put = Furnisher(builder, clearance, rng)
+    for one, other in combinations(plan.corridors, 2):  # where they cross, there is only floor
+        low, high = np.maximum(one.low, other.low), np.minimum(one.high, other.high)
+        if (low < high).all():
+            clearance.take(np.append(low - 0.1, 0.0), np.append(high + 0.1, height))
+    for corridor in plan.corridors:
+        draw_corridor_ceiling(corridor, height, builder, rng)
+        furnish_corridor(corridor, height, put)
+    kinds: list[str] = []
+    for room in plan.rooms.values():
+        # Every kind comes once before any comes again.
+        kinds = kinds or list(rng.permutation(list(KINDS)))
+        kind = kinds.pop()
+        for _ in range(max(1, round(float((room.high - room.low).prod()) / 13.0))):
+            furnish_room(room, kind, put)
+        draw_room_ceiling(room, height, builder, rng)
+    return World("office", seed, route, *builder.solids)
+
+
+def draw_walls(plan: Plan, doors: list[Door], height: float, builder: Builder, clearance: Clearance) -> None:
+    """Every wall, with its doors or windows."""
+    for k, wall in enumerate(plan.walls):
+        spot = Spot(builder, np.array([*wall.a, 0.0]), heading(wall.direction))  # y to the wall's left
+        if OUTSIDE in (wall.left, wall.right):
+            _facade(spot, wall, height, clearance)
+            continue
+        here = [door for door in doors if door.wall == k]
+        half = 0.5 * WALL_M
+        reach = (-half + HAIR_M, wall.length + half - HAIR_M)
+        spot.pierced_wall(reach, (-half, half), height, [_opening(door) for door in here])
+        for door in here:
+            _draw_door(spot, wall, door, clearance)
+
+
+def _opening(door: Door) -> Opening:
+    half = 0.5 * door.width + _FRAME_M
+    return Opening((door.along - half, door.along + half), (0.0, DOOR_HEIGHT_M + _FRAME_M))
+
+
+def _draw_door(spot: Spot, wall: WallLine, door: Door, clearance: Clearance) -> None:
+    """Frame and leaf; the swing and the way in are kept free of furniture."""
+    inwards = 1.0 if into_room(wall) @ wall.to_left > 0.0 else -1.0
+    half, reach, top = 0.5 * door.width, 0.5 * WALL_M + 0.02, DOOR_HEIGHT_M + _FRAME_M + 0.03
+    for side in (-1.0, 1.0):
+        jamb = (door.along + side * half, door.along + side * (half + _FRAME_M + 0.03))
+        spot.box(jamb, (-reach, reach), (0.0, top))
+    spot.box((door.along - half, door.along + half), (-reach, reach), (DOOR_HEIGHT_M, top))
+    # The leaf's frame: x from the hinge to the other jamb, y towards the room when closed.
+    hinge = spot.shifted(door.along + door.hinge * half, inwards * (0.5 * WALL_M - 0.03))
+    yaw = (np.pi if door.hinge > 0.0 else 0.0) - door.hinge * inwards * door.opened
+    leaf = Spot(spot.builder, hinge.origin, spot.yaw + yaw)
+    leaf.box((0.005, door.width - 0.005), (-0.022, 0.022), (0.01, DOOR_HEIGHT_M - 0.01))
+    leaf.box((door.width - 0.12, door.width - 0.07), (-0.07, 0.07), (1.0, 1.03))
+    before, behind = spot.point(door.along - half, -0.6 * inwards, 0.0), spot.point(door.along + half, inwards, 0.0)
+    _keep_free(clearance, before, behind)
+    _keep_free(clearance, hinge.origin, leaf.point(door.width, 0.0, 0.0))
+
+
+def _keep_free(clearance: Clearance, a: FloatArray, b: FloatArray) -> None:
+    around = np.array([0.05, 0.05, 0.0])
+    clearance.take(np.minimum(a, b) - around, np.maximum(a, b) + around + DOOR_HEIGHT_M * UP)
+
+
+def _facade(spot: Spot, wall: WallLine, height: float, clearance: Clearance) -> None:
+    """An outer wall: windows in recesses with a bar down their middle, a radiator below each."""
+    inwards = -1.0 if wall.left == OUTSIDE else 1.0
+    inner, outer = inwards * 0.5 * WALL_M, inwards * (0.5 * WALL_M - _FACADE_M)
+    count = int(wall.length // 2.1)
+    half = 0.5 * (0.62 * wall.length / max(count, 1))
+    middles = (np.arange(count) + 0.5) * wall.length / max(count, 1)
+    holes = [Opening((m - half, m + half), (_SILL_M, _LINTEL_M)) for m in middles]
+    # Outer corners are closed by both walls reaching past the grid point.
+    reach = (-0.4 * _FACADE_M, wall.length + 0.4 * _FACADE_M)
+    spot.pierced_wall(reach, (min(inner, outer), max(inner, outer)), height, holes)
+    for m, hole in zip(middles, holes, strict=True):
+        spot.box(hole.x, (outer + 0.06 * inwards, outer + 0.09 * inwards), hole.z)
+        spot.box((m - 0.035, m + 0.035), (outer + 0.04 * inwards, outer + 0.13 * inwards), hole.z)
+        spot.box((m - half - 0.05, m + half + 0.05), (outer, inner + 0.09 * inwards), (_SILL_M - 0.03, _SILL_M))
+        foot = spot.shifted(m, inner, yaw=0.0 if inwards > 0.0 else np.pi)
+        if clearance.claim(*foot.bounds((-half, half), (0.0, 0.14), (0.0, 0.75))):
+            radiator(foot, 2.0 * half)
+
+
+def draw_slabs(plan: Plan, height: float, builder: Builder) -> None:
+    """Floor and ceiling."""
+    low, high = plan.extent[0] - 1.0, plan.extent[1] + 1.0
+    middle, size = 0.5 * (low + high), high - low
+    for z in (-0.15, height + 0.15):
+        builder.box((*middle, z), (*size, 0.3))
+
+
+def draw_corridor_ceiling(corridor: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:
+    """Beams across a corridor, lamps between them, and a duct or a cable tray along it."""
+    size = corridor.high - corridor.low
+    lengthwise = int(size[1] > size[0])
+    corner = np.array([corridor.high[0] if lengthwise else corridor.low[0], corridor.low[1], 0.0])
+    spot = Spot(builder, corner, 0.5 * np.pi * lengthwise)
+    length, width = float(size[lengthwise]), float(size[1 - lengthwise])
+    inner = (0.5 * WALL_M, width - 0.5 * WALL_M)
+    spacing, depth = rng.uniform(2.2, 3.4), rng.uniform(0.12, 0.28)
+    for x in np.arange(0.5 * spacing, length, spacing):
+        spot.box((x - 0.1, x + 0.1), inner, (height - depth, height))
+        lamp = x + 0.5 * spacing
+        if lamp + 0.6 < length:
+            spot.box((lamp - 0.6, lamp + 0.6), (0.5 * width - 0.09, 0.5 * width + 0.09), (height - 0.09, height))
+    side = inner[0] + 0.2 if rng.random() < 0.5 else inner[1] - 0.2
+    if rng.random() < 0.6:
+        z = height - depth - 0.13
+        spot.rod((0.3, side, z), (length - 0.3, side, z), 0.12)
+    else:
+        spot.box((0.3, length - 0.3), (side - 0.12, side + 0.12), (height - depth - 0.07, height - depth - 0.01))
+
+
+def draw_room_ceiling(room: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:
+    """Rows of lamps, and at times a beam across."""
+    size = room.high - room.low
+    drop = rng.choice([0.0, rng.uniform(0.12, 0.3)])
+    spot = Spot(builder, np.array([*room.low, height]), 0.0)
+    xs, ys = ((np.arange(max(1, span // 2)) + 0.5) * span / max(1, span // 2) for span in size)
+    for x in xs:
+        for y in ys:
+            spot.box((x - 0.15, x + 0.15), (y - 0.55, y + 0.55), (-drop - 0.07, -drop))
+            if drop > 0.0:
+                for hanger in (y - 0.4, y + 0.4):
+                    spot.pillar(x, hanger, (-drop, 0.0), 0.008)
+    if rng.random() < 0.5:
+        x = rng.uniform(0.3, 0.7) * size[0]
+        spot.box((x - 0.15, x + 0.15), (0.5 * WALL_M, size[1] - 0.5 * WALL_M), (-rng.uniform(0.2, 0.35), 0.0))

@@ -1,1 +1,0 @@
-"""Worlds in the open: park, forest, fields."""

@@ -1,0 +1,270 @@
+"""Cars, people, poles, trees, hedges, grass; each thing drawn in its own frame, the origin on the ground, z up."""
+
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.simulation.world import Grass, HeightField
+from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise
+
+# Feet go this far down, so that nothing hovers on a slope.
+SUNK_M = 0.3
+
+
+def upright(ground: HeightField, xy: FloatArray, yaw: float) -> FloatArray:
+    """T_world_part (4, 4) of a part that stands plumb at (2,), whatever the slope."""
+    return make_transform(rotation_z(yaw), np.append(xy, ground.height_at(np.asarray(xy)[None])))
+
+
+def on_slope(ground: HeightField, xy: FloatArray, yaw: float, length: float, width: float) -> FloatArray:
+    """T_world_part (4, 4) of a part of that size that stands on the ground with all of its feet, such as a car."""
+    R = rotation_z(yaw)
+    ahead, left = 0.5 * length * R[:2, 0], 0.5 * width * R[:2, 1]
+    z = ground.height_at(xy + np.stack([ahead, -ahead, left, -left]))
+    x_axis = np.append(2.0 * ahead, z[0] - z[1])
+    normal = np.cross(x_axis, np.append(2.0 * left, z[2] - z[3]))
+    x_axis, normal = x_axis / np.linalg.norm(x_axis), normal / np.linalg.norm(normal)
+    return make_transform(np.stack([x_axis, np.cross(normal, x_axis), normal], axis=1), np.append(xy, z.mean()))
+
+
+def car(rng: np.random.Generator, round_wheels: bool = True) -> Builder:
+    """A car or, one time in six, a van, facing x: at most 5 m long, 1.95 m wide; movers take boxes for wheels."""
+    part = Builder()
+    is_van = rng.random() < 1.0 / 6.0
+    length, width = (rng.uniform(4.6, 5.0), 1.92) if is_van else (rng.uniform(3.7, 4.7), rng.uniform(1.66, 1.84))
+    a, b = 0.5 * length, 0.5 * width
+    waist, roof = (1.05, rng.uniform(1.9, 2.3)) if is_van else (rng.uniform(0.82, 0.95), rng.uniform(1.4, 1.55))
+    bonnet, boot = rng.uniform(0.26, 0.32) * length, rng.uniform(0.06, 0.2) * length
+    if is_van:
+        bonnet, boot = 0.25 * length, 0.02
+    part.block((-a, -b, 0.22), (a, b, waist - 0.12))
+    part.block((-a + 0.1, -b + 0.05, waist - 0.2), (a - bonnet + 0.1, b - 0.05, waist))
+    part.block((a - bonnet, -b + 0.08, waist - 0.3), (a - 0.15, b - 0.08, waist - 0.06))
+    slant = 0.35 if is_van else 0.5
+    front, back = a - bonnet - slant, -a + boot + 0.3 * (not is_van)
+    part.block((back, -b + 0.1, waist - 0.1), (front, b - 0.1, roof))
+    for foot, head in ((front + slant, front - 0.03), (back - 0.28 * (not is_van) - 0.03, back + 0.02)):
+        part.beam((foot, 0.0, waist - 0.06), (head, 0.0, roof - 0.05), width - 0.22, 0.08)
+    for side in (-1.0, 1.0):
+        part.box((front + 0.1, side * (b + 0.08), waist + 0.06), (0.12, 0.18, 0.14))
+    for x in (-0.62 * a, 0.64 * a):
+        for side in (-1.0, 1.0):
+            if round_wheels:
+                part.cylinder((x, side * (b - 0.2), 0.31), (x, side * (b + 0.01), 0.31), 0.33)
+            else:
+                part.box((x, side * (b - 0.1), 0.3), (0.56, 0.22, 0.68))
+    return part
+
+
+def pedestrian(rng: np.random.Generator) -> Builder:
+    """A pedestrian walking towards x, in a few boxes."""
+    part = Builder()
+    tall = rng.uniform(0.88, 1.06)
+    for side in (-1.0, 1.0):
+        stride = side * rng.uniform(0.08, 0.16)
+        part.beam((2.2 * stride, side * 0.09, -0.05), (0.0, side * 0.09, 0.88 * tall), 0.14, 0.16)
+        part.beam((-1.8 * stride, side * 0.27, 0.8 * tall), (0.0, side * 0.25, 1.42 * tall), 0.09, 0.1)
+    part.block((-0.12, -0.21, 0.82 * tall), (0.13, 0.21, 1.46 * tall))
+    part.block((-0.09, -0.08, 1.46 * tall), (0.11, 0.08, 1.75 * tall))
+    return part
+
+
+def lamp_post(height: float, reach: float) -> Builder:
+    """A tapering lamp post with its arm along x; with no reach, a lantern on top."""
+    part = Builder()
+    part.pole((0.0, 0.0), (-SUNK_M, 1.1), 0.1)
+    part.pole((0.0, 0.0), (1.1, height), 0.065)
+    if reach > 0.0:
+        tip = (reach, 0.0, height + 0.25)
+        part.cylinder((0.0, 0.0, height - 0.05), tip, 0.045)
+        part.box(tip, (0.7, 0.28, 0.13))
+    else:
+        part.block((-0.22, -0.22, height - 0.05), (0.22, 0.22, height + 0.35))
+        part.block((-0.3, -0.3, height + 0.35), (0.3, 0.3, height + 0.42))
+    return part
+
+
+def sign(rng: np.random.Generator) -> Builder:
+    """A traffic sign, its plate facing x."""
+    part = Builder()
+    size, top = rng.uniform(0.5, 0.8), rng.uniform(2.2, 2.8)
+    part.pole((0.0, 0.0), (-SUNK_M, top + 0.05), 0.035)
+    turn = Rotation.from_euler("x", rng.choice([0.0, 0.25 * np.pi])).as_matrix()
+    part.box((0.05, 0.0, top - 0.5 * size), (0.025, size, size), R=turn)
+    if rng.random() < 0.4:
+        part.block((0.04, -0.3, top - 1.8 * size), (0.06, 0.3, top - 1.8 * size + 0.22))
+    return part
+
+
+def bench(rng: np.random.Generator) -> Builder:
+    """A bench that looks towards x: three slats to sit on, two to lean on, two feet."""
+    part = Builder()
+    half = 0.5 * rng.uniform(1.5, 2.0)
+    for x in (-0.2, -0.02, 0.16):
+        part.block((x, -half, 0.43), (x + 0.13, half, 0.47))
+    for z in (0.6, 0.76):
+        part.block((-0.3, -half, z), (-0.26, half, z + 0.12))
+    for y in (-half + 0.2, half - 0.2):
+        part.block((-0.22, y - 0.05, -SUNK_M), (0.26, y + 0.05, 0.43))
+        part.block((-0.27, y - 0.04, 0.35), (-0.2, y + 0.04, 0.86))
+    return part
+
+
+def bin_row(rng: np.random.Generator, count: int) -> Builder:
+    """Wheeled bins in a row along y, their lids a little proud."""
+    part = Builder()
+    for k in range(count):
+        y, high, turn = 0.75 * (k - 0.5 * (count - 1)), rng.uniform(0.95, 1.15), rng.normal(0.0, 0.08)
+        part.box((0.0, y, 0.5 * high - 0.05), (0.6, 0.55, high + 0.1), yaw=turn)
+        part.box((0.0, y, high + 0.03), (0.68, 0.6, 0.06), yaw=turn)
+    return part
+
+
+def litter_bin() -> Builder:
+    """A round litter bin."""
+    part = Builder()
+    for z, radius in (((-SUNK_M, 0.85), 0.24), ((0.95, 1.0), 0.26), ((0.8, 1.0), 0.03)):
+        part.pole((0.0, 0.0), z, radius)
+    return part
+
+
+def bus_shelter(rng: np.random.Generator) -> Builder:
+    """A shelter open towards x, its back along y."""
+    part = Builder()
+    half = 0.5 * rng.uniform(3.0, 4.2)
+    part.block((-0.75, -half, 2.35), (0.7, half, 2.47))
+    part.block((-0.72, -half, 0.15), (-0.68, half, 2.35))
+    part.block((-0.7, half - 0.05, 0.15), (0.35, half, 2.35))
+    part.block((-0.6, -0.6 * half, 0.42), (-0.25, 0.6 * half, 0.48))
+    for x, y in ((-0.7, -half + 0.05), (-0.7, half - 0.05), (0.6, -half + 0.05), (0.6, half - 0.05), (-0.5, 0.0)):
+        part.pole((x, y), (-SUNK_M, 2.4 if y else 0.44), 0.04)
+    return part
+
+
+def log_pile(rng: np.random.Generator, rows: int) -> Builder:
+    """Logs along x, stacked `rows` wide at the bottom, between two stakes."""
+    part = Builder()
+    half, radius = 0.5 * rng.uniform(2.0, 4.0), rng.uniform(0.14, 0.22)
+    for level in range(rows):
+        for k in range(rows - level):
+            y, z = (2.0 * k - (rows - level - 1)) * radius, radius * (0.7 + 1.74 * level)
+            shift, r = rng.normal(0.0, 0.08), radius * rng.uniform(0.85, 1.0)
+            part.cylinder((shift - half, y, z), (shift + half, y, z), r)
+    for x in (-0.6 * half, 0.6 * half):
+        for side in (-1.0, 1.0):
+            part.pole((x, side * (rows * radius + 0.06)), (-SUNK_M, 1.3), 0.05)
+    return part
+
+
+# Roots go this far down, so that nothing hovers on a slope.
+_ROOTS_M = 0.4
+# Of meadows: at 10 degrees of incidence a ray sees half a decimetre deep.
+_FREE_PATH_M = 0.3
+_EDGE_M = 0.6
+
+
+def grass(rng: np.random.Generator, ground: HeightField, height_m: FloatArray, distance_m: FloatArray) -> Grass:
+    """Tussocks on the ground's grid (X, Y).
+
+    Args:
+        rng: of the tussocks.
+        ground: gives the grid.
+        height_m: (X, Y) mean height of the blades, 0 where none grow.
+        distance_m: (X, Y) from where the ground is kept free of grass, negative there.
+    """
+    shape = ground.heights.shape
+    tussocks = 1.0 + 0.3 * smooth_noise(rng, shape, 1.0) + 0.3 * smooth_noise(rng, shape, 8.0)
+    heights = height_m * np.clip(tussocks, 0.2, 2.0) * np.clip(distance_m / _EDGE_M, 0.0, 1.0)
+    return Grass(HeightField(ground.origin_xy, ground.cell_m, heights), _FREE_PATH_M)
+
+
+def leaf_clump(
+    part: Builder, rng: np.random.Generator, centre: FloatArray, radii: FloatArray, count: int, leaf_m: float
+) -> None:
+    """Flat boxes of any rotation, scattered in an ellipsoid of semi-axes `radii` (3,), denser towards its surface."""
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    centres = centre + radii * direction * rng.uniform(0.2, 1.0, (count, 1)) ** 0.5
+    sizes = leaf_m * rng.uniform([0.7, 0.5, 0.05], [1.3, 1.0, 0.2], (count, 3))
+    turns = Rotation.from_quat(rng.standard_normal((count, 4))).as_matrix()
+    for at, size, turn in zip(centres, sizes, turns, strict=True):
+        part.box(at, size, R=turn)
+
+
+def broadleaf(rng: np.random.Generator, height: float, trunk_radius: float, leaves: int) -> Builder:
+    """A tree with a bare trunk for two fifths of its height, forking into boughs that carry a round crown."""
+    part = Builder()
+    lean = np.array([*rng.normal(0.0, 0.035, 2), 1.0])
+    fork, middle = rng.uniform(0.36, 0.44) * height * lean, 0.68 * height * lean
+    part.cylinder(-_ROOTS_M * lean, fork, trunk_radius)
+    part.cylinder(fork, 0.8 * height * lean, 0.5 * trunk_radius)
+    crown = height * np.array([rng.uniform(0.22, 0.3), rng.uniform(0.22, 0.3), 0.3])
+    boughs = int(rng.integers(4, 7))
+    leaf_m = 0.4 * height / np.sqrt(leaves)  # the fewer, the larger, so that all crowns are about as dense
+    for angle in rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(boughs) / boughs:
+        outward = np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.2, 0.5)])
+        tip = middle + 0.7 * crown * outward
+        part.cylinder(fork * rng.uniform(0.93, 1.15), tip, 0.3 * trunk_radius)
+        leaf_clump(part, rng, tip, 0.45 * crown, leaves // (boughs + 1), leaf_m)
+    leaf_clump(part, rng, middle, crown, leaves - boughs * (leaves // (boughs + 1)), leaf_m)
+    return part
+
+
+def conifer(rng: np.random.Generator, height: float, trunk_radius: float, leaves: int) -> Builder:
+    """A straight tree: dead stubs on the lower trunk, and above a cone of drooping boughs."""
+    part = Builder()
+    lean = np.array([*rng.normal(0.0, 0.05, 2), 1.0])
+    half = 0.5 * height * lean
+    part.cylinder(-_ROOTS_M * lean, half, trunk_radius)
+    part.cylinder(half, height * lean, 0.55 * trunk_radius)
+    for _ in range(int(rng.integers(2, 6))):
+        angle, foot = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(1.2, 0.4 * height) * lean
+        reach = trunk_radius + rng.uniform(0.3, 1.1)
+        tip = foot + reach * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.25, 0.25)])
+        part.cylinder(foot, tip, rng.uniform(0.015, 0.03))
+    low = rng.uniform(0.25, 0.4)
+    angles = rng.uniform(0.0, 2.0 * np.pi) + 2.4 * np.arange(leaves)  # the golden angle spreads them evenly
+    for angle, level in zip(angles, np.linspace(low, 0.95, leaves), strict=True):
+        reach = 0.26 * height * (1.0 - level) * rng.uniform(0.8, 1.2) + 0.4
+        outward = np.array([np.cos(angle), np.sin(angle), -rng.uniform(0.2, 0.5)])
+        foot = level * height * lean
+        part.beam(foot, foot + reach * outward, rng.uniform(0.25, 0.4) * reach, 0.06)
+    return part
+
+
+def bush(rng: np.random.Generator, radius: float, leaves: int) -> Builder:
+    """A clump of small boxes, about as wide as high."""
+    part = Builder()
+    high = rng.uniform(0.7, 1.1) * radius
+    middle, radii = np.array([0.0, 0.0, 0.55 * high]), np.array([radius, radius, 0.75 * high])
+    leaf_clump(part, rng, middle, radii, leaves, 0.4 * radius)
+    part.pole((0.0, 0.0), (-_ROOTS_M, high), 0.08 * radius)
+    return part
+
+
+def hedge(rng: np.random.Generator, length: float, height: float, thickness: float) -> Builder:
+    """A clipped hedge along x, from 0 to `length`, of uneven blocks about 0.8 m long."""
+    part = Builder()
+    for a, b in pairwise(np.linspace(0.0, length, max(2, round(length / 0.8) + 1))):
+        top = height + rng.normal(0.0, 0.04)
+        size = (b - a + 0.1, thickness * rng.uniform(0.85, 1.1), top + _ROOTS_M)
+        part.box((0.5 * (a + b), rng.normal(0.0, 0.03), 0.5 * (top - _ROOTS_M)), size, yaw=rng.normal(0.0, 0.05))
+    return part
+
+
+def fallen_trunk(rng: np.random.Generator, length: float, radius: float) -> Builder:
+    """A lying trunk along x, its middle at the origin, half sunk, with stubs of boughs and a plate of roots."""
+    part = Builder()
+    half, low = 0.5 * length, 0.6 * radius
+    part.cylinder((-half, 0.0, low), (0.1 * half, 0.0, low), radius)
+    part.cylinder((0.1 * half, 0.0, low), (half, 0.0, low), 0.75 * radius)
+    for x in rng.uniform(-0.2 * half, 0.9 * half, int(rng.integers(2, 5))):
+        angle = rng.uniform(0.2, np.pi - 0.2)
+        tip = np.array([x + 0.3, np.cos(angle), low + np.sin(angle)]) * [1.0, 0.9, 0.9]
+        part.cylinder((x, 0.0, low), tip, 0.12 * radius + 0.01)
+    if rng.random() < 0.5:
+        roots = Rotation.from_rotvec([0.0, 0.15, 0.1]).as_matrix()
+        part.box((-half, 0.0, low + 0.2), (0.35, 5.0 * radius, 4.5 * radius), R=roots)
+    return part

@@ -1,0 +1,165 @@
+"""The clock of recordings, and the writers of KITTI's layout and of folders of PLY files."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.pose_text import format_kitti
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.folders.imu_csv import COLUMNS, EXTRINSIC, IMU_FILE
+from lidarslam.datasets.mounting.elevation import KITTI_DEG, correct_elevation
+from lidarslam.simulation.recorder import SimulatedScan
+
+# Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives
+# the same bytes; far from zero, so that readers can tell offsets from a stamp from readings of the clock.
+CLOCK_START_NS = 1_704_067_200 * 10**9
+
+
+def clock_ns(time: float, start_ns: int = CLOCK_START_NS) -> int:
+    """The clock's reading at a simulated time in seconds, to the nanosecond."""
+    return start_ns + round(time * 1e9)
+
+
+def clock_s(time: float, start_ns: int = CLOCK_START_NS) -> float:
+    """The same in seconds, the float64 that a reader makes of the nanoseconds."""
+    return clock_ns(time, start_ns) / 10**9
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The sensor on its carrier, as far as a file format has to know it."""
+
+    driver: str  # whose messages the sensor speaks: "velodyne", "ouster", "hesai" or "livox"
+    sweep_s: float  # duration of a sweep
+    T_world_lidar_at: Callable[[FloatArray], FloatArray]  # true poses (N, 4, 4) at times (N,), simulated seconds
+    imu: ImuSamples | None = None  # on simulated time too; None where none is to be recorded
+
+
+Writer = Callable[[Path, Iterable[SimulatedScan], Rig], None]
+"""Makes the folder, which does not exist yet, and writes the scans, holding one of them at a time."""
+
+
+_PROPERTY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<u2": "ushort", "<u4": "uint"}
+
+
+def write_ply_scans(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
+    """Write scan_000000.ply and so on, timestamps.txt and, with an IMU, imu.csv; implements `Writer`."""
+    folder.mkdir()
+    if rig.imu is not None:
+        write_imu(folder / IMU_FILE, rig.imu)
+    with (folder / "timestamps.txt").open("w", encoding="utf-8") as stamps:
+        for number, simulated in enumerate(scans):
+            scan = simulated.scan
+            columns: dict[str, tuple[str, ArrayLike]] = {}
+            for axis, coordinates in zip("xyz", scan.points.T, strict=True):
+                columns[axis] = ("<f4", coordinates)
+            columns["intensity"] = ("<f4", simulated.intensities)
+            if scan.time_offsets is not None:
+                columns["t"] = ("<u4", np.round(1e9 * scan.time_offsets))
+            if scan.rings is not None:
+                columns["ring"] = ("<u2", scan.rings)
+            write_ply(folder / f"scan_{number:06d}.ply", as_records(columns))
+            stamps.write(f"{clock_s(scan.stamp):.9f}\n")
+
+
+def write_imu(path: Path, imu: ImuSamples) -> None:
+    """Write samples, stamped in simulated seconds, as a table on the recording's clock."""
+    with path.open("w", encoding="utf-8") as table:
+        if imu.T_lidar_imu is not None:
+            table.write(f"# {EXTRINSIC}: {' '.join(f'{value:.12g}' for value in imu.T_lidar_imu[:3].ravel())}\n")
+        table.write(",".join(COLUMNS) + "\n")
+        for stamp, values in zip(imu.stamps, np.hstack([imu.angular_velocities, imu.accelerations]), strict=True):
+            table.write(f"{clock_s(stamp):.9f},{','.join(f'{value:.9g}' for value in values)}\n")
+
+
+def as_records(columns: Mapping[str, tuple[str, ArrayLike]]) -> NDArray[np.void]:
+    """A structured array (N,) of columns (N,), each with its type."""
+    count = len(np.asarray(next(iter(columns.values()))[1]))
+    records = np.empty(count, np.dtype([(name, kind) for name, (kind, _) in columns.items()]))
+    for name, (_, values) in columns.items():
+        records[name] = values
+    return records
+
+
+def write_ply(path: Path, vertices: NDArray[np.void]) -> None:
+    """Write a structured array (N,) as the vertices of a binary little-endian PLY file, its fields as they are named.
+
+    Raises:
+        KeyError: a field is not little-endian float32, float64, uint8, uint16 or uint32.
+    """
+    names = vertices.dtype.names or ()
+    properties = [f"property {_PROPERTY_TYPES[vertices.dtype[name].str]} {name}\n" for name in names]
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{''.join(properties)}end_header\n"
+    path.write_bytes(header.encode("ascii") + vertices.tobytes())
+
+
+SEQUENCE = "00"
+_FULL_INTENSITY = 255.0  # KITTI's reach from 0 to 1
+
+# Camera axes: x to the right, y down, z forward. On KITTI's car the camera looks within a degree of straight ahead,
+# and sits below and in front of the LiDAR.
+_R_CAM_LIDAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+T_CAM_LIDAR = exp([0.007, -0.015, 0.009, 0.0, 0.0, 0.0]) @ make_transform(_R_CAM_LIDAR, [-0.004, -0.076, -0.272])
+
+# Two grey and two colour cameras, rectified: one focal length, one centre, and how far each sits beside the first.
+_FOCAL_PX, _CENTRE_PX = 718.856, (607.193, 185.216)
+_BESIDE_M = (0.0, -0.537, 0.063, -0.469)
+
+
+def write_kitti(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
+    """Write sequence 00; implements `Writer`.
+
+    The LiDAR poses that a reader recovers from `poses/00.txt` and `Tr` are the true ones in the world of the
+    simulation, so the first need not be the identity.
+    """
+    sequence = folder / "sequences" / SEQUENCE
+    (sequence / "velodyne").mkdir(parents=True)
+    (folder / "poses").mkdir()
+    (sequence / "calib.txt").write_text(_format_calibration(), encoding="utf-8")
+    with (
+        (sequence / "times.txt").open("w", encoding="utf-8") as times,
+        (folder / "poses" / f"{SEQUENCE}.txt").open("w", encoding="utf-8") as poses,
+    ):
+        for number, simulated in enumerate(scans):
+            scan = simulated.scan
+            T_world_lidar = rig.T_world_lidar_at(np.array([scan.stamp]))
+            points = compensate(scan, rig)
+            (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(_rows(points, simulated).tobytes())
+            times.write(f"{scan.stamp:.9f}\n")
+            poses.write(format_kitti(T_CAM_LIDAR @ T_world_lidar @ inverse(T_CAM_LIDAR)))
+
+
+def compensate(scan: Scan, rig: Rig) -> FloatArray:
+    """The points (N, 3) as they would have been measured at the stamp, all at once, from the true motion.
+
+    Exact for what stands still.
+    """
+    if scan.time_offsets is None:
+        return scan.points
+    # Lasers fire together, so a sweep has far fewer instants than points.
+    offsets, instant = np.unique(scan.time_offsets, return_inverse=True)
+    T_world_lidar = rig.T_world_lidar_at(scan.stamp + np.concatenate([[0.0], offsets]))
+    T_stamp_point = (inverse(T_world_lidar[0]) @ T_world_lidar[1:])[instant]
+    rotated = np.einsum("nij,nj->ni", T_stamp_point[:, :3, :3], scan.points)
+    return np.asarray(rotated + T_stamp_point[:, :3, 3])
+
+
+def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
+    # KITTI's own scans lie too low, and everybody who reads them raises them; exact points would come out too high.
+    intensities = simulated.intensities / _FULL_INTENSITY
+    return np.column_stack([correct_elevation(points, -KITTI_DEG), intensities]).astype("<f4")
+
+
+def _format_calibration() -> str:
+    """calib.txt: the projections P0 to P3 of the four rectified cameras, and Tr, which is T_cam_lidar."""
+    lines = {"Tr": T_CAM_LIDAR[:3]}
+    for camera, beside_m in enumerate(_BESIDE_M):
+        focal_row, centre = [_FOCAL_PX, 0.0, _CENTRE_PX[0], _FOCAL_PX * beside_m], [0.0, _FOCAL_PX, _CENTRE_PX[1], 0.0]
+        lines[f"P{camera}"] = np.array([focal_row, centre, [0.0, 0.0, 1.0, 0.0]])
+    texts = {name: " ".join(f"{value:.12e}" for value in rows.reshape(-1)) for name, rows in lines.items()}
+    return "".join(f"{name}: {texts[name]}\n" for name in sorted(texts))

@@ -1,1 +1,0 @@
-"""One file format a module; the registry names them."""
