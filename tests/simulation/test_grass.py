@@ -17,34 +17,27 @@ EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 HEIGHT_M = 0.2
 
 
-def lawn(height_m: float = HEIGHT_M, free_path_m: float = 0.3) -> Grass:
-    return Grass(HeightField(np.array([-500.0, -500.0]), 1000.0, np.full((2, 2), height_m)), free_path_m)
+LAWN = Grass(HeightField(np.array([-500.0, -500.0]), 1000.0, np.full((2, 2), HEIGHT_M)), 0.3)
 
 
 @pytest.fixture(scope="module")
 def simulation(yard):
     motion = motion_along_route("car", yard, seed=2)
     sensor = replace(find_sensor("vlp-16"), ranging=EXACT)
-    world = replace(yard, movers=(), grass=lawn())
+    world = replace(yard, movers=(), grass=LAWN)
     return Simulation(world, sensor, motion, mount_pose("upright", 1.73), 50, seed=5)
 
 
 @pytest.mark.parametrize("cosine", [1.0, 0.3, 0.06])
 def test_the_law(cosine, rng):
     count = 40_000
-    ranges, is_blade = ranges_in_grass(lawn(), np.zeros((count, 3)), np.full(count, 50.0), np.full(count, cosine), rng)
+    ranges, is_blade = ranges_in_grass(LAWN, np.zeros((count, 3)), np.full(count, 50.0), np.full(count, cosine), rng)
     # Tips are evenly distributed between half the height and all of it.
     tips = HEIGHT_M * np.linspace(0.5, 1.0, 1001) / cosine
     assert is_blade.mean() == pytest.approx((1.0 - np.exp(-tips / 0.3)).mean(), abs=0.01)
     assert (ranges[~is_blade] == 50.0).all()
     depth = 50.0 - ranges[is_blade]
     assert 0.0 <= depth.min() <= depth.max() <= tips.max()
-
-
-def test_no_grass_changes_nothing(rng):
-    ranges, is_blade = ranges_in_grass(lawn(0.0), np.zeros((100, 3)), np.full(100, 9.0), np.full(100, 0.2), rng)
-    assert not is_blade.any()
-    assert (ranges == 9.0).all()
 
 
 def test_a_scan_ends_above_the_ground_within_the_grass(simulation):
@@ -74,10 +67,3 @@ def test_walls_stand_before_grass(simulation, yard):
 def test_the_reference_map_is_of_the_ground(simulation, yard):
     bare = replace(simulation, world=replace(yard, movers=()))
     np.testing.assert_array_equal(reference_map(simulation, step=25).points, reference_map(bare, step=25).points)
-
-
-def test_what_is_no_grass():
-    with pytest.raises(ValueError, match="positive path"):
-        lawn(free_path_m=0.0)
-    with pytest.raises(ValueError, match="0 or more"):
-        lawn(height_m=-0.1)

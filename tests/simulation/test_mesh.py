@@ -83,15 +83,6 @@ def test_cylinders_are_closed_and_hold_as_much_as_round_ones(cylinders):
     np.testing.assert_allclose(areas(mesh).reshape(-1, per_solid).sum(axis=1), round_areas, rtol=0.004)
 
 
-def test_cylinder_rims_lie_on_the_end_planes(cylinders):
-    vertices = cylinder_mesh(cylinders).vertices.reshape(len(cylinders), -1, 3)
-    axis = cylinders.ends - cylinders.starts
-    along = np.einsum("nkj,nj->nk", vertices - cylinders.starts[:, None], axis) / (axis**2).sum(axis=1)[:, None]
-    n = CYLINDER_SIDES
-    expected = np.concatenate([[0.0, 1.0], np.zeros(n), np.ones(n)])
-    np.testing.assert_allclose(along, np.broadcast_to(expected, along.shape), atol=1e-9)
-
-
 def test_height_field_is_the_surface_of_height_at(field, rng):
     mesh = height_field_mesh(field)
     assert mesh.triangles.shape == (2 * 5 * 8, 3)
@@ -121,16 +112,3 @@ def test_world_mesh_holds_everything_that_stands(boxes, cylinders, field):
 def test_nothing_gives_no_triangle():
     empty = world_mesh(World("empty", 0, Route(np.eye(3), 1.0, 1.0, 2.0, 1.0)))
     assert empty.vertices.shape == empty.triangles.shape == (0, 3)
-
-
-@pytest.mark.parametrize(
-    ("vertices", "triangles", "told"),
-    [
-        (np.zeros((4, 2)), np.zeros((1, 3), dtype=np.int32), "Mesh must be"),
-        (np.zeros((4, 3)), np.zeros((1, 4), dtype=np.int32), "Mesh must be"),
-        (np.zeros((4, 3)), np.full((1, 3), 4, dtype=np.int32), "must index 4 vertices, got 4"),
-    ],
-)
-def test_a_mesh_that_cannot_be_is_refused(vertices, triangles, told):
-    with pytest.raises(ValueError, match=told):
-        Mesh(vertices, triangles)

@@ -15,7 +15,6 @@ from lidarslam.simulation.route_motion import (
     corner_windows,
     motion_along_route,
     rest_to_rest,
-    round_and_round,
     straightened,
 )
 from lidarslam.simulation.world import Route, World
@@ -198,11 +197,6 @@ def test_seeds_vary_and_repeat(yard):
     assert np.abs(first.pose_at(times) - other.pose_at(times)).max() > 0.1
 
 
-def test_unknown_motion_is_answered_with_the_choices(yard):
-    with pytest.raises(InputError, match=r"'train'.*car, handheld, legged, .*drone, car-fast, drone-agile"):
-        motion_along_route("train", yard, 0)
-
-
 def test_a_given_trajectory_is_followed_on_the_ground(yard):
     stamps = 100.0 + 0.1 * np.arange(80)
     steps = exp(np.tile([0.0, 0.0, 0.01, 0.4, 0.0, 0.0], (80, 1)))
@@ -280,21 +274,6 @@ def test_speed_profile_keeps_its_limits():
     assert speeds.max() < 6.0 + 1e-9
     assert np.abs(np.gradient(speeds, TIME_STEP_S)).max() < 2.0 + 1e-6
     assert speeds[np.abs(travelled - 30.0) < 2.0].max() < 1.01
-
-
-def test_a_lap_without_a_halt_is_as_fast_where_it_closes():
-    positions = np.linspace(0.0, 200.0, 2001)
-    limits = np.where(np.abs(positions - 80.0) < 10.0, 4.0, 15.0)
-    travelled = round_and_round(positions, limits, acceleration=2.0, smoothing_s=0.3)
-    laps = np.concatenate([travelled[:-1] - 200.0, travelled, travelled[1:] + 200.0])
-    speeds = np.gradient(laps, TIME_STEP_S)[len(travelled) - 1 : 2 * len(travelled) - 1]
-    assert travelled[0] == 0.0
-    np.testing.assert_allclose(travelled[-1], 200.0)
-    np.testing.assert_allclose(speeds[0], speeds[-1], atol=1e-9)
-    assert (np.diff(travelled) > 0.0).all()
-    assert speeds.max() < 15.0 + 1e-9
-    np.testing.assert_allclose(speeds.min(), 4.0, rtol=0.02)
-    assert np.abs(np.gradient(np.tile(speeds[:-1], 3), TIME_STEP_S)).max() < 2.0 + 1e-6
 
 
 def test_rotations_are_in_the_order_yaw_pitch_roll():
