@@ -81,9 +81,9 @@ CONFINED = {
         "lidarslam.datasets.*",
         "lidarslam.simulation.bag_writer",
         "lidarslam.exports.*",
-        "lidarslam.run.modes.live.*",
+        "lidarslam.live.*",
     ),
-    "cyclonedds": ("lidarslam.run.modes.live.dds",),
+    "cyclonedds": ("lidarslam.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES, MOST_ENTRIES = 500, 20

@@ -20,11 +20,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingName
+from lidarslam.merge.writing import MergedRecording, MergeOutcome, MergeSummary
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
-from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.summary.written_map import WrittenMap
 
 
@@ -254,7 +253,7 @@ def test_merge_exits_as_run_does(
     entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
     summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
     outcome = MergeOutcome(summary, (None, None), stopped)
-    monkeypatch.setattr("lidarslam.run.modes.merge.merge.merge", lambda *_: outcome)
+    monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
     assert (
         lidarslam("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder").exit_code
         == status

@@ -74,8 +74,7 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
     with contextlib.ExitStack() as serve:
         with show_progress(topic or "live") as progress:
             progress.phase("loading the program")
-            from lidarslam.run.modes.live.live import execute
-            from lidarslam.run.modes.live.request import LiveRequest
+            from lidarslam.live.live import LiveRequest, execute
             from lidarslam.run.summary_text import format_outcome
             from lidarslam.storage.directory import RERUN
 

@@ -69,9 +69,7 @@ def localise(
     with contextlib.ExitStack() as serve:
         with show_progress(source.name) as progress:
             progress.phase("loading the program")
-            from lidarslam.run.modes.localise.localise import execute
-            from lidarslam.run.modes.localise.request import LocaliseRequest
-            from lidarslam.run.modes.localise.text import format_localisation, format_not_found
+            from lidarslam.localise import LocaliseRequest, execute, format_localisation, format_not_found
             from lidarslam.run.request import RunRequest
             from lidarslam.storage.default_places import source_name
 

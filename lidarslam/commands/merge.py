@@ -44,9 +44,9 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     map, and for each recording a run directory with its poses in the common frame. A recording without a loop closure
     to the others is left out of the common map, and the exit status is 1.
     """
-    from lidarslam.run.modes.merge.merge import merge as execute
-    from lidarslam.run.modes.merge.parts import MergeRequest
-    from lidarslam.run.modes.merge.text import format_merge
+    from lidarslam.merge.merge import merge as execute
+    from lidarslam.merge.parts import MergeRequest
+    from lidarslam.merge.writing import format_merge
     from lidarslam.run.progress import show_progress
     from lidarslam.storage.default_places import source_name
 

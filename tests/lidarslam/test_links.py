@@ -13,8 +13,7 @@ from lidarslam.compare.methods.run import LOG, clear
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import make_own_folder, only_writer, open_own
-from lidarslam.run.modes.merge.parts import remove_part
-from lidarslam.run.modes.merge.tracking import PartTask, track_part
+from lidarslam.merge.parts import PartTask, remove_part, track_part
 from lidarslam.run.request import RunRequest
 from lidarslam.storage.about import About
 from lidarslam.storage.unfinished import Unfinished
@@ -81,7 +80,7 @@ def test_the_work_folder_of_a_part_is_no_link(
     unfinished: Path, small_recording: Path, tmp_path: Path, leads_to: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A task of a merge may resume, and neither reads, locks nor replaces what it finds behind a link."""
-    monkeypatch.setattr("lidarslam.run.modes.merge.tracking._PATIENCE_S", 0.0)
+    monkeypatch.setattr("lidarslam.merge.parts._PATIENCE_S", 0.0)
     outside, out = tmp_path / "precious", tmp_path / "merged" / "01_room"
     if leads_to == "a checkpoint":
         shutil.move(unfinished / "unfinished", outside)

@@ -25,16 +25,13 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting.elevation import correct_elevation
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
+from lidarslam.live.clouds import CloudDecoder
+from lidarslam.live.live import bounded
+from lidarslam.live.messages import PosePublisher, serialize_transform
+from lidarslam.live.receiving import IncomingQueue, Received, find_imu, find_topic
+from lidarslam.live.statistics import LiveStatistics, count_missing
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import Localised, SweepMotion
-from lidarslam.run.modes.live.clouds import CloudDecoder
-from lidarslam.run.modes.live.discovery import find_topic
-from lidarslam.run.modes.live.imu import find_imu
-from lidarslam.run.modes.live.incoming import IncomingQueue, Received
-from lidarslam.run.modes.live.live import bounded
-from lidarslam.run.modes.live.messages import serialize_transform
-from lidarslam.run.modes.live.publishing import PosePublisher
-from lidarslam.run.modes.live.statistics import LiveStatistics, count_missing
 
 LIDARSLAM = [sys.executable, "-m", "lidarslam"]
 PLAY = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "play_bag.py")]
@@ -93,7 +90,7 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     """With constant velocity a run knows no more of a scan than a live one: the poses are the same, bit for bit."""
-    from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
+    from lidarslam.live.dds import DdsNode, PublishedTopic
 
     method = ["--odometry", "constant-velocity", "--no-report", "--set", "mapping.budget_ms=1e6"]
     live, ran = tmp_path / "live", tmp_path / "ran"
@@ -139,7 +136,7 @@ def test_interrupted_it_writes_what_came(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     """The poses until then are those of the robot, whose static transforms were published before."""
-    from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
+    from lidarslam.live.dds import DdsNode, PublishedTopic
 
     out, T_base_lidar = tmp_path / "live", make_transform(np.diag([-1.0, -1.0, 1.0]), [1.0, 0.0, 2.0])
     node = DdsNode(domain)
@@ -332,7 +329,7 @@ class Topic:
 
 
 def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidarslam.run.modes.live.discovery._SETTLED_S", 0.0)
+    monkeypatch.setattr("lidarslam.live.receiving._SETTLED_S", 0.0)
     clouds = Topic("/points")
     seen = iter([[], [Topic("/scan", "sensor_msgs/msg/LaserScan")], [clouds]])
     assert find_topic(lambda: next(seen, [clouds]), None, 0) is clouds
@@ -348,7 +345,7 @@ def test_it_waits_no_longer_than_it_is_told() -> None:
 
 
 def test_while_it_waits_it_says_what_it_sees(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr("lidarslam.run.modes.live.discovery._PATIENCE_S", 0.0)
+    monkeypatch.setattr("lidarslam.live.receiving._PATIENCE_S", 0.0)
     seen = iter([[Topic("/rear")], [Topic("/rear")], [Topic("/rear"), Topic("/front")]])
     assert find_topic(lambda: next(seen), "/front", 3).name == "/front"
     assert caplog.messages == ["waiting for /front in domain 3; clouds are published on /rear"]
@@ -424,7 +421,7 @@ def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:
 
 def play(bag: Path, domain: int) -> None:
     """Publish all topics of a bag at the times at which they were recorded, once somebody takes its clouds."""
-    from lidarslam.run.modes.live.dds import DdsNode
+    from lidarslam.live.dds import DdsNode
 
     node = DdsNode(domain)
     with AnyReader([bag]) as reader:

@@ -23,11 +23,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tasks.tasks import Where
 from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.merge.merge import merge
+from lidarslam.merge.parts import MergeRequest
+from lidarslam.merge.writing import MergeOutcome, format_merge
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.run.modes.merge.merge import merge
-from lidarslam.run.modes.merge.parts import MergeRequest
-from lidarslam.run.modes.merge.text import format_merge
-from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion import Motion, mount_pose
 from lidarslam.simulation.recorder import Simulation
@@ -354,7 +353,7 @@ def test_an_interrupted_merge_goes_on_where_it_was(
 
 KILLED_MERGE = """
 import os, signal, sys
-import lidarslam.run.modes.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph
+import lidarslam.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph
 from lidarslam.cli import main
 
 count = 0

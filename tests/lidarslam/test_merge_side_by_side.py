@@ -17,10 +17,10 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.tasks.tasks import SERIAL, Where
-from lidarslam.run.modes.merge import tracking
-from lidarslam.run.modes.merge.merge import merge
-from lidarslam.run.modes.merge.parts import MergeRequest
-from lidarslam.run.modes.merge.writing import MergeOutcome
+from lidarslam.merge import parts as tracking
+from lidarslam.merge.merge import merge
+from lidarslam.merge.parts import MergeRequest
+from lidarslam.merge.writing import MergeOutcome
 from lidarslam.run.tracking import Progress
 
 pytest.importorskip("ray")

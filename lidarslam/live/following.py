@@ -13,15 +13,14 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
 from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
+from lidarslam.live.clouds import CloudDecoder, LiveScan
+from lidarslam.live.dds import DdsNode, PublishedTopic
+from lidarslam.live.live import LiveRequest
+from lidarslam.live.messages import PosePublisher
+from lidarslam.live.receiving import Arrived, ImuReceiver, IncomingQueue
+from lidarslam.live.session import LiveSession
+from lidarslam.live.statistics import LiveCounts, LiveStatistics
 from lidarslam.pipeline.imu_stream import ImuStream
-from lidarslam.run.modes.live.clouds import CloudDecoder, LiveScan
-from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
-from lidarslam.run.modes.live.imu import ImuReceiver
-from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
-from lidarslam.run.modes.live.publishing import PosePublisher
-from lidarslam.run.modes.live.request import LiveRequest
-from lidarslam.run.modes.live.session import LiveSession
-from lidarslam.run.modes.live.statistics import LiveCounts, LiveStatistics
 
 logger = logging.getLogger(__name__)
 

@@ -22,8 +22,8 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
 from lidarslam.core.errors import InputError
-from lidarslam.run.modes.live.incoming import Received
-from lidarslam.run.modes.live.messages import message_types
+from lidarslam.live.messages import message_types
+from lidarslam.live.receiving import Received
 
 # A cloud of 3 MB arrives as a burst of datagrams that the default buffer, 1 MB, does not hold; the kernel grants up to
 # net.core.rmem_max.

@@ -20,13 +20,22 @@ from lidarslam.datasets.published.fetched import url_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.global_map import voxel_size_for
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.merge.parts import (
+    MergeRequest,
+    PartDone,
+    PartTask,
+    Show,
+    closing_loops,
+    earlier_parts,
+    open_parts,
+    read_graph,
+    remove_part,
+    track_part,
+)
+from lidarslam.merge.writing import MergeOutcome, Part, missing, write_merge
 from lidarslam.pipeline.background_worker import BackgroundWorker
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.modes.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
-from lidarslam.run.modes.merge.tracked_part import read_graph
-from lidarslam.run.modes.merge.tracking import PartDone, PartTask, Show, track_part
-from lidarslam.run.modes.merge.writing import MergeOutcome, Part, missing, write_merge
 from lidarslam.run.progress import show_count
 from lidarslam.run.resuming import WITHOUT_EFFECT
 from lidarslam.storage.about import About

@@ -1,26 +1,26 @@
-"""The results of a merge: the runs of the recordings, corrected by one graph, and the common map."""
+"""The results of a merge: the runs of the recordings, corrected by one graph, the common map, and summary.json."""
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.core.state.stateful import Saved
+from lidarslam.core.text.plain_text import count, joined
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.pose_graph.g2o import format_g2o
+from lidarslam.merge.parts import MergeRequest, PartDone, read_part
 from lidarslam.run.loop_closing import FinishedGraph
-from lidarslam.run.modes.merge.parts import MergeRequest
-from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
-from lidarslam.run.modes.merge.tracked_part import read_part
-from lidarslam.run.modes.merge.tracking import PartDone
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, draw, final_map, write_map, write_results
-from lidarslam.run.summary.summary import GraphSummary, peak_rss_mb
+from lidarslam.run.summary.summary import GraphSummary, graph_and_map_json, peak_rss_mb
 from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary_text import format_map
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.checkpoint_files import CheckpointFiles
@@ -29,6 +29,48 @@ from lidarslam.storage.state_file import read_state
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+
+@dataclass(frozen=True)
+class MergedRecording:
+    """One recording of a merge."""
+
+    name: str  # of the recording
+    directory: str | None  # of its run, beside the common map; None when no scan could be used
+    source: str  # its path
+    # scans, length_m, lost_scans: of its run
+    scans: int
+    length_m: float
+    lost_scans: int
+    joined: bool  # whether its poses are in the common frame
+
+
+@dataclass(frozen=True)
+class MergeSummary:
+    """The content of summary.json of a merge."""
+
+    recordings: tuple[MergedRecording, ...]
+    elapsed_s: float
+    peak_rss_mb: float
+    graph: GraphSummary | None
+    map: WrittenMap
+    warnings: tuple[str, ...]
+
+    @property
+    def lost_scans(self) -> int:
+        """Number of lost scans of all recordings."""
+        return sum(recording.lost_scans for recording in self.recordings)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        return {
+            "recordings": [vars(recording) for recording in self.recordings],
+            "elapsed_s": self.elapsed_s,
+            "peak_rss_mb": self.peak_rss_mb,
+            "lost_scans": self.lost_scans,
+            **graph_and_map_json(self.graph, self.map, self.warnings),
+        }
+
 
 # In the summary of a run; that of the merge says how to mend it.
 _OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
@@ -180,3 +222,37 @@ def _warnings(recordings: Sequence[MergedRecording], runs: Sequence[RunOutcome |
         if warning != _OF_ITS_OWN
     ]
     return [*apart, *own]
+
+
+def format_merge(out: Path, outcome: MergeOutcome) -> str:
+    """A merge in a few lines: each recording, the loops between them, the common map, warnings, and the directory."""
+    summary = outcome.summary
+    lines = [_recording(recording, run) for recording, run in zip(summary.recordings, outcome.runs, strict=True)]
+    lines += [_joined(summary), format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
+    if summary.lost_scans:
+        lost = count(summary.lost_scans, "scan")
+        lines.append(f"tracking was lost on {lost}; the summaries of the recordings say where")
+    return joined([*lines, f"written to {out}"])
+
+
+def _recording(recording: MergedRecording, run: RunOutcome | None) -> str:
+    if run is None:
+        return f"{recording.name}: no scan used"
+    parts = [f"{recording.directory}: {count(recording.scans, 'scan')}, {recording.length_m:.1f} m"]
+    if run.metrics is not None:
+        parts.append(f"ATE {run.metrics.errors.ate_rmse_m:.3f} m by itself")
+    if recording.lost_scans:
+        parts.append(f"{recording.lost_scans:,} lost")
+    parts.append("in the common frame" if recording.joined else "NOT JOINED")
+    return ", ".join(parts)
+
+
+def _joined(summary: MergeSummary) -> str:
+    joined = sum(recording.joined for recording in summary.recordings)
+    loops = () if summary.graph is None else summary.graph.loops
+    closed = [loop for loop in loops if loop.accepted]
+    between = sum(len(set(loop.recordings or ())) > 1 for loop in closed)
+    return (
+        f"{joined} of {len(summary.recordings)} recordings in one map;"
+        f" loops closed: {between} between recordings, {len(closed) - between} within"
+    )

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
@@ -11,29 +12,49 @@ from threadpoolctl import threadpool_limits
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.faults import Faults
+from lidarslam.live.clouds import CloudDecoder
+from lidarslam.live.receiving import IMU_DEPTH, ImuReceiver, IncomingQueue, find_imu, find_topic
+from lidarslam.live.session import LiveSession, warm_up
+from lidarslam.live.statistics import LiveCounts
+from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
-from lidarslam.run.modes.live.clouds import CloudDecoder
-from lidarslam.run.modes.live.discovery import find_topic
-from lidarslam.run.modes.live.incoming import IncomingQueue
-from lidarslam.run.modes.live.request import LiveRequest
-from lidarslam.run.modes.live.session import LiveSession, warm_up
-from lidarslam.run.modes.live.statistics import LiveCounts
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.run import open_odometry, require_no_trajectory, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.viewer.rerun_program import require_window
+from lidarslam.viewer.viewer import RerunMode
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
+    from lidarslam.live.dds import DdsNode
+    from lidarslam.live.following import Follower
     from lidarslam.pipeline.imu_stream import ImuStream
-    from lidarslam.run.modes.live.dds import DdsNode
-    from lidarslam.run.modes.live.following import Follower
-    from lidarslam.run.modes.live.imu import ImuReceiver
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """Topic, configuration and destination of a live run."""
+
+    out: Path  # the run directory
+    config: Config  # of the computation
+    topic: str | None = None  # of the clouds; None: the only one there is
+    domain: int = 0  # of DDS
+    # duration_s, scans: when it ends by itself, counted from the first scan; while none comes, from the beginning
+    duration_s: float | None = None
+    scans: int | None = None
+    queue: int = 20  # scans that may wait for registration
+    odom_frame: str = "odom"  # the fixed frame of the published poses
+    base_frame: str | None = None  # the frame that moves, connected to the LiDAR's by /tf_static; None: the LiDAR's own
+    publish_tf: bool = True  # whether the pose is published on /tf as well
+    rerun: RerunMode = "off"
+    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
+    overwrite: bool = False  # whether an earlier run in `out` is replaced
+    report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
 @dataclass(frozen=True)
@@ -132,7 +153,7 @@ def _follower(
     decoder: CloudDecoder,
     imu: "tuple[ImuReceiver, ImuStream] | None",
 ) -> "Follower":
-    from lidarslam.run.modes.live.following import Follower  # loads cyclonedds
+    from lidarslam.live.following import Follower  # loads cyclonedds
 
     return Follower(request, node, session, decoder, imu)
 
@@ -146,10 +167,8 @@ def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> "tuple[ImuRec
     stream = make_imu_stream(config, log.warn)
     if stream is None:
         return None
-    from lidarslam.run.modes.live.imu import DEPTH, ImuReceiver, find_imu
-
     topic = find_imu(node.published, config.reader.imu_topic)
-    return ImuReceiver(node.subscribe(topic, depth=DEPTH).take, stream), stream
+    return ImuReceiver(node.subscribe(topic, depth=IMU_DEPTH).take, stream), stream
 
 
 def _open_node(domain: int) -> "DdsNode":
@@ -160,7 +179,7 @@ def _open_node(domain: int) -> "DdsNode":
         InputError: the library cannot join the domain.
     """
     try:
-        from lidarslam.run.modes.live.dds import open_node
+        from lidarslam.live.dds import open_node
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
     return open_node(domain)

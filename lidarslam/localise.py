@@ -1,35 +1,95 @@
 """Localisation of a recording in a finished map: from a source and a map to a run directory in the map's frame."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarslam.config.settings import dump_yaml
+from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, scan_span
 from lidarslam.core.text.trajectory_io import format_tum
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
 from lidarslam.mapping.global_map.drawing import DrawnMap
+from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.run.interruption import Interruptions
-from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
-from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
-from lidarslam.run.request import log_choices
+from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, write_results
 from lidarslam.run.run import open_odometry, require_apart, require_overlap, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.summary import summarise
 from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary_text import format_times
 from lidarslam.run.tracking import Progress, Tracked, track
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY, RunDirectory
+from lidarslam.storage.finished_run import load_map
 from lidarslam.viewer.rerun_program import require_window
+from lidarslam.viewer.viewer import Viewer
 from lidarslam.viewer.web_page import WebPage
+
+# A map of fewer points is not worth a search.
+_FEWEST_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class LocaliseRequest:
+    """A recording, and the map that it is to be found in."""
+
+    run: RunRequest  # the recording, and where the results go; no checkpoints
+    map: Path  # a run directory, a .ply or a .pcd file with normals
+    guess: tuple[float, float, float] | None = None  # rough x, y (m) and heading (degrees) of the first scan in the map
+
+    def describe(self) -> dict[str, Any]:
+        """For config.yaml."""
+        guess = None if self.guess is None else list(self.guess)
+        return describe_run(self.run) | {"map": str(self.map.resolve()), "guess": guess}
+
+
+def read_map(request: LocaliseRequest) -> tuple[PointCloud, FixedMap]:
+    """The points of the map, and the map to register to.
+
+    Raises:
+        InputError: there is no map, or it is too small or without normals.
+        ConfigError: another registration than that to surfels is configured.
+    """
+    if request.run.config.mapping.method != "surfels":
+        raise ConfigError("mapping.method: scans are localised by registration to surfels; leave the setting out")
+    cloud = load_map(request.map)
+    if len(cloud) < _FEWEST_POINTS:
+        raise InputError(f"{request.map}: holds no map to localise in ({len(cloud):,} points)")
+    if not cloud.normals[:, :2].any():
+        raise InputError(f"{request.map}: has points without normals, which say from which side walls were seen")
+    return cloud, FixedMap(cloud.points, cloud.normals)
+
+
+class PlacedViewer(Viewer):
+    """Passes scans on once one has a place in the map: before, poses are in a frame of their own.
+
+    Args:
+        shown: the viewer that shows them.
+    """
+
+    def __init__(self, shown: Viewer) -> None:
+        self._shown = shown
+        self._is_placed = False
+
+    def show_scan(self, index: int, result: ScanResult) -> None:
+        """One scan, if the place is known."""
+        self._is_placed = self._is_placed or result.status is not Status.LOST
+        if self._is_placed:
+            self._shown.show_scan(index, result)
+
 
 _AFTERWARDS = "placed afterwards: the recording's own map leads from here to the place that was found"
 _REVOKED = "a place was found here, but later scans did not confirm it"
@@ -179,3 +239,36 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
         times_found=len(localiser.found),
         refused=refused,
     )
+
+
+# Stretches of lost scans that are listed; summary.json has them all.
+_LISTED = 3
+
+
+def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
+    """A localisation in a few lines: where it was found, what was tracked, what was lost, and where the files are."""
+    return joined(_lines(request, outcome))
+
+
+def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
+    """A line about a recording that was not found."""
+    refused, scans = outcome.localisation.refused, count(outcome.run.summary.scans, "scan")
+    last = f"; the last search: {refused[-1][1]}" if refused else ""
+    return f"{request.run.source}: not found in {request.map} with {scans}{last}; {SUMMARY} has all reasons"
+
+
+def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
+    summary, found, out = outcome.run.summary, outcome.localisation, request.run.out
+    yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
+    yield f"found at scan {found.found}, confirmed at scan {found.confirmed}, after {found.after_s:.1f} s"
+    before = f", {found.placed_afterwards:,} before that placed afterwards" if found.placed_afterwards else ""
+    yield f"{found.tracked:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
+    yield from format_times(summary)
+    for warning in summary.warnings:
+        yield f"warning: {warning}"
+    for stretch in summary.lost[:_LISTED]:
+        yield f"LOST on {scan_span(stretch.first, stretch.last)}: {stretch.reason}"
+    if len(summary.lost) > _LISTED:
+        yield f"LOST on {len(summary.lost) - _LISTED} more; {SUMMARY} and {SCANS_CSV} list them"
+    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
+    yield f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}"

@@ -1,0 +1,271 @@
+"""What a live run receives: topics once they are published, messages in a queue of bounded length, IMU samples."""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol, Self, TypeVar
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.ros.bag_imu import ACCELERATION, ANGULAR_VELOCITY, IMU_TYPE, imu_numbers
+from lidarslam.datasets.ros.bag_message import CLOUD_TYPES, read_header
+from lidarslam.pipeline.imu_stream import ImuStream
+
+logger = logging.getLogger(__name__)
+
+# Discovery of a running system is done within a second or two; after the second span the topics seen are printed.
+_SETTLED_S, _PATIENCE_S, _POLL_S = 2.0, 5.0, 0.1
+# How long to wait for a message before looking whether anything is wanted still.
+_RECEIVE_S = 0.2
+# Samples of an IMU that may wait in a reader: a second of a fast one.
+IMU_DEPTH = 1000
+# A scan waits so long at most for the samples of its sweep, seconds.
+_SWEEP_PATIENCE_S, _STEP_S = 0.05, 0.002
+# A stamp so far ahead, seconds, is taken when so many in a row are.
+_FAR_S, _STRAYS = 5.0, 10
+
+
+class Published(Protocol):
+    """A topic that is published."""
+
+    @property
+    def name(self) -> str:
+        """As in ROS."""
+
+    @property
+    def message_type(self) -> str:
+        """As in ROS."""
+
+
+P = TypeVar("P", bound=Published)
+
+
+def find_topic(
+    published: Callable[[], Iterable[P]], wanted: str | None, domain: int, within_s: float | None = None
+) -> P:
+    """Wait for the publisher of a topic of clouds, so long at most; without a name, for the only one.
+
+    Raises:
+        InputError: there are several and none is named, the named one holds no clouds, or none came in time.
+    """
+    begin = time.monotonic()
+    is_told = False
+    while True:
+        topics = list(published())
+        waited_s = time.monotonic() - begin
+        if wanted is not None and (found := [topic for topic in topics if topic.name == wanted]):
+            return _only_clouds(found[0])
+        clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES]
+        if wanted is None and clouds and waited_s > _SETTLED_S:
+            return _only(clouds)
+        if waited_s > _PATIENCE_S and not is_told:
+            logger.warning(_what_is_seen(wanted, clouds, len(topics), domain))
+            is_told = True
+        if within_s is not None and waited_s > within_s:
+            raise InputError(f"{within_s:g} s are over, {_what_is_seen(wanted, clouds, len(topics), domain)}")
+        time.sleep(_POLL_S)
+
+
+def _only_clouds(topic: P) -> P:
+    if topic.message_type not in CLOUD_TYPES:
+        raise InputError(f"{topic.name}: holds {topic.message_type}, not one of {', '.join(CLOUD_TYPES)}")
+    return topic
+
+
+def _only(clouds: list[P]) -> P:
+    if len(clouds) > 1:
+        names = ", ".join(topic.name for topic in clouds)
+        raise InputError(f"clouds are published on {names}; choose one with --topic")
+    return clouds[0]
+
+
+def _what_is_seen(wanted: str | None, clouds: Iterable[Published], topics: int, domain: int) -> str:
+    names = ", ".join(topic.name for topic in clouds)
+    if names:
+        seen = f"clouds are published on {names}"
+    elif topics:
+        seen = f"{topics} topics are published, none of them with clouds"
+    else:
+        seen = "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
+    return f"waiting for {wanted or 'clouds'} in domain {domain}; {seen}"
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message as the middleware gives it."""
+
+    raw: bytes  # CDR, with its four bytes of encapsulation
+    published_ns: int  # when it was published, by the publisher's clock
+
+
+@dataclass(frozen=True)
+class Arrived(Received):
+    """A message with its time of arrival."""
+
+    arrived_s: float  # when it came, by this machine's clock
+
+
+class IncomingQueue:
+    """Receives from its beginning to its end; where messages come faster than they are taken, some are dropped.
+
+    Dropped is what leaves the shortest gap: tracking bears half the rate better than a second without scans.
+
+    Attributes:
+        dropped: number of messages that were dropped.
+        is_ended: whether nothing more is received; messages may wait still.
+
+    Args:
+        receive: the next messages, waiting for so many seconds at most.
+        longest: number of messages that may wait.
+        on_arrival: called on the thread that receives, with each message.
+    """
+
+    def __init__(
+        self,
+        receive: Callable[[float], Iterable[Received]],
+        longest: int,
+        on_arrival: Callable[[Arrived], None] = lambda _: None,
+    ) -> None:
+        self.dropped = 0
+        self.is_ended = False
+        self._receive = receive
+        self._on_arrival = on_arrival
+        self._waiting: deque[Arrived] = deque()
+        self._longest = longest
+        self._taken_ns = 0  # when the last message that was taken was published
+        self._changed = threading.Condition()
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="receive", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+        self._thread.join()
+
+    def end(self) -> None:
+        """Receive nothing more; what waits can still be taken."""
+        with self._changed:
+            self.is_ended = True
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> Arrived | None:
+        """The oldest message that waits; None when none came in time.
+
+        An error of receiving is raised after the messages before it.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self.is_ended, timeout_s)
+            if self._waiting:
+                message = self._waiting.popleft()
+                self._taken_ns = message.published_ns
+                return message
+            if self._error is not None:
+                raise self._error
+            return None
+
+    def _run(self) -> None:
+        try:
+            while not self.is_ended:
+                for message in self._receive(_RECEIVE_S):
+                    self._add(Arrived(message.raw, message.published_ns, time.time()))
+        except Exception as error:
+            self._error = error
+            self.end()
+
+    def _add(self, message: Arrived) -> None:
+        self._on_arrival(message)
+        with self._changed:
+            self._waiting.append(message)
+            if len(self._waiting) > self._longest:
+                del self._waiting[self._most_dispensable()]
+                self.dropped += 1
+            self._changed.notify_all()
+
+    def _most_dispensable(self) -> int:
+        """Index of the message whose absence leaves the shortest gap: the oldest of equal ones, never the newest."""
+        times = [self._taken_ns, *(message.published_ns for message in self._waiting)]
+        gaps = [after - before for before, after in zip(times, times[2:], strict=False)]
+        return min(range(len(gaps)), key=gaps.__getitem__, default=0)
+
+
+def find_imu(published: Callable[[], Iterable[P]], wanted: str | None) -> P:
+    """Wait a moment for the publisher of an IMU; without a name, for the only one.
+
+    Raises:
+        InputError: there is none, or there are several and none is named.
+    """
+    end = time.monotonic() + _PATIENCE_S
+    while True:
+        imus = [topic for topic in published() if topic.message_type == IMU_TYPE]
+        found = imus if wanted is None else [topic for topic in imus if topic.name.lstrip("/") == wanted.lstrip("/")]
+        if len(found) == 1:
+            return found[0]
+        names = ", ".join(topic.name for topic in imus)
+        if len(found) > 1:
+            raise InputError(f"IMUs are published on {names}; choose one with --set reader.imu_topic=NAME")
+        if time.monotonic() > end:
+            what = f"no {IMU_TYPE} is published{'' if wanted is None else f' on {wanted}'}"
+            raise InputError(f"{what}; published: {names or 'none'}. Choose --odometry learned, which needs none")
+        time.sleep(_POLL_S)
+
+
+class ImuReceiver:
+    """Gives the messages of an IMU to a stream, on a thread of its own; a context manager.
+
+    Args:
+        receive: the next messages, waiting for so many seconds at most.
+        stream: takes the samples.
+    """
+
+    def __init__(self, receive: Callable[[float], Iterable[Received]], stream: ImuStream) -> None:
+        self._receive, self._stream = receive, stream
+        self._is_ended, self._strays = False, 0
+        self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
+        self.frame_id: str | None = None  # of the first message
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_ended = True
+        self._thread.join()
+
+    def wait_for(self, stamp: float) -> None:
+        """Wait for the sample at a stamp of the scans' clock, for 50 ms and the delay of the IMU's clock at most."""
+        late_s = self._stream.offset_s
+        end = time.monotonic() + _SWEEP_PATIENCE_S + max(0.0, late_s)
+        while self._stream.last_s - late_s < stamp and time.monotonic() < end:
+            time.sleep(_STEP_S)
+
+    def _run(self) -> None:
+        while not self._is_ended:
+            for message in self._receive(_POLL_S):
+                self._take(message)
+
+    def _take(self, message: Received) -> None:
+        """Give a message to the stream; one that is damaged or late is left out, as a gap between samples."""
+        try:
+            stamp_ns, frame_id = read_header(message.raw, ros2=True)
+            numbers = imu_numbers(message.raw, ros2=True)
+        except ValueError:
+            return
+        stamp = (stamp_ns or message.published_ns) / 10**9
+        if numbers is None or stamp <= self._stream.last_s or self._is_stray(stamp):
+            return
+        rates, forces = numbers[ANGULAR_VELOCITY], numbers[ACCELERATION]
+        if np.isfinite(rates).all() and np.isfinite(forces).all():
+            self._stream.add(stamp, rates, forces)
+            self.frame_id = self.frame_id or frame_id
+
+    def _is_stray(self, stamp: float) -> bool:
+        """Whether a stamp is an outlier, far ahead of the last one; several in a row are a new time."""
+        self._strays = self._strays + 1 if stamp > self._stream.last_s + _FAR_S else 0
+        return np.isfinite(self._stream.last_s) and 0 < self._strays < _STRAYS

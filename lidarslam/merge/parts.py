@@ -1,0 +1,269 @@
+"""The recordings of a merge: each is tracked as a task of its own, and leaves its result in a run directory."""
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lidarslam.config.settings import Config
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.files import only_writer, remove_partial_files
+from lidarslam.core.state.stateful import Saved, decode
+from lidarslam.core.state.tree import encode
+from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.text.names import safe_name
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.published.evalio_names import resolved
+from lidarslam.datasets.published.fetched import fetch
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.config import MapFormat
+from lidarslam.mapping.global_map.moved_points import Views
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.slides.slides import PairTests
+from lidarslam.run.interruption import Interruptions
+from lidarslam.run.loop_closing import begin_graph
+from lidarslam.run.request import RunRequest
+from lidarslam.run.resuming import describe_computed
+from lidarslam.run.run import open_odometry, require_apart
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
+from lidarslam.storage import directory as files
+from lidarslam.storage.about import About
+from lidarslam.storage.checkpoint_files import CheckpointFiles
+from lidarslam.storage.directory import RunDirectory, files_in, remove_run
+from lidarslam.storage.state_file import read_state, write_state
+from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.unfinished import Unfinished, remove_unfinished
+from lidarslam.viewer.viewer import Viewer
+
+# The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.
+_PART = re.compile(r"\d{2,}_[\w.-]+")
+
+
+@dataclass(frozen=True)
+class MergeRequest:
+    """Several recordings to be merged into one map."""
+
+    # two recordings or more, each once; the first of those that are connected gives the frame
+    sources: tuple[Path, ...]
+    out: Path  # the directory of the merged map
+    config: Config  # loops are closed whatever it says
+    map_formats: tuple[MapFormat, ...] = ()  # what the maps are written as beside .ply
+    overwrite: bool = False  # whether an earlier merge, or a run, in `out` is replaced
+    resume: bool = False  # whether the merge in `out`, which was killed or stopped, is continued
+    where: Where = SERIAL  # where recordings are tracked
+
+    def describe(self) -> dict[str, Any]:
+        """For config.yaml, and for the parts of an unfinished merge."""
+        return {"version": version("lidarslam"), "sources": [str(resolved(source)) for source in self.sources]}
+
+
+def closing_loops(config: Config) -> Config:
+    """The configuration with the pose graph.
+
+    Raises:
+        ConfigError: the odometry is a trajectory of one recording.
+    """
+    if config.odometry.method == "external":
+        raise ConfigError(
+            "odometry.method is external: one trajectory is not that of several recordings; choose another"
+        )
+    return config.model_copy(update={"pose_graph": config.pose_graph.model_copy(update={"enabled": True})})
+
+
+def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:
+    """The run of each recording; directories count from 1 and take the recordings' names, as file names allow.
+
+    Raises:
+        InputError: a recording cannot be read, or is named twice.
+        OutputError: the output is a recording, or holds an unfinished merge.
+    """
+    if len(request.sources) < 2:
+        raise InputError("expected two recordings or more; for the map of a single one use lidarslam run")
+    parts: list[tuple[RunRequest, Recording]] = []
+    for number, source in enumerate(request.sources, start=1):
+        if source.resolve() in {earlier.source.resolve() for earlier, _ in parts}:
+            raise InputError(f"{source}: is named twice; name every recording once")
+        require_apart(request.out, source)
+        recording = open_recording(source, request.config.reader)
+        if not len(recording):
+            raise InputError(f"{source}: holds no scan; leave it out")
+        name = safe_name(re.sub(r"[^\w.-]+", "_", recording.name).strip("._"))
+        out = request.out / f"{number:02d}_{name}"
+        require_apart(out, source)
+        parts.append((RunRequest(source, out, request.config, map_formats=request.map_formats), recording))
+    about = None if request.overwrite or request.resume else About.read(request.out)
+    if about is not None:
+        raise OutputError(f"{request.out}: {about.remedy(request.out)}")
+    return parts
+
+
+def earlier_parts(out: Path) -> set[str]:
+    """The directories of the recordings of an earlier merge, finished or not."""
+    names: list[str] = []
+    with suppress(InputError):
+        names += [entry["directory"] or "" for entry in read_summary(out).get("recordings", [])]
+    with suppress(InputError):
+        about = About.read(out)
+        names += [] if about is None else about.description.get("parts", [])
+    return {name for name in names if _PART.fullmatch(name)}
+
+
+def remove_part(path: Path) -> None:
+    """Remove the run of a recording that is no longer merged, however far it came."""
+    if path.is_symlink():  # what it leads to is not of this merge
+        return
+    if (path / files.ABOUT).exists():
+        remove_unfinished(path)
+        return
+    if path.is_dir():
+        with only_writer(path):
+            remove_partial_files(path)
+    remove_run(path)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPart:
+    """What `Tracked` holds of a recording, but what is read from it again or drawn anew."""
+
+    log: ScanLog
+    asked: int
+    faults: Faults
+    views: Views
+    slides: PairTests
+    stopped: str | None  # why it ended before its last scan
+    interrupted: bool  # whether that was an interruption
+
+    @classmethod
+    def of(cls, tracked: Tracked) -> "TrackedPart":
+        """A recording that was just tracked."""
+        interrupted = isinstance(tracked.error, KeyboardInterrupt)
+        log, slides = tracked.log, tracked.slides
+        return cls(log, tracked.asked, tracked.faults, tracked.views, slides, tracked.stopped, interrupted)
+
+    def write(self, unfinished: Unfinished, graph: KeyframeGraph) -> None:
+        """Leave it, and its graph, whose submaps are there already.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        write_state(unfinished.files.tracked, {"part": encode(TrackedPart, self), "graph": graph.state()})
+
+
+def read_part(saved: Saved) -> TrackedPart:
+    """The recording of a file; InputError where it is damaged."""
+    part: TrackedPart = decode(TrackedPart, saved.value("part"), saved.at("part"))
+    return part
+
+
+def read_graph(saved: Saved, config: Config, submaps: Path) -> KeyframeGraph:
+    """Its graph; InputError where a file is damaged."""
+    graph = KeyframeGraph(config.pose_graph.keyframes, file=submaps)
+    graph.restore(saved.part("graph"))
+    return graph
+
+
+# A process whose node was lost may be at work for some seconds more.
+_PATIENCE_S = 60.0
+
+Show = Callable[[str], AbstractContextManager[Progress]]
+"""Opens the progress of a recording, given its name."""
+
+
+@dataclass(frozen=True)
+class PartTask:
+    """The tracking of one recording."""
+
+    request: RunRequest
+    name: str  # for the progress
+    merge: dict[str, Any]  # which merge it is a part of
+    folder: str  # that relative paths are relative to
+    url: str | None  # of the source, where it was fetched
+
+
+@dataclass(frozen=True)
+class PartDone:
+    """A recording after its task."""
+
+    scans: int  # that were tracked
+    missing: str = ""  # why there is none
+    interrupted: bool = False  # whether there would be more
+
+
+@contextlib.contextmanager
+def _unseen(_name: str) -> Iterator[Progress]:
+    yield lambda _number, _total, _result: None
+
+
+def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
+    """Track a recording, from its last checkpoint where there is one; nothing is done where it was tracked before.
+
+    Raises:
+        LidarSlamError: the recording, the configuration or the directory is not usable, or the directory of the merge
+            is not that of another machine.
+    """
+    out = task.request.out
+    with ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a machine without that folder has no file there either
+            stack.enter_context(contextlib.chdir(task.folder))
+        if task.url is not None:
+            fetch(task.url, task.request.source)
+        if About.read(out.parent) is None:
+            raise OutputError(
+                f"{out.parent}: is not shared by the nodes of the cluster; name a folder that is with --out"
+            )
+        interruptions = stack.enter_context(Interruptions())
+        recording = open_recording(task.request.source, task.request.config.reader)
+        files = CheckpointFiles(out)
+        files.require_own()
+        files.make_folder()
+        stack.enter_context(only_writer(files.folder, _PATIENCE_S))
+        description = describe_computed(task.request, recording) | task.merge
+        is_begun = About.read(out) is not None
+        unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out, files_in(out)), description, is_begun))
+        if unfinished.files.tracked.is_file():
+            earlier = read_part(read_state(unfinished.files.tracked))
+            if not earlier.interrupted:
+                return PartDone(len(earlier.log))
+        with show(task.name) as progress:
+            return _track(task.request, recording, unfinished, progress, interruptions)
+
+
+def _track(
+    request: RunRequest,
+    recording: Recording,
+    unfinished: Unfinished,
+    progress: Progress,
+    interruptions: Interruptions,
+) -> PartDone:
+    """Track a recording, and leave the result."""
+    graph, scans, log = _open_graph(request.config, unfinished), range(len(recording)), ScanLog()
+    with closing(graph), closing(open_odometry(request.config, None)) as odometry:
+        try:
+            tracked = track(request, recording, scans, odometry, log, graph, Viewer(), progress, unfinished)
+        except NoScanError as error:
+            unfinished.end(stopped=False)
+            return PartDone(0, f"{request.source}: interrupted" if error.interrupted else str(error), error.interrupted)
+        interruptions.protect_results()
+        graph.end_recording()
+        part = TrackedPart.of(tracked)
+        part.write(unfinished, graph)
+    if not part.interrupted:
+        unfinished.remove_checkpoint()
+    return PartDone(len(part.log), interrupted=part.interrupted)
+
+
+def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:
+    """The graph of one recording, new or as it was saved; with loop closures only where they correct the local map."""
+    graph: KeyframeGraph | None = None
+    if config.mapping.method == "surfels" and config.pose_graph.corrects_local_map:
+        graph = begin_graph(config, file=unfinished.files.submaps)
+    graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=unfinished.files.submaps)
+    if unfinished.saved is not None:
+        graph.restore(unfinished.saved.part("graph"))
+    return graph

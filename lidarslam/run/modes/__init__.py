@@ -1,1 +1,0 @@
-"""Other ways to run: a running robot, a given map, several recordings."""

@@ -1,1 +1,0 @@
-"""A recording localised in a finished map, on disk."""
