@@ -74,7 +74,8 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
     with contextlib.ExitStack() as serve:
         with show_progress(topic or "live") as progress:
             progress.phase("loading the program")
-            from lidarslam.live.live import LiveRequest, execute
+            from lidarslam.live.live import execute
+            from lidarslam.live.session import LiveRequest
             from lidarslam.run.summary_text import format_outcome
             from lidarslam.storage.directory import RERUN
 

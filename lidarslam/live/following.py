@@ -15,10 +15,9 @@ from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.live.clouds import CloudDecoder, LiveScan
 from lidarslam.live.dds import DdsNode, PublishedTopic
-from lidarslam.live.live import LiveRequest
 from lidarslam.live.messages import PosePublisher
 from lidarslam.live.receiving import Arrived, ImuReceiver, IncomingQueue
-from lidarslam.live.session import LiveSession
+from lidarslam.live.session import LiveRequest, LiveSession
 from lidarslam.live.statistics import LiveCounts, LiveStatistics
 from lidarslam.pipeline.imu_stream import ImuStream
 

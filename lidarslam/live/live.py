@@ -4,7 +4,6 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
@@ -14,9 +13,8 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.receiving import IMU_DEPTH, ImuReceiver, IncomingQueue, find_imu, find_topic
-from lidarslam.live.session import LiveSession, warm_up
+from lidarslam.live.session import LiveRequest, LiveSession, warm_up
 from lidarslam.live.statistics import LiveCounts
-from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.inertial import make_imu_stream
@@ -27,34 +25,12 @@ from lidarslam.run.run import open_odometry, require_no_trajectory, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.viewer.rerun_program import require_window
-from lidarslam.viewer.viewer import RerunMode
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
     from lidarslam.live.dds import DdsNode
     from lidarslam.live.following import Follower
     from lidarslam.pipeline.imu_stream import ImuStream
-
-
-@dataclass(frozen=True)
-class LiveRequest:
-    """Topic, configuration and destination of a live run."""
-
-    out: Path  # the run directory
-    config: Config  # of the computation
-    topic: str | None = None  # of the clouds; None: the only one there is
-    domain: int = 0  # of DDS
-    # duration_s, scans: when it ends by itself, counted from the first scan; while none comes, from the beginning
-    duration_s: float | None = None
-    scans: int | None = None
-    queue: int = 20  # scans that may wait for registration
-    odom_frame: str = "odom"  # the fixed frame of the published poses
-    base_frame: str | None = None  # the frame that moves, connected to the LiDAR's by /tf_static; None: the LiDAR's own
-    publish_tf: bool = True  # whether the pose is published on /tf as well
-    rerun: RerunMode = "off"
-    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
-    overwrite: bool = False  # whether an earlier run in `out` is replaced
-    report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 import time
 from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -9,6 +11,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
+from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.background_worker import BackgroundWorker
@@ -18,7 +21,7 @@ from lidarslam.pipeline.rehearsal import made_up_scans
 from lidarslam.pipeline.stages import Stages
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Tracked
-from lidarslam.viewer.viewer import Viewer
+from lidarslam.viewer.viewer import RerunMode, Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -109,3 +112,24 @@ def warm_up(config: Config, odometry: Odometry) -> None:
         for scan in made_up_scans():
             estimated = stages.estimate(scan)
             stages.build(estimated, stages.localise(estimated))
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """Topic, configuration and destination of a live run."""
+
+    out: Path  # the run directory
+    config: Config  # of the computation
+    topic: str | None = None  # of the clouds; None: the only one there is
+    domain: int = 0  # of DDS
+    # duration_s, scans: when it ends by itself, counted from the first scan; while none comes, from the beginning
+    duration_s: float | None = None
+    scans: int | None = None
+    queue: int = 20  # scans that may wait for registration
+    odom_frame: str = "odom"  # the fixed frame of the published poses
+    base_frame: str | None = None  # the frame that moves, connected to the LiDAR's by /tf_static; None: the LiDAR's own
+    publish_tf: bool = True  # whether the pose is published on /tf as well
+    rerun: RerunMode = "off"
+    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
+    overwrite: bool = False  # whether an earlier run in `out` is replaced
+    report: bool = False  # whether a page and pictures are drawn, once all else is written
