@@ -13,10 +13,8 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.imu import ImuSamples
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
 from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
 from lidarslam.datasets.ros.made_messages import (
@@ -27,12 +25,12 @@ from lidarslam.datasets.ros.made_messages import (
     vector,
     write_chunk_checksums,
 )
-from lidarslam.simulation.choices import choose
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers import CLOCK_START_NS, Rig, clock_ns
 
 Records = NDArray[np.void]
 _FIRST_RETURN = 0x10
+_CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class DriverCloud:
     columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # beside x, y, z, by the sweep and its stamp_ns
     imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one beside it
     imu_frame_id: str = "imu_link"
-    custom_message: bool = False  # Livox's own rather than PointCloud2
+    message_type: str = POINT_CLOUD2_TYPE
 
     def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
         """The points (N,) of a sweep whose message is stamped `stamp_ns`."""
@@ -55,11 +53,6 @@ class DriverCloud:
         for name, values in self.columns(simulated, stamp_ns).items():
             records[name] = values
         return records
-
-
-def find_driver(name: str) -> DriverCloud:
-    """The layout of a driver."""
-    return choose("driver", name, DRIVERS)
 
 
 def _offsets(simulated: SimulatedScan) -> NDArray[np.float64]:
@@ -121,36 +114,13 @@ DRIVERS: dict[str, DriverCloud] = {
     "velodyne": DriverCloud("/velodyne_points", "velodyne", _VELODYNE_POINT, _velodyne),
     "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, _ouster, "/ouster/imu", "os_imu"),
     "hesai": DriverCloud("/lidar_points", "hesai_lidar", _HESAI_POINT, _hesai),
-    "livox": DriverCloud("/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, "/livox/imu", "livox_imu", True),
+    "livox": DriverCloud(
+        "/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, "/livox/imu", "livox_imu", _CUSTOM_MESSAGE
+    ),
 }
 
-
-IMU_TYPE = "sensor_msgs/msg/Imu"
-
-
-def imu_messages(store: Typestore, imu: ImuSamples, frame_id: str) -> Iterator[tuple[int, Any]]:
-    """Stamps in nanoseconds of the clock and messages of samples stamped in simulated seconds."""
-    types = store.types
-    orientation, unknown = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
-    no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition has it
-    for number, stamp in enumerate(imu.stamps):
-        stamp_ns = clock_ns(stamp)
-        yield (
-            stamp_ns,
-            types[IMU_TYPE](
-                header=header(store, stamp_ns, frame_id, number),
-                orientation=orientation,
-                orientation_covariance=no_orientation,
-                angular_velocity=vector(store, imu.angular_velocities[number]),
-                angular_velocity_covariance=unknown,
-                linear_acceleration=vector(store, imu.accelerations[number]),
-                linear_acceleration_covariance=unknown,
-            ),
-        )
-
-
+_IMU_TYPE = "sensor_msgs/msg/Imu"
 _STATIC_TRANSFORMS = "/tf_static"
-_CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
 _CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
 
 _LIDAR_ID = 192  # the last byte of the sensor's address
@@ -189,8 +159,8 @@ Messages = Iterator[tuple[Any, int, bytes]]
 def _clouds(
     bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", scans: Iterable[SimulatedScan], rig: Rig
 ) -> Messages:
-    driver = find_driver(rig.driver)
-    connection = bag.add_connection(driver.topic, serializer.message_type(driver), typestore=serializer.store)
+    driver = DRIVERS[rig.driver]
+    connection = bag.add_connection(driver.topic, driver.message_type, typestore=serializer.store)
     # A message is published, and recorded, when its last point has been measured.
     latency_ns = round(1e9 * rig.sweep_s)
     for number, simulated in enumerate(scans):
@@ -201,18 +171,29 @@ def _clouds(
 
 def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", rig: Rig) -> Messages:
     """Where the IMU is on the LiDAR, then a message a sample."""
-    driver, imu = find_driver(rig.driver), rig.imu
+    driver, imu, store = DRIVERS[rig.driver], rig.imu, serializer.store
     if imu is None:
         return
-    store = serializer.store
     if imu.T_lidar_imu is not None:
         placed = bag.add_connection(_STATIC_TRANSFORMS, TRANSFORMS_TYPE, typestore=store)
         parent = header(store, CLOCK_START_NS, driver.frame_id)
         message = transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
         yield placed, CLOCK_START_NS, serializer.serialized(message, TRANSFORMS_TYPE)
-    connection = bag.add_connection(driver.imu_topic, IMU_TYPE, typestore=store)
-    for stamp_ns, sample in imu_messages(store, imu, driver.imu_frame_id):
-        yield connection, stamp_ns, serializer.serialized(sample, IMU_TYPE)
+    connection = bag.add_connection(driver.imu_topic, _IMU_TYPE, typestore=store)
+    orientation, unknown = store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
+    no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition has it
+    for number, stamp in enumerate(imu.stamps):
+        stamp_ns = clock_ns(stamp)
+        sample = store.types[_IMU_TYPE](
+            header=header(store, stamp_ns, driver.imu_frame_id, number),
+            orientation=orientation,
+            orientation_covariance=no_orientation,
+            angular_velocity=vector(store, imu.angular_velocities[number]),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=vector(store, imu.accelerations[number]),
+            linear_acceleration_covariance=unknown,
+        )
+        yield connection, stamp_ns, serializer.serialized(sample, _IMU_TYPE)
 
 
 class MessageSerializer:
@@ -226,21 +207,16 @@ class MessageSerializer:
         if not ros2:  # ROS 2's store has it
             self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
 
-    def message_type(self, driver: DriverCloud) -> str:
-        """The name of the driver's message type."""
-        return _CUSTOM_MESSAGE if driver.custom_message else POINT_CLOUD2_TYPE
-
     def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
         """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
         message_header = header(self.store, stamp_ns, driver.frame_id, sequence)
-        message_type = self.message_type(driver)
-        if not driver.custom_message:
-            return self.serialized(point_cloud(self.store, message_header, records), message_type)
+        if driver.message_type != _CUSTOM_MESSAGE:
+            return self.serialized(point_cloud(self.store, message_header, records), driver.message_type)
         rsvd = np.zeros(3, np.uint8)
-        message = self.store.types[message_type](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
+        message = self.store.types[_CUSTOM_MESSAGE](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
         # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
         # empty list, which ends the message with its length.
-        without_points = self.serialized(message, message_type)[:-4]
+        without_points = self.serialized(message, _CUSTOM_MESSAGE)[:-4]
         return without_points + len(records).to_bytes(4, "little") + self._packed(records)
 
     def serialized(self, message: Any, message_type: str) -> bytes:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from lidarslam.simulation.choices import choose
 from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.world import choose
 from lidarslam.simulation.writers import CLOCK_START_NS, Rig, Writer, write_kitti, write_ply_scans
 
 

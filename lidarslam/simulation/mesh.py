@@ -34,12 +34,6 @@ class Mesh:
     vertices: FloatArray  # (V, 3)
     triangles: IntArray  # (T, 3) indices into `vertices`
 
-    def __post_init__(self) -> None:
-        if self.vertices.shape[1:] != (3,) or self.triangles.shape[1:] != (3,):
-            raise ValueError(f"Mesh must be (V, 3) and (T, 3), got {self.vertices.shape} and {self.triangles.shape}")
-        if self.triangles.size and not 0 <= self.triangles.min() <= self.triangles.max() < len(self.vertices):
-            raise ValueError(f"Mesh.triangles must index {len(self.vertices)} vertices, got {self.triangles.max()}")
-
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles of several meshes in one, in their order."""

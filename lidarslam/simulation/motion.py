@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.choices import choose
-from lidarslam.simulation.world import World
+from lidarslam.simulation.world import World, choose
 
 # Columns of `Motion.base`.
 CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "activity")
@@ -51,10 +50,6 @@ class Motion:
     sensor_height_m: float  # of a LiDAR above the body's origin
     repeats: bool = True  # another lap follows a lap; else the body stays where it is in the end
     rests: bool = True  # a lap begins and ends at rest; else its last pose is its first, whole turns of yaw aside
-
-    def __post_init__(self) -> None:
-        if self.base.shape != (len(self.times), len(CHANNELS)) or self.times[0] != 0.0:
-            raise ValueError(f"Motion.base must be ({len(self.times)}, {len(CHANNELS)}), got {self.base.shape}")
 
     @property
     def duration_s(self) -> float:

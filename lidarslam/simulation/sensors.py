@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.choices import choose
+from lidarslam.simulation.world import choose
 
 
 class Rays(NamedTuple):
@@ -35,13 +35,6 @@ class Spinning:
     columns: int  # in a turn
     start_azimuth_deg: float = 180.0  # where the turn starts, counter-clockwise from x
     clockwise: bool = True  # the sense of rotation, seen from above
-
-    def __post_init__(self) -> None:
-        for name in ("azimuth_offsets_deg", "firing"):
-            if getattr(self, name).shape != self.elevations_deg.shape:
-                raise ValueError(f"Spinning.{name} must be {self.elevations_deg.shape}")
-        if self.firing.min() < 0.0 or self.firing.max() >= 1.0:
-            raise ValueError("Spinning.firing must lie in [0, 1)")
 
     @property
     def lasers(self) -> int:

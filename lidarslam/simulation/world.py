@@ -1,13 +1,16 @@
 """Worlds: boxes, cylinders and height fields, moving boxes, and a route through them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.simulation.choices import choose
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +99,6 @@ class Grass:
     heights: HeightField  # of the blades above the ground, 0 where none grow
     free_path_m: float  # mean path of a ray among the blades until one reflects it
 
-    def __post_init__(self) -> None:
-        if self.heights.heights.min() < 0.0 or not self.free_path_m > 0.0:
-            raise ValueError(f"Grass must have heights of 0 or more and a positive path, got {self.free_path_m}")
-
 
 @dataclass(frozen=True, eq=False)
 class Mover:
@@ -182,6 +181,13 @@ def _check(owner: object, **shapes: tuple[int, ...]) -> None:
 WORLDS = (
     "street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace", "town", "corridor", "stairs", "crowd",
 )  # fmt: skip
+
+
+def choose(kind: str, name: str, table: Mapping[str, T]) -> T:
+    """The entry of that name; an InputError lists the names there are."""
+    if name not in table:
+        raise InputError(f"no {kind} is called {name!r}; there are: {', '.join(table)}")
+    return table[name]
 
 
 def build_world(name: str, seed: int) -> World:

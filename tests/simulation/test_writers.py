@@ -15,7 +15,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer, find_driver
+from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer
 from lidarslam.simulation.formats import FORMATS, find_format
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers import CLOCK_START_NS, T_CAM_LIDAR, Rig, clock_ns, compensate
@@ -173,10 +173,10 @@ def test_a_scan_without_points(name, driver, tmp_path, sweeps, drive):
 
 def test_driver_values(sweeps):
     simulated = sweeps[2]
-    ouster = find_driver("ouster").records(simulated, CLOCK_START_NS)
+    ouster = DRIVERS["ouster"].records(simulated, CLOCK_START_NS)
     np.testing.assert_allclose(ouster["range"], 1e3 * np.linalg.norm(simulated.scan.points, axis=1), atol=0.51)
     np.testing.assert_array_equal(ouster["reflectivity"], simulated.intensities)
-    velodyne = find_driver("velodyne").records(simulated, CLOCK_START_NS)
+    velodyne = DRIVERS["velodyne"].records(simulated, CLOCK_START_NS)
     np.testing.assert_array_equal(velodyne["intensity"], simulated.intensities)
     np.testing.assert_allclose(velodyne["time"], simulated.scan.time_offsets, rtol=1e-7, atol=1e-12)
 

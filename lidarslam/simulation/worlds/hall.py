@@ -31,14 +31,6 @@ _FREE_SIDE_M, _FREE_HEIGHT_M = 0.9, 2.2
 
 
 @dataclass(frozen=True)
-class Ramp:
-    """A ramp `LANE_M` wide, by the middle of its upper face's ends (3,)."""
-
-    foot: FloatArray
-    head: FloatArray
-
-
-@dataclass(frozen=True)
 class Deck:
     """A level floor on columns."""
 
@@ -57,7 +49,7 @@ class HallPlan:
     height: float  # inside
     aisle_y: tuple[float, float]  # of the two aisles across the ground floor
     turn_x: float  # where the way changes from one aisle to the other
-    ramps: tuple[Ramp, ...]  # A to D in the picture above
+    ramps: FloatArray  # (4, 2, 3) foot and head of A to D in the picture above, the middle of their upper faces' ends
     decks: tuple[Deck, ...]  # deck 1, deck 2, landing
     route: Route
 
@@ -82,7 +74,7 @@ def draw_hall(rng: np.random.Generator) -> HallPlan:
         *(*ramp_b, (near, far, 2.0 * rise), *ramp_c[::-1], (near, near, rise), *ramp_d[::-1]),
     ]
     route = Route(np.array(waypoints), 0.8, _FREE_SIDE_M, _FREE_HEIGHT_M, 2.0)
-    ramps = tuple(Ramp(np.array(foot), np.array(head)) for foot, head in (ramp_a, ramp_b, ramp_c, ramp_d))
+    ramps = np.array([ramp_a, ramp_b, ramp_c, ramp_d])
     decks = _decks(width, depth, rise, deck_1_x, landing_y)
     return HallPlan(width, depth, height, aisles, turn_x, ramps, decks, route)
 
@@ -114,28 +106,19 @@ def _decks(width: float, depth: float, rise: float, deck_1_x: float, landing_y: 
 _SLAB_M, _RAIL_M = 0.25, 1.1
 
 
-def draw_decks(plan: HallPlan, builder: Builder, clearance: Clearance) -> None:
-    """All ramps, decks and stairs; their space is taken."""
-    for ramp in plan.ramps:
-        _draw_ramp(ramp, builder, clearance)
-    for deck in plan.decks:
-        _draw_deck(deck, builder, clearance)
-    _draw_stairs(plan, builder, clearance)
-
-
-def _draw_ramp(ramp: Ramp, builder: Builder, clearance: Clearance) -> None:
-    step = ramp.head - ramp.foot
+def _draw_ramp(foot: FloatArray, head: FloatArray, builder: Builder, clearance: Clearance) -> None:
+    step = head - foot
     along = step / np.linalg.norm(step)
     side = np.array([-along[1], along[0], 0.0]) / np.hypot(along[0], along[1])
     down = 0.5 * _SLAB_M * np.cross(side, along)
-    builder.beam(ramp.foot + down, ramp.head + down, LANE_M, _SLAB_M)
+    builder.beam(foot + down, head + down, LANE_M, _SLAB_M)
     for sign in (-1.0, 1.0):
         edge = sign * (0.5 * LANE_M - 0.06) * side
-        builder.beam(ramp.foot + edge + 0.06 * UP, ramp.head + edge + 0.06 * UP, 0.12, 0.14)
-        draw_railing(ramp.foot + edge, ramp.head + edge, builder)
+        builder.beam(foot + edge + 0.06 * UP, head + edge + 0.06 * UP, 0.12, 0.14)
+        draw_railing(foot + edge, head + edge, builder)
     reach = np.abs(side) * 0.5 * LANE_M
     for k, (a, b) in enumerate(pairwise(np.linspace(0.0, 1.0, round(float(np.linalg.norm(step))) + 1))):
-        low, high = ramp.foot + a * step, ramp.foot + b * step
+        low, high = foot + a * step, foot + b * step
         bottom, top = np.minimum(low, high) - reach, np.maximum(low, high) + reach
         clearance.take(bottom - (_SLAB_M + 0.25) * UP, top + _RAIL_M * UP)
         if k % 5 == 4 and low[2] > 1.0:
@@ -213,17 +196,6 @@ class Yard:
         spot = Spot(self.builder, at, 0.5 * np.pi * turned + np.pi * float(self.rng.integers(2)))
         piece(spot, size, self.rng)
         return True
-
-
-def fill_floors(plan: HallPlan, yard: Yard) -> tuple[Mover, ...]:
-    """Fork-lifts' rounds first, then racks in rows, then machines, then goods; the fork-lifts."""
-    movers = _send_forklifts(plan, yard)
-    _set_racks(plan, yard)
-    _set_machines(plan, yard)
-    for deck in plan.decks[:2]:
-        _fill(yard, deck.low + 0.4, deck.high - 0.4, deck.z, 40)
-    _fill(yard, np.full(2, 0.6), np.array([plan.width, plan.depth]) - 0.6, 0.0, 300)
-    return movers
 
 
 def _send_forklifts(plan: HallPlan, yard: Yard) -> tuple[Mover, ...]:
@@ -306,9 +278,19 @@ def build(seed: int) -> World:
     rng = np.random.default_rng(seed)
     plan = draw_hall(rng)
     builder, clearance = Builder(), Clearance(plan.route)
-    draw_decks(plan, builder, clearance)
+    for foot, head in plan.ramps:
+        _draw_ramp(foot, head, builder, clearance)
+    for deck in plan.decks:
+        _draw_deck(deck, builder, clearance)
+    _draw_stairs(plan, builder, clearance)
     draw_shell(plan, builder, clearance, rng)
-    movers = fill_floors(plan, Yard(builder, clearance, rng))
+    yard = Yard(builder, clearance, rng)
+    movers = _send_forklifts(plan, yard)
+    _set_racks(plan, yard)
+    _set_machines(plan, yard)
+    for deck in plan.decks[:2]:
+        _fill(yard, deck.low + 0.4, deck.high - 0.4, deck.z, 40)
+    _fill(yard, np.full(2, 0.6), np.array([plan.width, plan.depth]) - 0.6, 0.0, 300)
     world = World("hall", seed, plan.route, *builder.solids, movers=movers)
     return _mirrored(world, rng.choice([-1.0, 1.0], 2))
 

@@ -303,7 +303,9 @@ def build(seed: int) -> World:
     doors, route = draw_doors(plan, rng)
     height = rng.uniform(2.6, 3.2)
     builder, clearance = Builder(), Clearance(route)
-    draw_slabs(plan, height, builder)
+    low, high = plan.extent[0] - 1.0, plan.extent[1] + 1.0
+    for z in (-0.15, height + 0.15):
+        builder.box((*(0.5 * (low + high)), z), (*(high - low), 0.3))
     draw_walls(plan, doors, height, builder, clearance)
     put = Furnisher(builder, clearance, rng)
     for one, other in combinations(plan.corridors, 2):  # where they cross, there is only floor
@@ -332,16 +334,14 @@ def draw_walls(plan: Plan, doors: list[Door], height: float, builder: Builder, c
             _facade(spot, wall, height, clearance)
             continue
         here = [door for door in doors if door.wall == k]
+        top = DOOR_HEIGHT_M + _FRAME_M
+        clear = [(door.along, 0.5 * door.width + _FRAME_M) for door in here]
+        openings = [Opening((along - half, along + half), (0.0, top)) for along, half in clear]
         half = 0.5 * WALL_M
         reach = (-half + HAIR_M, wall.length + half - HAIR_M)
-        spot.pierced_wall(reach, (-half, half), height, [_opening(door) for door in here])
+        spot.pierced_wall(reach, (-half, half), height, openings)
         for door in here:
             _draw_door(spot, wall, door, clearance)
-
-
-def _opening(door: Door) -> Opening:
-    half = 0.5 * door.width + _FRAME_M
-    return Opening((door.along - half, door.along + half), (0.0, DOOR_HEIGHT_M + _FRAME_M))
 
 
 def _draw_door(spot: Spot, wall: WallLine, door: Door, clearance: Clearance) -> None:
@@ -386,14 +386,6 @@ def _facade(spot: Spot, wall: WallLine, height: float, clearance: Clearance) -> 
         foot = spot.shifted(m, inner, yaw=0.0 if inwards > 0.0 else np.pi)
         if clearance.claim(*foot.bounds((-half, half), (0.0, 0.14), (0.0, 0.75))):
             radiator(foot, 2.0 * half)
-
-
-def draw_slabs(plan: Plan, height: float, builder: Builder) -> None:
-    """Floor and ceiling."""
-    low, high = plan.extent[0] - 1.0, plan.extent[1] + 1.0
-    middle, size = 0.5 * (low + high), high - low
-    for z in (-0.15, height + 0.15):
-        builder.box((*middle, z), (*size, 0.3))
 
 
 def draw_corridor_ceiling(corridor: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:

@@ -61,7 +61,9 @@ class StairPlan:
 def build(seed: int) -> World:
     """The stairwell of that seed: four to six storeys up and down again; the ground floor is at z = 0."""
     rng = np.random.default_rng(seed)
-    plan = draw_stairs(rng)
+    storeys, steps = int(rng.integers(4, 7)), int(rng.integers(9, 11))
+    width, shaft, landing = rng.uniform(1.25, 1.4), rng.uniform(0.2, 0.6), rng.uniform(1.35, 1.6)
+    plan = StairPlan(storeys, steps, width, shaft, landing, rng.uniform(4.0, 6.0))
     builder, route = Builder(), _route(plan)
     for number in range(2 * plan.storeys):
         _draw_flight(plan.flight(builder, number), plan)
@@ -69,13 +71,6 @@ def build(seed: int) -> World:
     draw_railing(top.point(0.0, -0.5 * plan.width, 0.0), top.point(0.0, 0.5 * plan.width + plan.shaft, 0.0), builder)
     _draw_shell(plan, builder, Clearance(route), rng)
     return World("stairs", seed, route, *builder.solids)
-
-
-def draw_stairs(rng: np.random.Generator) -> StairPlan:
-    """Measures of stairs that are comfortable to walk."""
-    storeys, steps = int(rng.integers(4, 7)), int(rng.integers(9, 11))
-    width, shaft, landing = rng.uniform(1.25, 1.4), rng.uniform(0.2, 0.6), rng.uniform(1.35, 1.6)
-    return StairPlan(storeys, steps, width, shaft, landing, rng.uniform(4.0, 6.0))
 
 
 def _route(plan: StairPlan) -> Route:

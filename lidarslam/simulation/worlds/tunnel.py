@@ -173,17 +173,13 @@ class Rock:
     ground: HeightField
     roof: HeightField
 
-    def is_solid(self, points: FloatArray) -> FloatArray:
-        """(N,) bool for points (N, 3)."""
-        xy = points[:, :2]
-        return np.asarray((points[:, 2] < self.ground.height_at(xy)) | (points[:, 2] > self.roof.height_at(xy)))
-
     def reach(self, origins: FloatArray, directions: FloatArray, furthest: float = 6.0) -> FloatArray:
         """Level distance (N,) from points (N, 3) in air along (N, 2) unit vectors to the rock, at most `furthest`."""
         steps = np.arange(0.0, furthest, 0.05)
         points = np.repeat(origins[:, None], len(steps), axis=1)
         points[:, :, :2] += steps[:, None] * directions[:, None]
-        solid = self.is_solid(points.reshape(-1, 3)).reshape(len(origins), len(steps))
+        x_y, z = points[..., :2].reshape(-1, 2), points[..., 2].ravel()
+        solid = ((z < self.ground.height_at(x_y)) | (z > self.roof.height_at(x_y))).reshape(len(origins), len(steps))
         return np.asarray(np.where(solid.any(axis=1), steps[solid.argmax(axis=1)], furthest))
 
 
