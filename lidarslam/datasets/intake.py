@@ -13,7 +13,7 @@ from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting.recording import recorded_axes
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.times.stamp_order import in_stamp_order
+from lidarslam.datasets.times.stamps import in_stamp_order
 
 # No LiDAR measures more points in a sweep; the cells are finer than any method's.
 _MOST_POINTS = 1 << 20

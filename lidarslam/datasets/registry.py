@@ -10,8 +10,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
-from lidarslam.datasets.mounting.elevation import KITTI_DEG
 from lidarslam.datasets.mounting.recording import MountedRecording
+from lidarslam.datasets.mounting.rotation import KITTI_DEG
 from lidarslam.datasets.published.evalio_names import is_of_evalio, located
 from lidarslam.datasets.published.unrecognised import absent, result_of_program, unrecognised
 from lidarslam.datasets.recording import Recording

@@ -11,8 +11,7 @@ from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import field_offsets, timed_scan
-from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, is_return
-from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, TimedCloud, is_return, learn_point_time
 
 # Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
 _MOST_LOOKED_AT = 10

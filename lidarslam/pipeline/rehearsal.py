@@ -36,7 +36,7 @@ def made_up_scans() -> tuple[Scan, ...]:
 
 
 def _reading() -> None:
-    from lidarslam.datasets.mounting.elevation import correct_elevation
+    from lidarslam.datasets.mounting.rotation import correct_elevation
 
     as_stored = np.ones((1, 4), dtype=np.float32)
     squared_ranges(Scan.from_raw(correct_elevation(as_stored[:, :3], 0.0), 0.0).points)
@@ -141,7 +141,7 @@ PARTS = {
         _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("residuals", "point_to_plane", "steps"))
     ),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
-    "reading": Part(_reading, ("core.scan", "datasets.mounting.elevation")),
+    "reading": Part(_reading, ("core.scan", "datasets.mounting.rotation")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.kernels")),
     "checks": Part(_checks, ("mapping.global_map.visibility_kernels", "mapping.slides.kernels"), is_late=True),
 }

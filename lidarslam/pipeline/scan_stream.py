@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.times.stamp_order import in_stamp_order
+from lidarslam.datasets.times.stamps import in_stamp_order
 
 T = TypeVar("T")
 

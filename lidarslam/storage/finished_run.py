@@ -14,10 +14,8 @@ from lidarslam.core.scan import PointAttributes
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.datasets.folders.pcd import read_pcd
-from lidarslam.datasets.folders.ply import read_ply
-from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
-from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
+from lidarslam.datasets.folders.formats import read_pcd, read_ply
+from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
 from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files

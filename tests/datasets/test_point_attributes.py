@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lidarslam.datasets.folders.ply import read_ply
-from lidarslam.datasets.folders.point_attributes import (
+from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.point_table import (
     find_colour_fields,
     find_intensity_field,
     read_colours,

@@ -8,8 +8,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.recording import PointField
 from lidarslam.datasets.ros.livox import decode_custom_message
 from lidarslam.datasets.ros.point_cloud2 import decode_point_cloud2
-from lidarslam.datasets.times.point_time import PointTimeModel
-from lidarslam.datasets.times.point_time_inference import infer_point_time
+from lidarslam.datasets.times.point_time import PointTimeModel, infer_point_time
 
 STAMP_NS = 1_700_000_000_250_000_000
 STAMP = STAMP_NS / 10**9

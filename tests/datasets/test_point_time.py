@@ -12,13 +12,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.times.point_time import (
     TIME_FIELD_NAMES,
     UNITS_PER_SECOND,
+    LearnedTime,
     PointTimeModel,
+    TimedCloud,
     find_ring_field,
     find_time_field,
-)
-from lidarslam.datasets.times.point_time_inference import (
-    LearnedTime,
-    TimedCloud,
     infer_point_time,
     learn_point_time,
     value_spread,

@@ -15,7 +15,7 @@ from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.truth_files import find_truth_file
+from lidarslam.datasets.folders.layout import find_truth_file
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.recording import PointField, Topic
 from lidarslam.datasets.registry import open_recording

@@ -12,8 +12,7 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.folders.pcd import read_pcd
-from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.formats import read_pcd, read_ply
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.times.stamps import read_stamps, stamps_from_names

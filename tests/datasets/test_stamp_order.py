@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.times.stamp_order import in_stamp_order
+from lidarslam.datasets.times.stamps import in_stamp_order
 
 YEAR_S = 365 * 86400.0
 

@@ -21,7 +21,7 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.storage.directory import FILES, RunDirectory

@@ -22,7 +22,7 @@ from lidarslam.core.geometry import is_rigid
 from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.storage.about import About
 from lidarslam.storage.directory import UNFINISHED
 

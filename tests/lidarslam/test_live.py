@@ -22,7 +22,7 @@ from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.elevation import correct_elevation
+from lidarslam.datasets.mounting.rotation import correct_elevation
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.live.clouds import CloudDecoder

@@ -19,7 +19,7 @@ from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.train.settings import TrainConfig
 
 

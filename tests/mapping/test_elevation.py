@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.tracking import Status
-from lidarslam.datasets.mounting.elevation import correct_elevation
+from lidarslam.datasets.mounting.rotation import correct_elevation
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.elevation.bias import PlacedPoints, combined, estimate_bias
 from lidarslam.mapping.elevation.stretches import ElevationEstimator

@@ -9,8 +9,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.folders.pcd import read_pcd
-from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.formats import read_pcd, read_ply
 from lidarslam.datasets.folders.point_table import coordinates
 
 # Surveys end well within this; squares of much more overflow.

@@ -10,12 +10,12 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.text.plain_text import count
-from lidarslam.datasets.folders.imu_csv import find_imu_file
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key
-from lidarslam.datasets.folders.truth_files import find_truth_file
+from lidarslam.datasets.imu_samples import find_imu_file
 from lidarslam.datasets.times.stamps import mend_stamps, read_stamps, stamps_from_names
 
 _STAMP_FILES = ("timestamps.txt", "times.txt")
+_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,3 +115,10 @@ def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int
             " use the file names or the rate"
         ) from None
     return mended, replaced - left, warnings
+
+
+def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | None:
+    """The true trajectory in the first folder that has one; `<stem>.tum` in any of them goes before general names."""
+    own = [folder / f"{stem}.tum" for folder in folders] if stem else []
+    general = [folder / name for folder in folders for name in _NAMES]
+    return next((path for path in own + general if path.is_file()), None)

@@ -18,13 +18,12 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.formats import table_reader
-from lidarslam.datasets.folders.imu_csv import IMU_FILE, read_imu_csv
 from lidarslam.datasets.folders.layout import find_layout
-from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
-from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
+from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
+from lidarslam.datasets.imu_samples import IMU_FILE, read_imu_csv
 from lidarslam.datasets.recording import PointField, Recording
-from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
-from lidarslam.datasets.times.azimuth_inference import (
+from lidarslam.datasets.times.azimuth import (
+    AZIMUTH_TIME,
     AzimuthTiming,
     Sweep,
     infer_azimuth_timing,
@@ -33,12 +32,14 @@ from lidarslam.datasets.times.azimuth_inference import (
 )
 from lidarslam.datasets.times.point_time import (
     CLOCK_LIMIT_S,
+    LearnedTime,
     PointTimeModel,
+    TimedCloud,
     find_ring_field,
     find_time_field,
     is_return,
+    learn_point_time,
 )
-from lidarslam.datasets.times.point_time_inference import LearnedTime, TimedCloud, learn_point_time
 from lidarslam.datasets.times.stamps import assumed_rate, scan_rate
 
 

@@ -13,8 +13,8 @@ from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.layout import find_truth_file
 from lidarslam.datasets.folders.scan_files import scan_indices
-from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.imu_samples import summarise
 from lidarslam.datasets.recording import PointField, RecordingInfo, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel

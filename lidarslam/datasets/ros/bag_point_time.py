@@ -13,10 +13,8 @@ from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import VELODYNE_SCAN_TYPE, BagMessage, StampSource
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import field_offsets
-from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
-from lidarslam.datasets.times.azimuth_inference import AzimuthTiming, Sweep, infer_azimuth_timing, time_warnings
-from lidarslam.datasets.times.point_time import PointTimeModel, is_return
-from lidarslam.datasets.times.point_time_inference import LearnedTime, TimedCloud, learn_point_time
+from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, AzimuthTiming, Sweep, infer_azimuth_timing, time_warnings
+from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, TimedCloud, is_return, learn_point_time
 
 # So many pairs of messages, spread over the first so many, are compared at their seams.
 _PAIRS, _LOOKED_AT = 40, 600

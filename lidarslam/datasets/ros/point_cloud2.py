@@ -10,7 +10,7 @@ from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointField as Po
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.folders.point_attributes import (
+from lidarslam.datasets.folders.point_table import (
     find_colour_fields,
     find_intensity_field,
     read_colours,

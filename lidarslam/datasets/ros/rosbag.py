@@ -15,8 +15,8 @@ from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults, first_readable, readable_scans
+from lidarslam.datasets.folders.layout import find_truth_file
 from lidarslam.datasets.folders.scan_files import scan_indices
-from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.packets.libraries import require
 from lidarslam.datasets.recording import Recording, RecordingInfo, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
@@ -33,7 +33,7 @@ from lidarslam.datasets.ros.bag_topics import choose_topic, one_part, others_lef
 from lidarslam.datasets.ros.ouster_bag import OusterBag
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import timed_scan
-from lidarslam.datasets.times.stamp_order import in_stamp_order
+from lidarslam.datasets.times.stamps import in_stamp_order
 
 logger = logging.getLogger(__name__)
 

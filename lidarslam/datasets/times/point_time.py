@@ -1,14 +1,18 @@
 """Time of each point of a sweep: which field holds it, and its offsets from the scan's stamp."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.config import TimeReference, TimeUnit
 
 # In the order of preference, should a cloud have several; compared without regard to case.
 TIME_FIELD_NAMES: tuple[str, ...] = (
@@ -30,6 +34,23 @@ MISTAKEN_UNITS_PER_SECOND = {"ks": 1e-3, "Ms": 1e-6, "ps": 10**12}
 # A sweep and its stamp are closer than this; a time farther away is on another clock, or is no time at all.
 CLOCK_LIMIT_S = 1.0
 _MEDIAN_SAMPLE = 2048
+logger = logging.getLogger(__name__)
+# How many clouds are looked at, and how many of them may lack usable times.
+_CLOUDS_LOOKED_AT, _CLOUDS_WITHOUT_TIME = 30, 3
+# Sweeps last 0.02 to 0.3 s. The limits leave room for partial ones and are less than one unit (1000) apart.
+_SWEEP_S, _SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 0.1, 0.005, 1.0
+# Seconds since 1970 read as nanoseconds are 1.7 s, which may be near the stamp; a sweep is then shorter than this.
+_NO_SWEEP_S = 1e-6
+# The same relative to the time between scans, where that is known and itself plausible.
+_SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
+_PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
+# A span so near to the time between scans, in another unit than expected, leaves no doubt about the unit.
+_WHOLE_SWEEP = (0.8, 1.1)
+_IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
+# Times coarser than this part of the sweep do not separate its points.
+_COARSEST_OF_SWEEP = 0.1
+# Instead of the extremes, so that a few stray values do not matter.
+_QUANTILES = (0.005, 0.5, 0.995)
 
 
 def _first_listed(names: Sequence[str], wanted: tuple[str, ...]) -> str | None:
@@ -124,3 +145,186 @@ class PointTimeModel:
         with np.errstate(invalid="ignore", over="ignore"):  # damaged bytes may be any number
             seconds = (values.astype(np.float64) - rounded) / per_second
         return np.asarray(seconds + float((Fraction(rounded) - zero) / per_second))
+
+
+class TimedCloud(NamedTuple):
+    """The raw times (N,) of a cloud's returns, with the field's name, and the scan's stamp in seconds if known."""
+
+    field: str | None
+    values: NDArray[np.generic] | None
+    stamp: float | None
+
+
+class LearnedTime(NamedTuple):
+    """What is known of a time field."""
+
+    model: PointTimeModel | None = None  # None: it gives the points no times
+    # A correction, or another clock; without a model, what is wrong, to be continued with a semicolon.
+    warning: str | None = None
+
+
+def learn_point_time(
+    clouds: Iterable[TimedCloud],
+    unit: TimeUnit = "auto",
+    reference: TimeReference = "auto",
+    period_s: float | None = None,
+    defined_unit: TimeUnit | None = None,
+) -> LearnedTime:
+    """By the first cloud whose times are unambiguous, else by the last with any; see `infer_point_time`.
+
+    Stamps close to zero are ambiguous: times from 0 to 0.1 s are then relative as well as absolute.
+    """
+    learned, failures = LearnedTime(), 0
+    for cloud in islice(clouds, _CLOUDS_LOOKED_AT):
+        if cloud.values is not None and len(cloud.values) < 2:
+            continue  # an empty scan shows nothing of the field
+        found = LearnedTime()
+        if cloud.field is not None and cloud.values is not None:
+            found = infer_point_time(cloud.field, cloud.values, cloud.stamp, unit, reference, period_s, defined_unit)
+        learned = found if found.model is not None or learned == LearnedTime() else learned
+        failures += found.model is None
+        is_clear = cloud.stamp is None or abs(cloud.stamp) > 2 * CLOCK_LIMIT_S
+        if (found.model is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
+            break
+    if (model := learned.model) is None:
+        logger.info("time of a point: none is known; scans are taken as measured at one instant, or compensated")
+    else:
+        logger.info("time of a point: field %r in %s, %s", model.field, model.unit, model.reference)
+    return learned
+
+
+def infer_point_time(
+    field: str,
+    values: NDArray[np.generic],
+    stamp: float | None,
+    unit: TimeUnit = "auto",
+    reference: TimeReference = "auto",
+    period_s: float | None = None,
+    defined_unit: TimeUnit | None = None,
+) -> LearnedTime:
+    """Infer unit and reference of a time field from the raw values (N,) of one scan with a stamp in seconds.
+
+    Values that read the same as the stamp in some unit are absolute in that unit. Otherwise the unit is the one in
+    which they span a sweep (about `period_s`, where known), and they are relative if none exceeds a second, else
+    readings of a clock of their own. Values that were divided or multiplied by a thousand once too often, so that
+    they span the whole period (0.1 s where it is unknown) in another unit alone, are corrected with a warning. A given
+    unit or reference is not questioned; `defined_unit`, by the definition of a message, gives way to such a correction.
+
+    Returns:
+        No model when the values are no per-point time: `reference` is "none" or "azimuth", all values are equal, too
+        coarse (an epoch in float32), or span a sweep in no unit; but for the first, the warning says so. With a model,
+        the warning says how it corrects the values, or that they read another clock than the stamp.
+    """
+    if reference in ("none", "azimuth") or not len(values):
+        return LearnedTime()
+    spread = value_spread(values)
+    if spread is None:
+        return LearnedTime(None, f"The time field {field!r} holds {_without_spread(values)}")
+    if spread.resolution > _COARSEST_OF_SWEEP * spread.span:
+        return LearnedTime(None, f"The time field {field!r} is too coarse, with steps of {spread.resolution:g}")
+    given = defined_unit if unit == "auto" else unit
+    units = tuple(UNITS_PER_SECOND) if given is None else (given,)
+    by_clock = None if reference == "relative" else _unit_by_clock(spread, stamp, units)
+    found = by_clock or given or _unit_by_span(spread, period_s)
+    sweep_s = period_s if period_s is not None and _is_plausible(period_s) else _SWEEP_S
+    mistaken = _unit_by_whole_sweep(spread, found, sweep_s) if unit == "auto" else None
+    if mistaken is not None:
+        return LearnedTime(
+            PointTimeModel(field, mistaken, _reference(spread, mistaken, reference)),
+            f"The time field {field!r} spans {spread.span:.3g}, a sweep of {sweep_s:.3g} s in units of"
+            f" {_IN_WORDS.get(mistaken, mistaken)}{'' if found is None else f' instead of {found}'}, and is read so;"
+            " --set reader.time_unit gives another.",
+        )
+    if found is None:
+        span = f"({spread.first:.9g} to {spread.last:.9g})"
+        return LearnedTime(None, f"The time field {field!r} {span} spans a sweep in no unit")
+    model = PointTimeModel(field, found, "absolute" if by_clock else _reference(spread, found, reference))
+    return LearnedTime(model, _other_clock(model, values, stamp))
+
+
+def _other_clock(model: PointTimeModel, values: NDArray[np.generic], stamp: float | None) -> str | None:
+    if model.reference != "absolute" or stamp is None or model.shares_clock(values, stamp):
+        return None
+    said = f"The time field {model.field!r} reads another clock than the scans' stamps"
+    return f"{said}, so the earliest point of each scan gets its stamp."
+
+
+def _without_spread(values: NDArray[np.generic]) -> str:
+    known = values[np.isfinite(values)]
+    return "no number" if not len(known) else f"one value alone ({float(np.median(known)):.9g})"
+
+
+def _reference(spread: "ValueSpread", unit: str, reference: TimeReference) -> str:
+    if reference != "auto":
+        return reference
+    largest_s = max(abs(spread.first), abs(spread.last)) / PointTimeModel("", unit, "").units_per_second
+    return "relative" if largest_s <= CLOCK_LIMIT_S else "absolute"
+
+
+class ValueSpread(NamedTuple):
+    """The values of one scan, in their own unit."""
+
+    # first, middle, last: near the smallest, the median and near the largest, a few stray values left out
+    first: float
+    middle: float
+    last: float
+    span: float  # last minus first, without the rounding of large values
+    resolution: float  # the step between neighbouring values at this size
+
+
+def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
+    """The spread of integer or float values (N,), NaN left out; None when all, or all but a few, are alike."""
+    whole = values.dtype.kind in "iu"
+    with np.errstate(invalid="ignore"):  # damaged bytes may be a NaN of the signalling kind
+        numbers = values.reshape(-1).astype(np.int64 if whole else np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    set_times = numbers[numbers != 0]
+    # Among clock readings a zero is a missing return; among relative times it is a time.
+    if len(set_times) and np.abs(set_times).min() > 10 * float(np.ptp(set_times)):
+        numbers = set_times
+    if len(numbers) < 2:
+        return None
+    base = numbers.min()
+    first, middle, last = np.quantile((numbers - base).astype(np.float64), _QUANTILES)
+    if last <= first:
+        return None
+    resolution = 1.0 if whole else float(np.spacing(values.dtype.type(np.abs(numbers).max())))
+    return ValueSpread(float(base + first), float(base + middle), float(base + last), float(last - first), resolution)
+
+
+def _is_plausible(period_s: float) -> bool:
+    return _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]
+
+
+def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str]) -> str | None:
+    """The unit in which the values read the same as the stamp."""
+    if stamp is None or abs(stamp) <= 2 * CLOCK_LIMIT_S:  # ambiguous: relative times read about the same
+        return None
+    for unit in units:
+        per_second = UNITS_PER_SECOND[unit]
+        reads_the_same = abs(spread.middle / per_second - stamp) <= CLOCK_LIMIT_S
+        if reads_the_same and _NO_SWEEP_S < spread.span / per_second <= _LONGEST_SWEEP_S:
+            return unit
+    return None
+
+
+def _unit_by_span(spread: ValueSpread, period_s: float | None) -> str | None:
+    """The unit in which the values span a sweep."""
+    spans = {unit: spread.span / per_second for unit, per_second in UNITS_PER_SECOND.items()}
+    if period_s is not None and _is_plausible(period_s):
+        for unit, span in spans.items():
+            if _SHORTEST_OF_PERIOD * period_s <= span <= _LONGEST_OF_PERIOD * period_s:
+                return unit
+    fitting = [unit for unit, span in spans.items() if _SHORTEST_SWEEP_S <= span <= _LONGEST_SWEEP_S]
+    return min(fitting, key=lambda unit: abs(np.log(spans[unit] / _SWEEP_S)), default=None)
+
+
+def _unit_by_whole_sweep(spread: ValueSpread, expected: str | None, sweep_s: float) -> str | None:
+    """The unit in which the values span a whole sweep, where they span no part of it in the expected one."""
+    parts = {
+        unit: spread.span / per_second / sweep_s
+        for unit, per_second in (UNITS_PER_SECOND | MISTAKEN_UNITS_PER_SECOND).items()
+    }
+    if expected is not None and _SHORTEST_OF_PERIOD <= parts[expected] <= _LONGEST_OF_PERIOD:
+        return None
+    return next((unit for unit, part in parts.items() if _WHOLE_SWEEP[0] <= part <= _WHOLE_SWEEP[1]), None)
