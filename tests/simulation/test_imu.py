@@ -100,13 +100,6 @@ def test_biases_walk_as_a_random_walk():
     np.testing.assert_allclose(ends[:, 0, 3:].std(), 0.1, rtol=0.1)
 
 
-def test_the_seed_decides(yard):
-    first, again = (simulation(yard, imu_model=MEMS_IMU).imu for _ in range(2))
-    assert first.accelerations.tobytes() == again.accelerations.tobytes()
-    other = replace(simulation(yard, imu_model=MEMS_IMU), seed=5).imu
-    assert not np.isclose(first.angular_velocities, other.angular_velocities).any(axis=1).all()
-
-
 def test_samples_lie_on_the_grid_of_the_rate():
     still = lambda times: np.tile(np.eye(4), (len(times), 1, 1))  # noqa: E731
     stamps = sample_imu(MEMS_IMU, still, 0.3, 0.4, 0).stamps

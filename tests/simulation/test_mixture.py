@@ -9,7 +9,7 @@ import pytest
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Excerpt, ingredients_of, mixture
-from lidarslam.simulation.motion import CARRIERS
+from lidarslam.simulation.motion import CARRIERS, MOUNTS
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS
@@ -60,11 +60,22 @@ def test_an_excerpt_is_a_recording_of_its_own(chosen, expected):
     assert excerpt.ground_truth is whole.ground_truth
 
 
-def test_all_worlds_appear(drawn):
-    assert {simulation(excerpt).world.name for excerpt in drawn} == set(MIXED_WORLDS)
+def simulation(excerpt: Excerpt) -> Simulation:
+    assert isinstance(excerpt.whole, Simulation)
+    return excerpt.whole
+
+
+def test_all_worlds_appear_as_their_ingredients_say(drawn):
+    drawn_names = []
+    for number, excerpt in enumerate(drawn):
+        of, made = ingredients_of(number, SEED), simulation(excerpt)
+        drawn_names.append((of.world, of.sensor, of.carrier))
+        assert drawn_names[-1] == (made.world.name, made.sensor.name, made.motion.name)
+        assert of.mount in MOUNTS
+    worlds, sensors, carriers = map(set, zip(*drawn_names, strict=True))
+    assert worlds == set(MIXED_WORLDS)
+    assert min(len(sensors), len(carriers)) > 2
     assert len({excerpt.name for excerpt in drawn}) == len(drawn)
-    assert len({simulation(excerpt).sensor.name for excerpt in drawn}) > 2
-    assert len({simulation(excerpt).motion.name for excerpt in drawn}) > 2
 
 
 def test_ingredients_are_registered():
@@ -105,19 +116,3 @@ def test_a_number_is_the_same_whatever_comes_before_it(drawn):
     scan, other = next(iter(alone.scans())), next(iter(drawn[1].scans()))
     assert scan.points.tobytes() == other.points.tobytes()
     assert scan.time_offsets.tobytes() == other.time_offsets.tobytes()
-
-
-def simulation(excerpt: Excerpt) -> Simulation:
-    assert isinstance(excerpt.whole, Simulation)
-    return excerpt.whole
-
-
-def test_what_a_recording_is_of_is_known_without_building_it(drawn):
-    for number, excerpt in enumerate(drawn):
-        of = ingredients_of(number, SEED)
-        simulation = excerpt.whole
-        assert isinstance(simulation, Simulation)
-        assert (of.world, of.sensor, of.carrier) == (
-            simulation.world.name, simulation.sensor.name, simulation.motion.name
-        )  # fmt: skip
-        assert of.mount in ("upright", "upside-down", "tilted")

@@ -111,19 +111,6 @@ def test_is_a_scan_sequence(simulation):
     assert next(simulation.scans(299)).stamp == pytest.approx(29.9)
 
 
-def test_upside_down_flips_the_scan(simulation):
-    """At rest, the ground is above a sensor that hangs, and what was left is right."""
-    hanging = exact(replace(simulation, T_body_lidar=mount_pose("upside-down", 0.6)))
-    upright = exact(simulation).scan(0)
-    flipped = hanging.scan(0)
-    down, up = (sweep.scan.points[sweep.scan.rings == ring] for sweep, ring in ((upright, 0), (flipped, 15)))
-    assert down[:, 2].max() < 0.0 < up[:, 2].min()
-    np.testing.assert_allclose(np.median(down[:, 2]), -np.median(up[:, 2]), rtol=0.02)
-    left = down[np.abs(np.rad2deg(np.arctan2(down[:, 1], down[:, 0])) - 90.0).argmin()]
-    right = up[np.abs(np.rad2deg(np.arctan2(up[:, 1], up[:, 0])) + 90.0).argmin()]
-    np.testing.assert_allclose(left, right * [1.0, -1.0, -1.0], atol=0.05)
-
-
 def test_noise_grows_with_range_and_slant():
     ranges, cosines = np.array([5.0, 50.0, 50.0]), np.array([1.0, 1.0, 0.3])
     near, far, slanted = range_sigma(NOISY, ranges, cosines)

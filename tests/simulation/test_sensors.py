@@ -112,16 +112,6 @@ def test_mid_360_draws_strokes_ten_degrees_apart_with_lasers_side_by_side():
     assert 360.0 < np.rad2deg(np.ptp(azimuth)) < 375.0
 
 
-def test_avia_fills_its_view():
-    views = np.concatenate([find_sensor("avia").pattern.rays(index).directions for index in range(20)])
-    azimuth, elevation = np.rad2deg(np.arctan2(views[:, 1], views[:, 0])), elevations_deg(views)
-    np.testing.assert_allclose([azimuth.min(), azimuth.max()], [-35.2, 35.2], atol=0.05)
-    np.testing.assert_allclose([elevation.min(), elevation.max()], [-38.6, 38.6], atol=0.05)
-    # Over 2 s no cell of two degrees in the inner circle stays empty.
-    counts, _, _ = np.histogram2d(azimuth, elevation, bins=np.arange(-24.0, 25.0, 2.0))
-    assert counts.min() > 0
-
-
 def test_mounts_turn_the_sensor():
     up = {name: mount_pose(name, 1.5)[:3, 2] for name in MOUNTS}
     np.testing.assert_allclose(up["upright"], [0.0, 0.0, 1.0], atol=1e-12)

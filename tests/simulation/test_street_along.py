@@ -55,13 +55,6 @@ def test_both_sides_are_built_up(eight):
     assert eight.movers
 
 
-def test_the_seed_and_the_path_make_the_street(eight):
-    again, other = build_along(figure_of_eight(), 3), build_along(figure_of_eight(), 4)
-    assert again.boxes.centres.tobytes() == eight.boxes.centres.tobytes()
-    assert again.height_fields[0].heights.tobytes() == eight.height_fields[0].heights.tobytes()
-    assert other.boxes.centres.tobytes() != eight.boxes.centres.tobytes()
-
-
 def test_the_second_round_adds_nothing(eight):
     twice = build_along(figure_of_eight(rounds=2), 3)
     assert len(twice.boxes) < 1.3 * len(eight.boxes)

@@ -67,12 +67,3 @@ def test_a_car_goes_round_and_round(small):
     assert way.max() * (len(way) / motion.duration_s) < 14.5
     start, again = motion.pose_at(np.array([0.0, motion.duration_s]))
     assert np.allclose(start, again, atol=0.02)  # but for its suspension
-
-
-def test_the_seed_makes_the_town(small, monkeypatch):
-    monkeypatch.setattr(town, "_ROWS", 3)
-    monkeypatch.setattr(town, "_LEFT_OUT", 2)
-    again = town.build(0)
-    assert np.array_equal(again.boxes.centres, small.boxes.centres)
-    assert np.array_equal(again.height_fields[0].heights, small.height_fields[0].heights)
-    assert again.name == "town"

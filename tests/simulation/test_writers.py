@@ -12,13 +12,12 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, transform_points
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer
 from lidarslam.simulation.formats import FORMATS, find_format
 from lidarslam.simulation.recorder import SimulatedScan
-from lidarslam.simulation.writers import CLOCK_START_NS, T_CAM_LIDAR, Rig, clock_ns, compensate
+from lidarslam.simulation.writers import CLOCK_START_NS, T_CAM_LIDAR, Rig, clock_ns
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 SWEEP_S = 0.1
@@ -212,19 +211,6 @@ def test_kitti_scans_are_compensated_exactly(tmp_path, sweeps, rig, room):
         assert room.distance_to_surface(transform_points(T_room_lidar, scan.points)).max() < 2e-5
         skewed = room.distance_to_surface(transform_points(T_room_lidar, simulated.scan.points))
         assert skewed.max() > 0.05
-
-
-def test_kitti_scans_lie_too_low_like_kittis_own(tmp_path, sweeps, rig):
-    write("kitti", tmp_path / "drive", sweeps, rig)
-    stored = ReaderConfig(elevation_correction_deg=0.0)
-    points = next(open_recording(tmp_path / "drive", stored).scans()).points
-    true_points = compensate(sweeps[0].scan, rig)
-    raised_deg = np.rad2deg(elevation(true_points) - elevation(points))
-    np.testing.assert_allclose(raised_deg, 0.205, atol=1e-3)
-
-
-def elevation(points):
-    return np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
 
 
 def test_kitti_truth_comes_back_through_the_calibration(tmp_path, sweeps, rig):
