@@ -253,8 +253,6 @@ _VLP_16 = _one_column(np.arange(-15.0, 16.0, 2.0), 1800, 0.0, 16 * 2.304 / 55.29
 _HDL_32 = _one_column(np.linspace(-30.67, 10.67, 32), 2170, 0.0, 32 * 1.152 / 46.08)
 # the first generation's design values: 33.2 degrees
 _OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024)
-# the first generation's design values: 33.2 degrees
-_OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024)
 # after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
 _ROSETTE = Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5)
 # The same view as strokes of four lasers together, some ten degrees of azimuth apart, a turn a sweep.

@@ -34,9 +34,8 @@ def build(seed: int) -> World:
     _bales(solid, rng, road, ground)
     _hedges(green, rng, road, ground)
     _trees(green, rng, road, ground)
-    waypoints = paths.resample_loop(road, _WAYPOINT_SPACING_M)[
-        1:
-    ]  # a leg of twice the length: a lap begins in its middle
+    # Without the first there is a leg of twice the length: a lap begins in its middle.
+    waypoints = paths.resample_loop(road, _WAYPOINT_SPACING_M)[1:]
     route = Route(paths.on_ground(waypoints, ground), 3.0, _FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
     solid.place(paths.prune(green, route), np.eye(4))
     # Stubble, meadow or crops in parcels, a mown strip along the road.
