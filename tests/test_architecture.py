@@ -53,7 +53,6 @@ CONFINED = {
     "small_gicp": ("lidarslam.compare.peers.small_gicp",),
     "gtsam": (
         "lidarslam.mapping.pose_graph.optimizer",
-        "lidarslam.mapping.inertial.preintegration",
         "lidarslam.mapping.inertial.window",
     ),
     "rerun": ("lidarslam.viewer.rerun_*",),

@@ -13,7 +13,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MAPPINGS
-from lidarslam.mapping.elevation.stretches import ElevationEstimator
+from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.registration.sampled_scan import SampledScan

@@ -142,8 +142,8 @@ PARTS = {
     ),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.mounting.rotation")),
-    "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.kernels")),
-    "checks": Part(_checks, ("mapping.global_map.visibility_kernels", "mapping.slides.kernels"), is_late=True),
+    "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),
+    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.slides.scan_surfels"), is_late=True),
 }
 """The parts whose loops are compiled."""
 

@@ -13,7 +13,7 @@ from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.mounting.recording import elevation_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping.elevation.stretches import ElevationEstimator
+from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.run.request import RunRequest

@@ -18,7 +18,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
-from lidarslam.mapping.elevation.stretches import ElevationEstimator
+from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore

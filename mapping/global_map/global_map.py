@@ -12,12 +12,20 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import State, Stateful
-from lidarslam.mapping.global_map import kernels
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.normals import estimate_normals
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
-from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
-from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
+from lidarslam.mapping.global_map.voxels import (
+    COUNT,
+    POSITION,
+    VIEW,
+    Layout,
+    Rows,
+    Voxels,
+    column_cells,
+    row_cells,
+    write_sums,
+)
 from lidarslam.mapping.surfels.hash_kernels import EMPTY
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
 
@@ -139,7 +147,7 @@ class GlobalMap(Stateful):
         layout = Layout.of(attributes)
         keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
         T = np.ascontiguousarray(T_world_lidar)
-        beyond = kernels.write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
+        beyond = write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
         layout.write(attributes, sums)
         self._wait(Voxels(keys, sums, layout), keys == EMPTY if beyond else None)
 

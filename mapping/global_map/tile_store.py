@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.state.block_file import BlockFile
 from lidarslam.core.state.stateful import ANY_NUMBER
-from lidarslam.mapping.global_map.voxel_rows import Layout
-from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
+from lidarslam.mapping.global_map.voxels import Layout, Voxels, column_cells, row_cells
 
 # Edge of a tile, as near as a whole number of voxels comes.
 _EDGE_M = 100.0

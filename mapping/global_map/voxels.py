@@ -1,5 +1,9 @@
-"""Sums over the points of voxels, by the voxels' keys."""
+"""Rows over the points of voxels, by the voxels' keys: a row each, of what every map has and of scans' attributes.
 
+Intensity and colour are summed over the points that have one. Ring and time are those of the earliest point.
+"""
+
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -7,17 +11,112 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Within
-from lidarslam.mapping.global_map import kernels
-from lidarslam.mapping.global_map.voxel_rows import COUNT, Layout
-from lidarslam.mapping.surfels.hash_kernels import BITS, OFFSET
+from lidarslam.mapping.surfels.hash_kernels import BITS, EMPTY, OFFSET, PREFETCHED, cell_of, key_of
+from lidarslam.mapping.surfels.voxel_hash import reach_m
 
+POSITION, VIEW, COUNT = slice(0, 3), slice(3, 6), 6
+_GEOMETRY = 7
+_INTENSITY, _RGB, _FIRST = 2, 4, 3
+# Of a point without a time: later than all others, its low part, and its ring.
+_NO_FIRST = (np.inf, 0.0, -1.0)
 _MASK = (1 << BITS) - 1
+
+Keys = NDArray[np.int64]
+Rows = NDArray[np.float32]
+
+_reach_m = compiled_part(reach_m)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The columns of rows (N, width) beside position (3), direction to the sensor (3) and number of points."""
+
+    intensity: bool = False  # its sum, and how many points have one
+    rgb: bool = False  # the sums of red, green and blue, and how many points have them
+    # the time of the earliest point as the sum of two float32, exact to some microseconds since 1970, and its ring
+    first: bool = False
+
+    @classmethod
+    def of(cls, attributes: PointAttributes) -> "Layout":
+        """Columns for these attributes."""
+        return cls(attributes.intensity is not None, attributes.rgb is not None, attributes.time is not None)
+
+    @classmethod
+    def union(cls, layouts: "Sequence[Layout]") -> "Layout":
+        """The columns that any of them has."""
+        return cls(*(any(getattr(one, name) for one in layouts) for name in ("intensity", "rgb", "first")))
+
+    @property
+    def summed(self) -> int:
+        """How many columns are sums, the first ones."""
+        return _GEOMETRY + _INTENSITY * self.intensity + _RGB * self.rgb
+
+    @property
+    def width(self) -> int:
+        """How many columns there are."""
+        return self.summed + _FIRST * self.first
+
+    def parts(self, rows: Rows) -> tuple[Rows, Rows, Rows]:
+        """Views of the columns of intensity (N, 2), colour (N, 4) and earliest point (N, 3), as far as they exist."""
+        at = _GEOMETRY + _INTENSITY * self.intensity
+        return rows[:, _GEOMETRY:at], rows[:, at : self.summed], rows[:, self.summed :]
+
+    def write(self, attributes: PointAttributes, rows: Rows) -> None:
+        """Write the attributes of N points into their rows (N, width)."""
+        intensity, rgb, first = self.parts(rows)
+        if attributes.intensity is not None:
+            known = np.isfinite(attributes.intensity)
+            intensity[:, 0], intensity[:, 1] = np.where(known, attributes.intensity, 0.0), known
+        if attributes.rgb is not None:
+            rgb[:, :3], rgb[:, 3] = attributes.rgb, 1.0
+        if attributes.time is not None:
+            first[:, 0] = attributes.time
+            first[:, 1] = attributes.time - first[:, 0].astype(np.float64)
+            first[:, 2] = -1.0 if attributes.ring is None else attributes.ring
+
+    def widened(self, rows: Rows, layout: "Layout") -> Rows:
+        """Rows with the columns of another layout, which has all of these."""
+        if layout == self:
+            return rows
+        wide = np.zeros((len(rows), layout.width), dtype=np.float32)
+        wide[:, :_GEOMETRY] = rows[:, :_GEOMETRY]
+        if layout.first:
+            wide[:, layout.summed :] = _NO_FIRST
+        for old, new in zip(self.parts(rows), layout.parts(wide), strict=True):
+            if old.shape[1]:
+                new[:] = old
+        return wide
+
+    def largest_intensity(self, rows: Rows) -> float:
+        """The largest mean intensity; 0 where none is known."""
+        intensity = self.parts(rows)[0]
+        return float(np.nanmax(_means(intensity, unknown=np.nan), initial=0.0)) if self.intensity else 0.0
+
+    def attributes(self, rows: Rows) -> PointAttributes:
+        """Means of intensity and colour, ring and time of the earliest point; rings as far as one is known."""
+        intensity, rgb, first = self.parts(rows)
+        ring = first[:, 2].astype(np.int32) if self.first else None
+        return PointAttributes(
+            intensity=_means(intensity, unknown=np.nan)[:, 0] if self.intensity else None,
+            rgb=np.round(_means(rgb, unknown=0.0)).astype(np.uint8) if self.rgb else None,
+            ring=None if ring is None or (ring < 0).all() else ring,
+            time=first[:, 0].astype(np.float64) + first[:, 1] if self.first else None,
+        )
+
+
+def _means(sums: Rows, unknown: float) -> NDArray[np.float32]:
+    """Rows divided by their last column, how many they are of."""
+    counts = sums[:, -1:]
+    return np.where(counts > 0.0, sums[:, :-1] / np.maximum(counts, 1.0), np.float32(unknown))
 
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Sums over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
+    """Rows over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
 
     keys: Annotated[NDArray[np.int64], Shape(None), Within(low=0)]
     sums: Annotated[NDArray[np.float32], Shape(None, None), ANY_NUMBER]  # the earliest point of none is at infinity
@@ -57,7 +156,7 @@ class Voxels:
         """Rows of equal keys added up, in the order of keys."""
         unique, totals = np.empty_like(self.keys), np.empty_like(self.sums)
         order = np.argsort(self.keys)
-        count = kernels.add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
+        count = add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
         return Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
 
     def united(self, other: "Voxels") -> "Voxels":
@@ -66,7 +165,7 @@ class Voxels:
         sums = [part.layout.widened(part.sums, layout) for part in (self, other)]
         unique = np.empty(len(self) + len(other), dtype=np.int64)
         totals = np.empty((len(unique), layout.width), dtype=np.float32)
-        count = kernels.unite(self.keys, sums[0], other.keys, sums[1], layout.summed, unique, totals)
+        count = unite(self.keys, sums[0], other.keys, sums[1], layout.summed, unique, totals)
         return Voxels(unique[:count].copy(), totals[:count].copy(), layout)
 
     def chosen(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Voxels":
@@ -89,3 +188,91 @@ def column_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 def row_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Cells (M,) along y of voxels, by their keys (M,)."""
     return ((keys >> BITS) & _MASK) - OFFSET
+
+
+@compiled
+def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Rows) -> int:
+    """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame.
+
+    Returns:
+        Number of points beyond the reach of the voxels, whose keys are `EMPTY`.
+    """
+    T, sensor = T_world_lidar, T_world_lidar[:3, 3]
+    reach, beyond = _reach_m(voxel_size_m), 0
+    for n in range(len(points)):
+        a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if not (abs(x) < reach and abs(y) < reach and abs(z) < reach):
+            keys[n] = EMPTY
+            beyond += 1
+            continue
+        u, v, w = sensor[0] - x, sensor[1] - y, sensor[2] - z
+        distance = math.sqrt(u * u + v * v + w * w)
+        i, j, k = cell_of(x / voxel_size_m), cell_of(y / voxel_size_m), cell_of(z / voxel_size_m)
+        keys[n] = key_of(i, j, k)
+        # Within the voxel float32 is exact enough.
+        sums[n, 0], sums[n, 1], sums[n, 2] = x - i * voxel_size_m, y - j * voxel_size_m, z - k * voxel_size_m
+        sums[n, 3], sums[n, 4], sums[n, 5], sums[n, 6] = u / distance, v / distance, w / distance, 1.0
+    return beyond
+
+
+@compiled
+def add_up(order: NDArray[np.intp], keys: Keys, sums: Rows, summed: int, unique: Keys, totals: Rows) -> int:
+    """Write the keys (M,) and the totals (M, C) of the rows (N, C) of equal keys (N,), given an order that sorts these.
+
+    The first columns are summed, so many; those behind are those of the earliest row, by the first two of them.
+
+    Returns:
+        M.
+    """
+    count, columns = 0, sums.shape[1]
+    for n in range(len(order)):
+        ahead = order[min(n + PREFETCHED, len(order) - 1)]
+        prefetch(keys, ahead)
+        prefetch(sums, ahead)
+        row = order[n]
+        if count == 0 or keys[row] != unique[count - 1]:
+            unique[count] = keys[row]
+            for column in range(
+                columns
+            ):  # copying a whole row brings the text of its error, which takes 4 s to compile
+                totals[count, column] = sums[row, column]
+            count += 1
+        else:
+            for column in range(summed):
+                totals[count - 1, column] += sums[row, column]
+            if summed < columns and _is_earlier(sums[row], totals[count - 1], summed):
+                for column in range(summed, columns):
+                    totals[count - 1, column] = sums[row, column]
+    return count
+
+
+@compiled
+def unite(
+    first_keys: Keys, first_sums: Rows, second_keys: Keys, second_sums: Rows, summed: int, unique: Keys, totals: Rows
+) -> int:  # fmt: skip
+    """As `add_up` for two tables, each with its keys (N,) sorted and unique."""
+    count, a, b, columns = 0, 0, 0, first_sums.shape[1]
+    while a < len(first_keys) or b < len(second_keys):
+        from_first = b >= len(second_keys) or (a < len(first_keys) and first_keys[a] <= second_keys[b])
+        from_second = a >= len(first_keys) or (b < len(second_keys) and second_keys[b] <= first_keys[a])
+        unique[count] = first_keys[a] if from_first else second_keys[b]
+        for column in range(columns):
+            totals[count, column] = first_sums[a, column] if from_first else second_sums[b, column]
+        if from_first and from_second:
+            for column in range(summed):
+                totals[count, column] += second_sums[b, column]
+            if summed < columns and _is_earlier(second_sums[b], totals[count], summed):
+                for column in range(summed, columns):
+                    totals[count, column] = second_sums[b, column]
+        a, b, count = a + from_first, b + from_second, count + 1
+    return count
+
+
+@compiled_part
+def _is_earlier(row: Rows, other: Rows, column: int) -> bool:
+    """Whether the time of one row (C,) is before another's: a column and the rest of it in the next one."""
+    high, rest = row[column] - other[column], row[column + 1] - other[column + 1]
+    return bool(high < 0.0 or (high == 0.0 and rest < 0.0))

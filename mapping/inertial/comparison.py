@@ -13,7 +13,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, log, make_transform
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
-from lidarslam.mapping.inertial.preintegration import Preintegration
+from lidarslam.mapping.inertial.window import Preintegration
 
 # Turns are compared over this time, and velocities: long beside the errors of registered poses.
 _SPAN_S = 0.5

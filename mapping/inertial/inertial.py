@@ -10,8 +10,7 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
-from lidarslam.mapping.inertial.preintegration import STANDARD_GRAVITY, Preintegration
-from lidarslam.mapping.inertial.window import LEVER, SCALE, InertialWindow, Knot
+from lidarslam.mapping.inertial.window import LEVER, SCALE, STANDARD_GRAVITY, InertialWindow, Knot, Preintegration
 from lidarslam.mapping.motion.prediction import GravityDirection, MotionState, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 

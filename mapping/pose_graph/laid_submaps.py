@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful, Transforms
 from lidarslam.mapping.global_map.global_map import VoxelMeans
-from lidarslam.mapping.global_map.voxel_rows import POSITION, VIEW, Rows
+from lidarslam.mapping.global_map.voxels import POSITION, VIEW, Rows
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.loops.revisits import as_registered
 from lidarslam.mapping.pose_graph.edges import first_connected

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.state.block_file import BlockFile
 from lidarslam.mapping.global_map.global_map import VoxelMeans
-from lidarslam.mapping.global_map.voxel_rows import Layout
+from lidarslam.mapping.global_map.voxels import Layout
 
 
 class SubmapStore(BlockFile):

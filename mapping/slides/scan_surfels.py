@@ -4,11 +4,21 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state.stateful import Shape
-from lidarslam.mapping.slides.kernels import COLUMNS, ROWS, draw_indices, vote, write_planes
+from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
+# Pixels of one degree.
+ROWS, COLUMNS = 180, 360
+# Neighbourhood of a pixel, in rows and columns to either side; rings are farther apart than points of a ring.
+_NEAR_ROWS, _NEAR_COLUMNS = 2, 1
+# Largest distance of a neighbour, as a share of the range.
+_REACH = 0.1
+# Least cosine between normals of one surface in two scans.
+_SAME_NORMAL = 0.9
 _MIN_RANGE_M = 1.0
 _FEWEST_NEIGHBOURS = 5
 # Largest ratio of the variances of thickness and width, least ratio of those of width and length, and the largest
@@ -87,3 +97,127 @@ def shift_profile(
     blocks = block.ravel()[order].astype(np.int64)
     vote(points, normals, blocks, held.points, held.normals, held.radii, direction, _GATE_M, BIN_M, votes)
     return np.asarray(np.minimum(votes, _MOST_OF_BLOCK).sum(axis=0), dtype=np.float64)
+
+
+@compiled
+def draw_indices(points: FloatArray, min_range_m: float, image: NDArray[np.int64]) -> None:
+    """Write the index of one of the points (N, 3) into every pixel (ROWS, COLUMNS) that has any, -1 elsewhere."""
+    image[:, :] = -1
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        across = np.sqrt(x * x + y * y)
+        if not (across * across + z * z >= min_range_m * min_range_m):
+            continue
+        column = int((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * COLUMNS) % COLUMNS
+        row = int((np.arctan2(z, across) + 0.5 * np.pi) / np.pi * ROWS)
+        image[min(max(row, 0), ROWS - 1), column] = n
+
+
+@compiled
+def write_planes(
+    points: FloatArray, image: NDArray[np.int64], pixels: NDArray[np.int64], means: FloatArray, normals: FloatArray,
+    variances: FloatArray, counts: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Write the planes of the points around pixels (M, 2) of an image.
+
+    The mean (M, 3), the axis of least variance (M, 3), the variances (M, 3) along the principal axes, ascending, and
+    the number (M,) of the points.
+    """
+    offset, mean, products, covariance = np.empty(3), np.empty(3), np.empty(6), np.empty(6)
+    for m in range(len(pixels)):
+        centre = points[image[pixels[m, 0], pixels[m, 1]]]
+        reach2 = _REACH * _REACH * (centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+        count = 0
+        mean[:] = 0.0
+        products[:] = 0.0
+        for row in range(max(pixels[m, 0] - _NEAR_ROWS, 0), min(pixels[m, 0] + _NEAR_ROWS + 1, ROWS)):
+            for step in range(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1):
+                n = image[row, (pixels[m, 1] + step) % COLUMNS]
+                if n < 0:
+                    continue
+                for i in range(3):
+                    offset[i] = points[n, i] - centre[i]
+                if offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 > reach2:
+                    continue
+                count += 1
+                for i in range(3):
+                    mean[i] += offset[i]
+                _add_products(offset, 1.0, products)
+        for i in range(3):
+            mean[i] /= count
+            means[m, i] = centre[i] + mean[i]
+        for entry in range(6):
+            covariance[entry] = products[entry] / count
+        _add_products(mean, -1.0, covariance)
+        write_eigenvalues(covariance, variances[m])
+        write_eigenvector(covariance, variances[m, 0], normals[m])
+        counts[m] = count
+
+
+@compiled_part
+def _add_products(v: FloatArray, sign: float, total: FloatArray) -> None:
+    """Add the six distinct products of the components of a vector (3,): xx, xy, xz, yy, yz, zz."""
+    total[0] += sign * v[0] * v[0]
+    total[1] += sign * v[0] * v[1]
+    total[2] += sign * v[0] * v[2]
+    total[3] += sign * v[1] * v[1]
+    total[4] += sign * v[1] * v[2]
+    total[5] += sign * v[2] * v[2]
+
+
+@compiled
+def vote(
+    points: FloatArray, normals: FloatArray, blocks: NDArray[np.int64], held_points: FloatArray,
+    held_normals: FloatArray, held_radii: FloatArray, direction: FloatArray, gate_m: float, bin_m: float,
+    votes: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Add up votes for the shifts of a scan along a direction that lay its surfels on those of another.
+
+    A surfel p is in the plane of a held surfel a with a similar normal n after the shift n.(a - p) / n.d, and votes for
+    it if it is then within a's radius; the vote falls off to zero at a distance of `gate_m` from the plane. A surfel
+    has at most one vote for each shift.
+
+    Args:
+        points, normals: (M, 3) surfels of the one scan, those of a block successively.
+        blocks: (M,) ascending, which block each belongs to.
+        held_points, held_normals, held_radii: (K, 3), (K, 3), (K,) of the other, in the same frame.
+        direction: (3,) unit vector; held normals are not at right angles to it.
+        gate_m, bin_m: width of a vote, and between shifts.
+        votes: (B, S) written, of each block; the shift of zero is in the middle.
+    """
+    votes[:, :] = 0.0
+    middle = votes.shape[1] // 2
+    own = np.empty(votes.shape[1], dtype=np.float32)
+    for m in range(len(points)):
+        own[:] = 0.0
+        for k in range(len(held_points)):
+            if _dot(held_normals[k], normals[m]) < _SAME_NORMAL:
+                continue
+            along, gap, squared = _dot(held_normals[k], direction), 0.0, 0.0
+            for i in range(3):
+                gap += held_normals[k, i] * (held_points[k, i] - points[m, i])
+            shift = gap / along
+            if not abs(shift) < middle * bin_m:
+                continue
+            for i in range(3):
+                squared += (points[m, i] + shift * direction[i] - held_points[k, i]) ** 2
+            if squared <= held_radii[k] * held_radii[k]:
+                _vote_once(shift, gate_m / abs(along), bin_m, own)
+        for s in range(len(own)):
+            votes[blocks[m], s] += own[s]
+
+
+@compiled_part
+def _vote_once(shift: float, half: float, bin_m: float, votes: NDArray[np.float32]) -> None:
+    """Raise the votes (S,) around a shift to a triangle of half-width `half`."""
+    middle = len(votes) // 2
+    first = max(int(np.ceil((shift - half) / bin_m)) + middle, 0)
+    last = min(int(np.floor((shift + half) / bin_m)) + middle, len(votes) - 1)
+    for s in range(first, last + 1):
+        weight = np.float32(1.0 - abs((s - middle) * bin_m - shift) / half)
+        votes[s] = max(votes[s], weight)
+
+
+@compiled_part
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -13,8 +13,7 @@ from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.mounting.rotation import correct_elevation
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.elevation.bias import PlacedPoints, combined, estimate_bias
-from lidarslam.mapping.elevation.stretches import ElevationEstimator
+from lidarslam.mapping.elevation import ElevationEstimator, PlacedPoints, combined, estimate_bias
 from lidarslam.mapping.motion.prediction import MotionState
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.sampling import SurfelSampler

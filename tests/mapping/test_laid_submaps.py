@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.mapping.global_map.global_map import VoxelMeans
-from lidarslam.mapping.global_map.voxel_rows import Layout, Rows
+from lidarslam.mapping.global_map.voxels import Layout, Rows
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER, LaidSubmaps, draw_local_map
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 

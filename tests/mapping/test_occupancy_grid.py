@@ -12,13 +12,13 @@ from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.mapping.global_map.products.ground import find_ground
 from lidarslam.mapping.global_map.products.occupancy_grid import (
     FREE,
     OCCUPIED,
     UNKNOWN,
     GridOptions,
     OccupancyGrid,
+    find_ground,
     occupancy_grid,
 )
 from lidarslam.storage.finished_run import load_map

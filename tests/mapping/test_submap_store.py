@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.geometry import exp
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
-from lidarslam.mapping.global_map.voxel_rows import Layout
+from lidarslam.mapping.global_map.voxels import Layout
 from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 
 

@@ -1,16 +1,28 @@
 """A 2D occupancy grid of a map: obstacles above the ground, free space, and the unknown."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, convolve
+from scipy.ndimage import binary_dilation, convolve, distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.global_map.products.grid_kernels import mark_visible
-from lidarslam.mapping.global_map.products.ground import CELL_M, along_path, find_ground
 
+CELL_M = 0.5
+# Least |z| of the normal of a point of the ground.
+_UPRIGHT = float(np.cos(np.deg2rad(35.0)))
+# The ground rises or falls by so much from one cell to the next, at most: a slope, and the noise of the points.
+_STEP_M = CELL_M * float(np.tan(np.deg2rad(15.0))) + 0.05
+_FEWEST_GROUND_POINTS = 3
+# Cells without points of the ground that it is continued over: 3 m.
+_LONGEST_GAP = 6
+# Below the sensor: horizontal reach of a first look at the ground, least depth, and bins of its height.
+_REACH_M, _LEAST_DEPTH_M, _BIN_M = 2.5, 0.1, 0.1
+# The four neighbours of a cell.
+_DOWN, _RIGHT = (1, -1, 0, 0), (0, 0, 1, -1)
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """The values of nav_msgs/OccupancyGrid."""
 
@@ -121,3 +133,179 @@ def _driven(
     driven = np.zeros(shape, dtype=np.bool_)
     driven[row[inside], column[inside]] = True
     return driven
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Ground heights on a grid, in the world."""
+
+    origin: FloatArray  # (2,) x and y of the corner of the first cell
+    heights: FloatArray  # (rows, columns) z at the middle of cells of `CELL_M`, by y and x; NaN where unknown
+    observed: NDArray[np.bool_]  # (rows, columns) whether points support it; elsewhere it is continued
+
+    def cells(self, xy: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns (N,) of the cells of positions (N, 2); those outside are clipped."""
+        indices = np.floor((xy - self.origin) / CELL_M).astype(np.intp)
+        rows, columns = self.heights.shape
+        return np.clip(indices[:, 1], 0, rows - 1), np.clip(indices[:, 0], 0, columns - 1)
+
+    def at(self, xy: FloatArray) -> FloatArray:
+        """Heights (N,) at positions (N, 2), bilinear; NaN where the ground is unknown."""
+        known = np.isfinite(self.heights)
+        nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+        filled = self.heights[tuple(nearest)]
+        column, row = ((xy - self.origin) / CELL_M - 0.5).T
+        heights = map_coordinates(filled, [row, column], order=1, mode="nearest")
+        return np.where(known[self.cells(xy)], heights, np.nan)
+
+
+def find_ground(points: FloatArray, normals: FloatArray, positions: FloatArray) -> Ground | None:
+    """The ground around the positions (K, 3) of a sensor; None if none is found below it.
+
+    It begins with the most frequent height of upright surfaces below the sensor, and grows from cell to cell: points of
+    the next cell belong to it if they are a slope away from it, and over gaps it is continued.
+
+    Args:
+        points: (N, 3) of the map.
+        normals: (N, 3) of its surfaces.
+        positions: of the sensor, in the order of time.
+    """
+    upright = points[np.abs(normals[:, 2]) > _UPRIGHT]
+    everything = np.concatenate([points[:, :2], positions[:, :2]])
+    origin = np.floor(everything.min(axis=0) / CELL_M) * CELL_M
+    columns, rows = np.floor((everything.max(axis=0) - origin) / CELL_M).astype(np.intp) + 1
+    ground = Ground(origin, np.full((rows, columns), np.nan), np.zeros((rows, columns), dtype=np.bool_))
+    seeds, heights = _below(upright, positions)
+    if not len(seeds):
+        return None
+    row, column = ground.cells(upright[:, :2])
+    cell = row * columns + column
+    order = np.lexsort((upright[:, 2], cell))
+    starts = np.searchsorted(cell[order], np.arange(rows * columns + 1))
+    row, column = ground.cells(seeds)
+    grow_ground(
+        upright[order, 2],
+        starts,
+        row * columns + column,
+        heights,
+        _STEP_M,
+        _FEWEST_GROUND_POINTS,
+        _LONGEST_GAP,
+        ground.heights,
+        ground.observed,
+    )
+    return ground
+
+
+def _below(upright: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positions (M, 2) along the path, and the heights (M,) of the ground below them."""
+    tree = cKDTree(upright[:, :2]) if len(upright) else None
+    seeds, heights = [], []
+    for position in along_path(positions, CELL_M):
+        near = [] if tree is None else tree.query_ball_point(position[:2], _REACH_M)
+        z = upright[near, 2]
+        z = z[z < position[2] - _LEAST_DEPTH_M]
+        if len(z) < _FEWEST_GROUND_POINTS:
+            continue
+        bins = np.floor(z / _BIN_M).astype(np.intp)
+        values, counts = np.unique(bins, return_counts=True)
+        seeds.append(position[:2])
+        heights.append(float(np.median(z[np.abs(bins - values[np.argmax(counts)]) <= 1])))
+    return np.array(seeds).reshape(-1, 2), np.array(heights)
+
+
+def along_path(positions: FloatArray, spacing_m: float) -> FloatArray:
+    """Those of the positions (K, 3) that are at least a distance away from the one before, with the first and last."""
+    kept = [0]
+    for number in range(1, len(positions)):
+        if np.linalg.norm(positions[number] - positions[kept[-1]]) >= spacing_m:
+            kept.append(number)
+    return positions[[*kept, *([len(positions) - 1] if kept[-1] != len(positions) - 1 else [])]]
+
+
+@compiled
+def grow_ground(
+    z: FloatArray,
+    starts: NDArray[np.int64],
+    seeds: NDArray[np.int64],
+    seed_heights: FloatArray,
+    step_m: float,
+    fewest: int,
+    longest_gap: int,
+    heights: FloatArray,
+    observed: NDArray[np.bool_],
+) -> None:
+    """Grow the ground from seeds, breadth first.
+
+    Args:
+        z: (N,) heights of upright points, by cell and then ascending.
+        starts: (cells + 1,) the points of each cell.
+        seeds: (M,) cells.
+        seed_heights: (M,) the ground in them.
+        step_m: largest change of the ground from one cell to the next.
+        fewest: points that a height is measured from.
+        longest_gap: cells without points that the ground is continued over.
+        heights: (rows, columns) NaN; the ground.
+        observed: (rows, columns) False; where it was measured.
+    """
+    rows, columns = heights.shape
+    queue = np.empty(rows * columns, dtype=np.int64)
+    gaps = np.zeros(rows * columns, dtype=np.int64)
+    flat, measured = heights.ravel(), observed.ravel()
+    head, tail = -len(seeds), 0  # first every seed, then the neighbours of each cell in the queue
+    while head < tail:
+        for side in range(1 if head < 0 else 4):
+            if head < 0:
+                cell, expected, gap = seeds[head], seed_heights[head], 0
+            else:
+                parent = queue[head]
+                row, column = parent // columns + _DOWN[side], parent % columns + _RIGHT[side]
+                if row < 0 or row >= rows or column < 0 or column >= columns:
+                    continue
+                cell, expected, gap = row * columns + column, flat[parent], gaps[parent] + 1
+            if not math.isnan(flat[cell]):
+                continue
+            measured_height = _height_near(z, starts[cell], starts[cell + 1], expected, step_m * max(1, gap), fewest)
+            if not math.isnan(measured_height):
+                flat[cell], measured[cell], gaps[cell] = measured_height, True, 0
+            elif gap > longest_gap:
+                continue
+            else:
+                flat[cell], gaps[cell] = expected, gap
+            queue[tail] = cell
+            tail += 1
+        head += 1
+
+
+@compiled_part
+def _height_near(z: FloatArray, first: int, last: int, expected: float, tolerance: float, fewest: int) -> float:
+    """Median of those of the ascending heights z[first:last] that are near the expected one; NaN of too few."""
+    while first < last and z[first] < expected - tolerance:
+        first += 1
+    while last > first and z[last - 1] > expected + tolerance:
+        last -= 1
+    return z[(first + last - 1) // 2] if last - first >= fewest else np.nan
+
+
+@compiled
+def mark_visible(occupied: NDArray[np.bool_], viewpoints: FloatArray, reach: float, visible: NDArray[np.bool_]) -> None:
+    """Mark the cells of a grid that straight rays from viewpoints reach before an occupied cell.
+
+    Args:
+        occupied: (rows, columns).
+        viewpoints: (K, 2) row and column, in cells.
+        reach: length of a ray, in cells.
+        visible: (rows, columns), False; True where a ray passes.
+    """
+    rows, columns = occupied.shape
+    rays = max(8, math.ceil(2.0 * math.pi * reach))
+    for k in range(len(viewpoints)):
+        for ray in range(rays):
+            angle = 2.0 * math.pi * ray / rays
+            down, right = math.sin(angle), math.cos(angle)
+            for step in range(int(reach) + 1):
+                row = math.floor(viewpoints[k, 0] + step * down)
+                column = math.floor(viewpoints[k, 1] + step * right)
+                if row < 0 or row >= rows or column < 0 or column >= columns or occupied[row, column]:
+                    break
+                visible[row, column] = True

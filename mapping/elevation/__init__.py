@@ -1,1 +1,0 @@
-"""Estimating the error of a sensor's elevations."""
