@@ -34,8 +34,8 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.simulation.formats import FORMATS
     from lidarslam.simulation.recorder import SimulatedScan
     from lidarslam.simulation.writers import Rig
-    from lidarslam.storage.about import About
-    from lidarslam.storage.summary_file import read_summary
+    from lidarslam.storage.finished_run import read_summary
+    from lidarslam.storage.unfinished import About
 
 # Of memory, seconds for one input, and its bytes.
 _LIMITS = ("-rss_limit_mb=2048", "-timeout=20", "-max_len=65536")

@@ -27,7 +27,7 @@ from lidarslam.evaluation.trajectory.association import Association
 from lidarslam.evaluation.trajectory.drift import segment_errors
 from lidarslam.odometry.config import LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import Motion
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 
 LENGTHS_M = (20.0, 30.0, 40.0, 50.0, 60.0)
 _SCANS_OF_A_START = 50

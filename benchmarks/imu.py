@@ -39,7 +39,7 @@ from lidarslam.odometry.config import OdometryConfig, OdometryName
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 from lidarslam.run.loop_closing import begin_graph
 
 METHODS: dict[str, tuple[OdometryName, bool]] = {

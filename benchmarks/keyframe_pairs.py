@@ -18,7 +18,7 @@ from lidarslam.mapping.loops.candidates import KeyframeDatabase
 from lidarslam.mapping.loops.refinement import DenseSubmap
 from lidarslam.mapping.pose_graph.edges import drift_covariance
 from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 from lidarslam.simulation.recorder import Simulation
 
 _LAPS, _EVERY = 1.34, 3

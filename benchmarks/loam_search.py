@@ -32,7 +32,7 @@ from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, match_features
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.registration.surfaces import Surfaces
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 
 
 def main() -> None:

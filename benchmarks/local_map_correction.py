@@ -44,7 +44,7 @@ from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 
 # Scans of another round are within this part of the median range, and at least so much of the way away.
 _SAME_PLACE_RANGES, _LATER_M = 0.5, 30.0

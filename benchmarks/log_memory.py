@@ -28,7 +28,7 @@ from lidarslam.mapping.global_map import global_map
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.scan_log import ScanLog

@@ -51,7 +51,7 @@ from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.scan_log import ScanLog

@@ -25,10 +25,10 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline import free_memory
+from lidarslam.pipeline import threads
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.scan_log import ScanLog
 
 _NOISE_M = 0.005
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--keep-free", action="store_true")
     arguments = parser.parse_args()
     if arguments.keep_free:
-        free_memory.EVERY_SCANS = arguments.scans + 1
+        threads.EVERY_SCANS = arguments.scans + 1
     header = ["scans", "memory, MB", "most, MB", "cells", "map points", "lost", "maps begun", "ms a scan"]
     print_row(header)
     print_row(["---"] * len(header))

@@ -19,7 +19,7 @@ from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
-from lidarslam.run.summary.summary import RunSummary
+from lidarslam.run.summary import RunSummary
 
 _STRETCH = 15
 

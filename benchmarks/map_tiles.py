@@ -26,7 +26,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.run.results import draw, write_map
-from lidarslam.run.summary.summary import peak_rss_mb
+from lidarslam.run.summary import peak_rss_mb
 from lidarslam.run.summary_text import format_map
 from lidarslam.storage.directory import RunDirectory
 

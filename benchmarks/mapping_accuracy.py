@@ -37,7 +37,7 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 from lidarslam.simulation.motion import CARRIERS, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route

@@ -31,7 +31,7 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.simulation.motion import CARRIERS

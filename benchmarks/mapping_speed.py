@@ -46,7 +46,7 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.registration.sampled_scan import Sampler
 from lidarslam.mapping.tracking import attempts
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 
 _METHODS: tuple[MappingName, ...] = ("surfels", "loam")
 # Stage -> what is timed for it: the object that holds the function, and its name there.

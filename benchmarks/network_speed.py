@@ -42,7 +42,7 @@ from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights, shipped_folder
 from lidarslam.odometry.network.torch_graphs import torch_search
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 
 SCANS = 12
 # The first scan is not compared with any, and the second without a motion before.

@@ -39,7 +39,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import in_order, prefetch
+from lidarslam.pipeline.threads import in_order, prefetch
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
 
 _KISS = "KISS-ICP's own loop"

@@ -42,7 +42,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.association import associate
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 
 # Methods that `lidarslam run` has, and the options that choose them.
 OPTIONS: dict[str, tuple[str, ...]] = {

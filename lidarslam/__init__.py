@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lidarslam.api.evaluation import evaluate
     from lidarslam.api.recordings import OpenRecording, open
-    from lidarslam.api.registered_scan import RegisteredScan
-    from lidarslam.api.slam import Slam
+    from lidarslam.api.slam import RegisteredScan, Slam
     from lidarslam.config.settings import Config
     from lidarslam.core.errors import LidarSlamError
     from lidarslam.core.scan import Scan
@@ -38,7 +37,7 @@ _MODULES = {
     "LidarSlamError": "lidarslam.core.errors",
     "OpenRecording": "lidarslam.api.recordings",
     "PointCloud": "lidarslam.mapping.global_map.global_map",
-    "RegisteredScan": "lidarslam.api.registered_scan",
+    "RegisteredScan": "lidarslam.api.slam",
     "Scan": "lidarslam.core.scan",
     "Slam": "lidarslam.api.slam",
     "Status": "lidarslam.core.tracking",

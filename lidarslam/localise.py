@@ -27,8 +27,7 @@ from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, write_results
 from lidarslam.run.run import open_odometry, require_apart, require_overlap, viewing
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary.summary import summarise
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import WrittenMap, summarise
 from lidarslam.run.summary_text import format_times
 from lidarslam.run.tracking import Progress, Tracked, track
 from lidarslam.storage import directory as files

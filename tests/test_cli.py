@@ -24,7 +24,7 @@ from lidarslam.merge.writing import MergedRecording, MergeOutcome, MergeSummary
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import WrittenMap
 
 
 def lidarslam(*arguments: object) -> Result:

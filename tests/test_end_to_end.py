@@ -21,7 +21,7 @@ from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.storage.directory import FILES, MAPS

@@ -2,37 +2,152 @@
 
 import copy
 import logging
+import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from threading import RLock
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
 
 from lidarslam.api.arrays import check_stamp, check_sweep, make_scan, make_vector
-from lidarslam.api.registered_scan import RegisteredScan
-from lidarslam.api.saving import Built, python_names, save_run
 from lidarslam.config.settings import Config, make_config
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
+from lidarslam.mapping.global_map.drawing import DrawnMap
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.pipeline.background_worker import BackgroundWorker
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import Estimated, Localised
 from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.stages import Stages
+from lidarslam.pipeline.threads import BackgroundWorker
 from lidarslam.run.inertial import make_imu_stream
-from lidarslam.run.loop_closing import begin_graph
+from lidarslam.run.loop_closing import GraphOutcome, begin_graph, loops_so_far
+from lidarslam.run.results import final_map, write_results
 from lidarslam.run.run import open_odometry, require_no_trajectory
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.tracking import Tracked
+from lidarslam.storage.directory import RunDirectory
+
+if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredScan:
+    """The pose of a scan as estimated when it came, and its quality; arrays are read-only."""
+
+    stamp: float  # seconds
+    T_world_lidar: FloatArray  # (4, 4) at the stamp; the world is the LiDAR frame of the first scan
+    # whether no later scan changes the pose: without a pose graph, whose loops correct the earlier ones
+    is_final: bool
+    # status, message: ok, degraded or lost, and the reason unless it is ok; the pose of a lost scan is a prediction
+    status: Status
+    message: str
+    # (6, 6) of the error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first, radians and metres; None where the
+    # scan was not registered to a map
+    covariance: FloatArray | None
+    degenerate: tuple[str, ...]  # of roll, pitch, yaw, x, y, z of the LiDAR: those that the scan does not constrain
+    velocity: FloatArray | None  # (6,) of the LiDAR in its own frame, rotation first, rad/s and m/s; None where unknown
+    points_used: int  # number of correspondences
+    # residual_m, inlier_ratio: of the fit to the map or the previous scan; None when it could not be computed
+    residual_m: float | None
+    inlier_ratio: float | None
+
+    @classmethod
+    def of(cls, stamp: float, localised: Localised, is_final: bool) -> "RegisteredScan":
+        """Of a scan's pose."""
+        return cls(
+            stamp=stamp,
+            is_final=is_final,
+            T_world_lidar=_read_only(localised.T_world_lidar),
+            status=localised.status,
+            message=localised.message,
+            covariance=None if localised.covariance is None else _read_only(localised.covariance),
+            degenerate=localised.degenerate,
+            velocity=None if (velocity := localised.motion.latest) is None else _read_only(velocity),
+            points_used=localised.points_used,
+            residual_m=localised.residual_m,
+            inlier_ratio=localised.inlier_ratio,
+        )
+
+
+def _read_only(array: FloatArray) -> FloatArray:
+    """A copy that the caller cannot change: the next scan's estimate begins with the original."""
+    copy = array.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+_OPTION = re.compile(r"--([a-z][a-z-]*)")
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """All that was built of the scans so far."""
+
+    config: Config  # of the computation
+    # log, faults: of the scans; changed by `correct`
+    log: ScanLog
+    faults: Faults
+    map: MapBuilder  # the global map, and what is kept beside it
+    graph: "SlamGraph | None"  # the pose graph
+
+    def correct(self, directory: RunDirectory | None = None) -> tuple[GraphOutcome | None, DrawnMap]:
+        """Correct the log by the loops that are closed, and draw the map, with tiles in the directory."""
+        closed = loops_so_far(self.graph, self.map.global_map, self.log)
+        return closed, final_map(self.tracked(), closed, self.config.global_map, directory)
+
+    def tracked(self) -> Tracked:
+        """The same as a recording after the pipeline."""
+        built = self.map
+        return Tracked(
+            None,
+            None,
+            self.log,
+            len(self.log),
+            self.faults,
+            built.global_map,
+            built.views,
+            built.slides.tests,
+            None,
+        )
+
+
+def save_run(path: Path, overwrite: bool, config: Config, built: Built) -> None:
+    """Write a run directory.
+
+    Raises:
+        OutputError: the directory holds something else, or cannot be written.
+    """
+    described = {"version": version("lidarslam"), "source": None}
+    with python_names(), RunDirectory.create(path, overwrite) as directory:
+        closed, drawn = built.correct(directory)
+        write_results(directory, config, described, built.tracked(), closed, drawn)
+
+
+@contextmanager
+def python_names() -> Iterator[None]:
+    """Messages name the options of commands; those of functions have the same names, without dashes."""
+    try:
+        yield
+    except LidarSlamError as error:
+        error.args = (_OPTION.sub(lambda found: found[1].replace("-", "_"), str(error)), *error.args[1:])
+        raise
+
 
 logger = logging.getLogger(__name__)
 

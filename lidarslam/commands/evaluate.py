@@ -85,7 +85,7 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
     from lidarslam.compare.assessment.map_evaluation import MapOptions
     from lidarslam.compare.assessment.text import format_evaluation
     from lidarslam.evaluation.comparison.gates import format_gates, judge
-    from lidarslam.storage.summary_file import read_summary
+    from lidarslam.storage.finished_run import read_summary
 
     gates = (*options.pop("maxima"), *options.pop("minima"))
     given = {name: value for name, value in options.items() if value is not None}

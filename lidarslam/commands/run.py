@@ -66,8 +66,8 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
     with contextlib.ExitStack() as serve:
         with show_progress(source.name) as progress:
             progress.phase("loading the program")
+            from lidarslam.run.checkpoints import abandoned, lost_when_finished
             from lidarslam.run.request import RunRequest
-            from lidarslam.run.resuming import abandoned, lost_when_finished
             from lidarslam.run.run import execute
             from lidarslam.run.summary_text import format_outcome, format_stop
             from lidarslam.storage.directory import RERUN

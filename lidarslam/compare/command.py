@@ -18,7 +18,7 @@ from lidarslam.core.text.plain_text import command_line
 from lidarslam.evaluation.comparison.gates import Gate, format_gates, judge_comparison, require_methods
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.progress import show_count
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import read_summary
 
 DEFAULT_METHODS = "learned+map,kiss-icp"
 

@@ -17,7 +17,7 @@ from lidarslam.core.files import only_writer
 from lidarslam.core.text.plain_text import count
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.mean_table import mean_table
-from lidarslam.run.summary.machine import machine, versions
+from lidarslam.run.machine import machine, versions
 from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
 from lidarslam.storage.directory import RunDirectory
 

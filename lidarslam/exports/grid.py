@@ -8,8 +8,7 @@ import numpy as np
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.exports.grid_files import write_grid
 from lidarslam.mapping.global_map.products.occupancy_grid import FREE, OCCUPIED, GridOptions, occupancy_grid
-from lidarslam.storage.finished_run import load_map, read_trajectory
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import load_map, read_summary, read_trajectory
 
 _FINEST_M = 0.05
 

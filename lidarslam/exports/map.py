@@ -18,8 +18,7 @@ from lidarslam.exports.redrawn import redrawn
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.products import edits
-from lidarslam.storage.finished_run import is_run, load_map, read_trajectory
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import is_run, load_map, read_summary, read_trajectory
 
 SUFFIXES = (".ply", ".pcd", ".laz", ".e57")
 

@@ -9,8 +9,7 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.exports.glb import write_glb
 from lidarslam.mapping.global_map.products.mesh import Mesh, reconstruct
-from lidarslam.storage.finished_run import load_map
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import load_map, read_summary
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 _DEFAULT_CELL_M = 0.1

@@ -11,7 +11,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
 from lidarslam.mapping.global_map.moved_points import Views, seen_through
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.storage.directory import CONFIG
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import read_summary
 
 
 def redrawn(run: Path, least_through: int) -> tuple[PointCloud, int]:

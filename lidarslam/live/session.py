@@ -14,11 +14,11 @@ from lidarslam.datasets.intake import look_at
 from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.interface import Odometry
-from lidarslam.pipeline.background_worker import BackgroundWorker
+from lidarslam.pipeline.compile_ahead import made_up_scans
 from lidarslam.pipeline.estimates import Estimated, Localised
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.rehearsal import made_up_scans
 from lidarslam.pipeline.stages import Stages
+from lidarslam.pipeline.threads import BackgroundWorker
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Tracked
 from lidarslam.viewer.viewer import RerunMode, Viewer

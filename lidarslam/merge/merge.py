@@ -33,15 +33,13 @@ from lidarslam.merge.parts import (
     track_part,
 )
 from lidarslam.merge.writing import MergeOutcome, Part, missing, write_merge
-from lidarslam.pipeline.background_worker import BackgroundWorker
+from lidarslam.pipeline.threads import BackgroundWorker
+from lidarslam.run.checkpoints import WITHOUT_EFFECT
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.progress import show_count
-from lidarslam.run.resuming import WITHOUT_EFFECT
-from lidarslam.storage.about import About
-from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph

@@ -25,20 +25,18 @@ from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
+from lidarslam.run.checkpoints import describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.request import RunRequest
-from lidarslam.run.resuming import describe_computed
 from lidarslam.run.run import open_odometry, require_apart
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
 from lidarslam.storage import directory as files
-from lidarslam.storage.about import About
-from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory, files_in, remove_run
+from lidarslam.storage.finished_run import read_summary
 from lidarslam.storage.state_file import read_state, write_state
-from lidarslam.storage.summary_file import read_summary
-from lidarslam.storage.unfinished import Unfinished, remove_unfinished
+from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished, remove_unfinished
 from lidarslam.viewer.viewer import Viewer
 
 # The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.

@@ -18,14 +18,13 @@ from lidarslam.merge.parts import MergeRequest, PartDone, read_part
 from lidarslam.run.loop_closing import FinishedGraph
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, draw, final_map, write_map, write_results
-from lidarslam.run.summary.summary import GraphSummary, graph_and_map_json, peak_rss_mb
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import GraphSummary, WrittenMap, graph_and_map_json, peak_rss_mb
 from lidarslam.run.summary_text import format_map
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
-from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
+from lidarslam.storage.unfinished import CheckpointFiles
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph

@@ -21,7 +21,7 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
-from lidarslam.pipeline import free_memory
+from lidarslam.pipeline import threads
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
@@ -94,8 +94,8 @@ class Pipeline(Stateful):
                 jobs.append(mapping.submit(self._build, estimated, localised))
 
             for number, estimated in enumerate(self._estimate(scans), start=1):
-                if number % free_memory.EVERY_SCANS == 0:
-                    free_memory.return_free_memory()
+                if number % threads.EVERY_SCANS == 0:
+                    threads.return_free_memory()
                 previous, self.held = self.held, estimated
                 if previous is None:
                     continue

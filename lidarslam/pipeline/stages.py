@@ -16,12 +16,12 @@ from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
-from lidarslam.pipeline.background_worker import BackgroundWorker
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, graph_scan
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.map_correction import MapCorrection
 from lidarslam.pipeline.odometry_gate import OdometryGate
+from lidarslam.pipeline.threads import BackgroundWorker
 
 # Calls that may wait for the graph, which takes as long for a loop closure as for all scans up to the next keyframe.
 _GRAPH_CALLS_BEHIND = 64

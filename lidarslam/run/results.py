@@ -7,6 +7,7 @@ from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import cannot_write, make_own_folder
 from lidarslam.core.geometry import inverse
 from lidarslam.core.pose_text import format_kitti
 from lidarslam.core.text.plain_text import count
@@ -14,19 +15,18 @@ from lidarslam.core.text.trajectory_io import format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat
-from lidarslam.mapping.global_map.drawing import DrawnMap, drawn_map
-from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.global_map.drawing import DrawnMap, TiledMap, drawn_map
+from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.moved_points import PlacedViews
+from lidarslam.mapping.global_map.tile_store import Tile
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.summary.summary import RunSummary, summarise
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.map_tiles import TileWriter
+from lidarslam.storage.directory import MAP_INDEX, MAP_TILES, RunDirectory
 
 logger = logging.getLogger(__name__)
 
@@ -148,3 +148,70 @@ def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> Trajectory
     if metrics is not None:
         directory.write_json(files.METRICS, metrics.to_json())
     return metrics
+
+
+class TileWriter:
+    """Writes the tiles of a map, and then the index, without which they are nothing."""
+
+    def __init__(self, directory: RunDirectory) -> None:
+        self._directory = directory
+        self._entries: dict[Tile, dict[str, Any]] = {}
+        self.failure: OutputError | None = None  # of the first tile that could not be written, after which none is
+
+    def write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
+        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
+
+        Raises:
+            OutputError: a file is in the way of the folder.
+        """
+        if self.failure is None and not self._entries:
+            self._begin()
+        if self.failure is None:
+            try:
+                self._write(tile, cloud, brightest)
+            except OutputError as error:
+                self.failure = error
+                self._remove()
+
+    def _write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
+        name = f"{tile[0]}_{tile[1]}.laz"
+        with self._directory.replacing(f"{MAP_TILES}/{name}") as path:
+            write_cloud(path, cloud, brightest)
+        self._entries[tile] = {
+            "file": name,
+            "tile": list(tile),
+            "points": len(cloud),
+            "min": cloud.points.min(axis=0).round(4).tolist(),
+            "max": cloud.points.max(axis=0).round(4).tolist(),
+        }
+
+    def finish(self, tiled: TiledMap) -> None:
+        """Write the index.
+
+        Raises:
+            OutputError: it could not be written.
+        """
+        index = {
+            "frame": "world",  # of trajectory.tum
+            "tile_edge_m": round(tiled.tiling.edge_m, 9),
+            "voxel_size_m": tiled.tiling.voxel_size_m,
+            "points": tiled.total,
+            "tiles": [self._entries[tile] for tile in tiled.points],
+        }
+        self._directory.write_json(MAP_INDEX, index)
+
+    def _begin(self) -> None:
+        folder = self._directory.path / MAP_TILES
+        self._directory.before_change()
+        try:
+            make_own_folder(folder)
+            (self._directory.path / MAP_INDEX).unlink(missing_ok=True)  # first: tiles of an earlier run are replaced
+        except (FileExistsError, NotADirectoryError) as error:
+            raise OutputError(f"{folder}: a file is in the way; name another directory") from error
+        except OSError as error:
+            self.failure = cannot_write(folder, error)
+
+    def _remove(self) -> None:
+        """Leave the room of the tiles to the other results."""
+        for entry in self._entries.values():
+            (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)

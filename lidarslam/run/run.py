@@ -1,5 +1,6 @@
 """One run on disk: from a source to a run directory."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -18,14 +19,13 @@ from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.odometry_gate import OdometryGate
+from lidarslam.run.checkpoints import describe_computed
 from lidarslam.run.elevation import with_elevations
-from lidarslam.run.gnss import gnss_track, write_in_utm
 from lidarslam.run.inertial import imu_samples
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, final_map, write_results
-from lidarslam.run.resuming import describe_computed
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Progress, track
 from lidarslam.storage.directory import RERUN, RunDirectory
@@ -34,8 +34,49 @@ from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.viewer import RerunMode, Viewer
 from lidarslam.viewer.web_page import WebPage
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # loads SciPy and the pose graph
+    from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+logger = logging.getLogger(__name__)
+
+# The folder of a run's results in UTM.
+UTM_FOLDER = "utm"
+
+
+def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
+    """The GNSS track of a recording, in UTM; None where the pose graph uses none.
+
+    Raises:
+        InputError: the recording has no GNSS positions.
+        ConfigError: pyproj is not installed.
+    """
+    if not (request.config.pose_graph.enabled and request.config.pose_graph.gnss):
+        return None
+    from lidarslam.exports.gnss import read_gnss
+    from lidarslam.exports.projection import utm_around
+    from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
+
+    track = read_gnss(request.source, request.config.reader)
+    utm = utm_around(track.geodetic)
+    return ProjectedTrack(track, utm.project(track.geodetic), utm.scale)
+
+
+def write_in_utm(request: RunRequest) -> None:
+    """Write map and trajectory of a finished run in UTM, in a folder of its own; see `lidarslam.exports.geo`.
+
+    Positions that do not determine the heading are a warning: the run is there.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from lidarslam.exports.geo import export_geo, georeference
+
+    try:
+        for line in export_geo(georeference(request.out), request.out / UTM_FOLDER, overwrite=True):
+            logger.info(line)
+    except InputError as error:
+        logger.warning("not written in UTM: %s", error)
 
 
 def execute(

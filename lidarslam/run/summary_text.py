@@ -7,8 +7,7 @@ from lidarslam.core.text.plain_text import as_typed, command_line, count, joined
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary.summary import GraphSummary, RunSummary
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap
 from lidarslam.storage.directory import MAP_PLY, MAP_TILES, REPORT, SCANS_CSV, SUMMARY
 
 # A speed that differs less is that of the recording.

@@ -30,7 +30,7 @@ from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import Localiser, ScanMapper, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.elevation import Elevation
 from lidarslam.run.inertial import open_inertial

@@ -9,8 +9,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio, resolved
 from lidarslam.datasets.registry import takes_sequence
-from lidarslam.storage.about import About
 from lidarslam.storage.directory import TRAJECTORY_TUM
+from lidarslam.storage.unfinished import About
 
 RUNS = Path("runs")
 _TIME = "%Y-%m-%d_%H-%M-%S"

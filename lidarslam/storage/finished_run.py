@@ -2,26 +2,56 @@
 
 import csv
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, with_config
+from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
+from lidarslam.core.text.json_text import read_json
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.formats import read_pcd, read_ply
 from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
 from lidarslam.datasets.published.unrecognised import absent
+from lidarslam.datasets.registry import choose_reader
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
-from lidarslam.storage.about import require_whole
-from lidarslam.storage.not_a_run import not_a_run
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.directory import SUMMARY
+from lidarslam.storage.unfinished import require_whole
+
+_LISTED = 5
+# How deep a folder is searched for runs.
+_PATTERNS = tuple("*/" * depth + files.TRAJECTORY_TUM for depth in (1, 2, 3))
+
+
+def not_a_run(path: Path) -> str:
+    """Why nothing can be read from a path that should be a run directory."""
+    if not path.exists():
+        return absent(path)
+    if path.is_file():
+        if path.name in files.FILES and (path.parent / files.TRAJECTORY_TUM).is_file():
+            return f"{path}: is a file of the run {path.parent}; name the directory"
+        what = "is a file, expected a run directory"
+    else:
+        for pattern in _PATTERNS:
+            if found := sorted(str(file.parent) for file in path.glob(pattern)):
+                more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
+                return f"{path}: is no run, but holds some; name them: {', '.join(found[:_LISTED])}{more}"
+        what = f"not a run directory (no {files.TRAJECTORY_TUM})"
+    with suppress(InputError):
+        choose_reader(path)
+        return f"{path}: is a recording, {what}; make one with lidarslam run {path} --out RUN"
+    return f"{path}: {what}; lidarslam run makes one from a recording"
+
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
 # In .ply and in .pcd files.
@@ -179,3 +209,85 @@ def read_statuses(path: Path, poses: int) -> list[Status]:
 def _damaged(file: Path, kind: str, error: Exception) -> InputError:
     reason = f"{error} is missing" if isinstance(error, KeyError) else error
     return InputError(f"{file}: not {kind} ({reason}); make the run again")
+
+
+_keeping_others = with_config(ConfigDict(extra="allow"))
+_Positive = Annotated[float, Field(gt=0.0)]
+
+
+@_keeping_others
+class _Stretch(TypedDict):
+    first: NonNegativeInt
+    last: NonNegativeInt
+
+
+@_keeping_others
+class _LostStretch(_Stretch):
+    reason: str
+
+
+@_keeping_others
+class _Loop(TypedDict):
+    first_scan: int
+    second_scan: int
+    accepted: bool
+
+
+@_keeping_others
+class _PoseGraph(TypedDict):
+    loops: list[_Loop]
+
+
+@_keeping_others
+class _Localisation(TypedDict):
+    map: str
+
+
+@_keeping_others
+class _Recording(TypedDict):
+    directory: str | None
+
+
+@_keeping_others
+class _Summary(TypedDict, total=False):
+    """What is read back, of any version; other keys are kept as they are."""
+
+    scans: NonNegativeInt
+    lost_scans: NonNegativeInt
+    lost: list[_LostStretch]
+    map_contradictions: list[_Stretch]
+    length_m: float
+    unconstrained_m: float
+    map_voxel_size_m: _Positive | None
+    map_entropy: float | None
+    ms_per_scan: dict[str, dict[str, float | None]]
+    pose_graph: _PoseGraph | None
+    localisation: _Localisation | None
+    recordings: list[_Recording]
+    warnings: list[str]
+
+
+_SHAPE = TypeAdapter(_Summary)
+
+# Share of the way, of a metre at least, that may be unconstrained.
+_MOST_UNCONSTRAINED, _SHORTEST_M = 0.1, 1.0
+
+
+def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
+    """Whether so much of a way lies along directions that hardly any surface constrains that its length is unknown."""
+    return unconstrained_m > _MOST_UNCONSTRAINED * max(length_m, _SHORTEST_M)
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """The content of a run's summary.json, empty when there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    file = path / SUMMARY
+    if not file.is_file():
+        return {}
+    try:
+        return cast(dict[str, Any], read_json(file, _SHAPE))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: not a run's summary ({error}); make the run again") from error

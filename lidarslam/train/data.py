@@ -1,8 +1,11 @@
-"""The data of a training: recordings and simulations, prepared once and kept on disk."""
+"""The data of a training: recordings and simulations, prepared once, also side by side, and kept on disk."""
 
+import contextlib
 import hashlib
 import json
 import random
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,16 +13,54 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from lidarslam.core.errors import ConfigError, InputError
+import numpy as np
+import torch
+
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan, ScanSequence
+from lidarslam.core.tasks.start import open_tasks
+from lidarslam.core.tasks.tasks import Where
+from lidarslam.core.tracking import Status
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.training.preparation import PreparedRecording, prepare
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.threads import in_order
+from lidarslam.run.progress import show_count
 from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredients_of, mixture
-from lidarslam.train.teacher import MapTeacher
+
+
+class MapTeacher:
+    """Registers a recording at constant velocity, scan after scan."""
+
+    def __init__(self) -> None:
+        self._mapper = Mapper(MappingConfig())
+        self._T_world_middle: list[FloatArray] = []
+        self._is_ok: list[bool] = []
+
+    def follow(self, scan: Scan) -> None:
+        """Register the next scan."""
+        mapped = self._mapper.process(scan, Prior())
+        state = mapped.state
+        self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * scan.middle_offset_s))
+        # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.
+        self._is_ok.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
+
+    def relabelled(self, recording: PreparedRecording) -> PreparedRecording:
+        """The recording of these scans with the motions between the middles of sweeps on the map.
+
+        A motion is valid where both poses have the status ok.
+        """
+        T = np.stack(self._T_world_middle)
+        T_prev_curr = inverse(T[:-1]) @ T[1:]
+        is_ok = torch.tensor(self._is_ok)
+        return replace(recording, T_prev_curr=torch.from_numpy(T_prev_curr).float(), valid=is_ok[:-1] & is_ok[1:])
+
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
 PIECE = 500
@@ -218,3 +259,47 @@ def digest(stretches: Sequence[Stretch]) -> str:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, where: Where) -> None:
+    """Prepare the stretches into the cache, where they are not in it already.
+
+    Raises:
+        InputError: a recording turns out unreadable.
+        OutputError: the cache cannot be written, or is another folder on the nodes of a cluster.
+        KeyboardInterrupt: Ctrl-C; what is finished stays in the cache.
+    """
+    pieces = [piece for stretch in stretches for piece in stretch.pieces()]
+    wanted = [piece for piece in pieces if not file_of(piece, config, cache).is_file()]
+    done, total = 0, sum(map(len, wanted))
+
+    def count(index: int, _: object) -> None:
+        nonlocal done
+        done += len(wanted[index])
+        show(done, total)
+
+    prepare_one = partial(_prepare_one, config=config, cache=cache.absolute())
+    with show_count("preparing side by side") as show, _interrupted_at_once(), open_tasks(where) as tasks:
+        for _ in tasks.run(prepare_one, wanted, count):
+            pass
+    if not all(file_of(piece, config, cache).is_file() for piece in wanted):
+        raise OutputError(f"{cache}: is not shared by the nodes of the cluster; name a folder that is with --prepared")
+
+
+def _prepare_one(piece: Stretch, config: TrainingConfig, cache: Path) -> None:
+    prepared_piece(piece, config, cache, lambda _: None)
+
+
+@contextlib.contextmanager
+def _interrupted_at_once() -> Iterator[None]:
+    """For the time of the block, a training's first Ctrl-C ends it; a request that is ignored stays ignored."""
+    if threading.current_thread() is not threading.main_thread():  # signals go to the main thread
+        yield
+        return
+    asking = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
+    earlier = [(number, signal.signal(number, signal.default_int_handler)) for number in asking]
+    try:
+        yield
+    finally:
+        for number, handler in earlier:
+            signal.signal(number, handler)

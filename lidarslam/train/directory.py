@@ -1,11 +1,17 @@
-"""The directory of a training: the names of its files, and whether an earlier one may be resumed or replaced."""
+"""The directory of a training: its files, and the state from which it goes on as if it had never stopped."""
 
 import shutil
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
+from pydantic import TypeAdapter
+from torch import Tensor, nn
+
 from lidarslam.config.settings import SOURCES_SECTION
-from lidarslam.core.errors import OutputError
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
 
 CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"
@@ -56,3 +62,72 @@ def is_training(path: Path) -> bool:
         return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{SOURCES_SECTION}:")
     except (OSError, UnicodeDecodeError):
         return False
+
+
+_KIND = Kind("the state of a training", version=1)
+_NETWORK, _OPTIMIZER = "network/", "optimizer/"
+
+
+@dataclass
+class Progress:
+    """The state beside weights and moments."""
+
+    step: int = 0  # how many steps are done
+    best: float | None = None  # the lowest score of a validation so far, None before the first
+    sums: dict[str, float] = field(default_factory=dict)  # of each part of the loss since the last line of the log
+    counted: int = 0  # over how many steps
+    data: str = ""  # digest of the recordings
+
+
+_SHAPE = TypeAdapter(Progress)
+
+
+def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
+    """Write the file, whole or not at all.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    tensors: dict[str, Tensor] = {_NETWORK + name: value for name, value in network.state_dict().items()}
+    for number, moments in optimizer.state_dict()["state"].items():
+        tensors |= {f"{_OPTIMIZER}{number}/{name}": torch.as_tensor(value) for name, value in moments.items()}
+    write_tensor_file(path, _KIND, tensors, vars(progress))
+
+
+def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
+    """Restore weights and moments; the network and the optimizer must be as they were made.
+
+    Raises:
+        InputError: the file is not usable, or belongs to another network.
+    """
+    tensors, content = read_tensor_file(path, _KIND)
+    try:
+        weights = _below(tensors, _NETWORK)
+        moments = _moments(
+            _below(tensors, _OPTIMIZER), [p for group in optimizer.param_groups for p in group["params"]]
+        )
+        if damaged := next((name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())), None):
+            raise ValueError(f"{damaged} is not finite")
+        network.load_state_dict(weights)
+        optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+        return _SHAPE.validate_python(content)
+    except (RuntimeError, ValueError, KeyError, IndexError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{path}: does not belong to this network; go on with the configuration it was begun with ({reason[:200]})"
+        ) from error
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def _moments(tensors: dict[str, Tensor], parameters: list[nn.Parameter]) -> dict[int, dict[str, Tensor]]:
+    """The moments of each parameter by its number: of its shape, or a number of steps."""
+    moments = dict[int, dict[str, Tensor]]()
+    for name, tensor in tensors.items():
+        number, _, key = name.partition("/")
+        if not number.isdecimal() or tensor.shape not in (torch.Size(), parameters[int(number)].shape):
+            raise ValueError(f"{name} has the shape {tuple(tensor.shape)}")
+        moments.setdefault(int(number), {})[key] = tensor
+    return moments

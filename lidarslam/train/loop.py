@@ -1,15 +1,17 @@
-"""The steps of a training: draw pairs, lower the loss, log it, and from time to time validate and save."""
+"""The steps of a training on its devices: draw pairs, lower the loss, and now and then log, validate and save."""
 
 import contextlib
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
@@ -19,12 +21,68 @@ from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.pairs import Pairs
 from lidarslam.odometry.training.preparation import PreparedRecording
 from lidarslam.odometry.training.training import Validation, learning_rate, loss_of, validate
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.train import directory as files
-from lidarslam.train.devices import Devices
-from lidarslam.train.log import TrainingLog
-from lidarslam.train.state import Progress, save_state
-from lidarslam.train.text import format_step, format_validation
+from lidarslam.train.directory import Progress, save_state
+from lidarslam.train.log import TrainingLog, format_step, format_validation
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+class Devices:
+    """The device of this process, and its place among the others.
+
+    Attributes:
+        device: of this process.
+        processes: how many there are.
+        process: number of this one; the first writes and speaks.
+
+    Raises:
+        ConfigError: the device is not there.
+    """
+
+    def __init__(self, name: DeviceName) -> None:
+        if name == "cuda" and not torch.cuda.is_available():
+            raise ConfigError("--device cuda: PyTorch finds no such device here; leave it out, or choose cpu")
+        is_cuda = name != "cpu" and torch.cuda.is_available()
+        self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if is_cuda else torch.device("cpu")
+        self.processes = int(os.environ.get("WORLD_SIZE", "1"))
+        self.process = int(os.environ.get("RANK", "0")) if self.processes > 1 else 0
+        if is_cuda:
+            torch.cuda.set_device(self.device)
+        if self.processes > 1 and not distributed.is_initialized():
+            distributed.init_process_group("nccl" if is_cuda else "gloo")
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process is the one that writes and speaks."""
+        return self.process == 0
+
+    def shared(self, module: nn.Module) -> nn.Module:
+        """A module on the device, with gradients averaged over the processes."""
+        if self.processes == 1:
+            return module
+        # Which parameters have a gradient depends on the losses.
+        return DistributedDataParallel(module, find_unused_parameters=True)
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.processes > 1:
+            distributed.barrier()
+
+    def any(self, flag: bool) -> bool:
+        """Whether it is true in any process."""
+        if self.processes == 1:
+            return flag
+        total = torch.tensor(float(flag), device=self.device)
+        distributed.all_reduce(total)
+        return bool(total > 0.0)
+
+    def close(self) -> None:
+        """Leave the other processes."""
+        if self.processes > 1 and distributed.is_initialized():
+            distributed.destroy_process_group()
+
 
 # Steps between lines of the log, and between validations.
 LOG_EVERY, VALIDATE_EVERY = 50, 500

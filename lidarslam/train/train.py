@@ -1,4 +1,4 @@
-"""One training on disk: from recordings to weights."""
+"""One training on disk: from the options of `lidarslam train` and recordings to weights."""
 
 import contextlib
 import signal
@@ -12,23 +12,33 @@ from typing import Any
 import torch
 from torch import nn
 
+from lidarslam.config.settings import SOURCES_SECTION, reader_settings
+from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer, remove_partial_files, require_no_link
 from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
 from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.shipped import default_weights
 from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.training import Validation, make_optimizer
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import directory as files
-from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated
-from lidarslam.train.devices import DeviceName, Devices
-from lidarslam.train.loop import Recordings, TrainingLoop
-from lidarslam.train.settings import TrainConfig, dump_train_yaml
-from lidarslam.train.side_by_side import prepare_side_by_side
-from lidarslam.train.state import Progress, load_state
-from lidarslam.train.text import format_outcome
+from lidarslam.train.data import (
+    Stretch,
+    digest,
+    draw_weights,
+    hold_out,
+    prepare_side_by_side,
+    prepared,
+    recorded,
+    simulated,
+)
+from lidarslam.train.directory import CONFIG, Progress, is_training, load_state
+from lidarslam.train.log import format_outcome
+from lidarslam.train.loop import DeviceName, Devices, Recordings, TrainingLoop
+from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
 
 
 @dataclass(frozen=True)
@@ -215,3 +225,43 @@ def _interruption() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in earlier:
             signal.signal(number, handler)
+
+
+def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: Any) -> bool:
+    """Train with the options of `lidarslam train --help`; whether all steps were done.
+
+    A training that is resumed is as it was, but for what is given anew.
+
+    Raises:
+        LidarSlamError: options contradict each other, a value does not fit, or as `execute`.
+    """
+    out, start_from = options["out"], options["start_from"]
+    if options["resume"] and options["overwrite"]:
+        raise ConfigError("--resume goes on with what --overwrite replaces; choose one")
+    if options["resume"] and start_from is not None:
+        raise ConfigError("--resume goes on with the weights it left; leave --from out")
+    earlier = out / CONFIG if options["resume"] and is_training(out) else None
+    if start_from is not None:
+        start_from = default_weights() if start_from == "shipped" else Path(start_from)
+    named = {"training.steps": options["steps"], "training.network.name": options["network"]}
+    settings = [
+        *(() if options["losses"] is None else LOSSES[options["losses"]]),
+        *options["settings"],
+        *(f"{key}={value}" for key, value in named.items() if value is not None),
+        *reader_settings(name=options["reader"], topic=options["topic"], sequence=options["sequence"]),
+    ]
+    request = TrainRequest(
+        sources=sources or _earlier_sources(earlier),
+        out=out,
+        config=load_train_config(options["config_file"] or earlier, settings),
+        start_from=start_from,
+        **{name: options[name] for name in ("device", "prepared", "resume", "overwrite", "where")},
+    )
+    return execute(request, say)
+
+
+def _earlier_sources(earlier: Path | None) -> tuple[Path, ...]:
+    """The recordings that a training was begun on."""
+    section = {} if earlier is None else read_yaml(earlier).get(SOURCES_SECTION)
+    sources = section.get("sources", []) if isinstance(section, dict) else []
+    return tuple(Path(str(source)) for source in sources)

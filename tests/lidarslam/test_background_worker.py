@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from lidarslam.pipeline.background_worker import BackgroundWorker
+from lidarslam.pipeline.threads import BackgroundWorker
 
 
 class Slow:

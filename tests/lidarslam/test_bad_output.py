@@ -91,7 +91,7 @@ def test_tiles_that_find_no_room_cost_no_other_result(
         path.write_bytes(b"a tile")
         written.append(path)
 
-    monkeypatch.setattr("lidarslam.storage.map_tiles.write_cloud", full_after_one)
+    monkeypatch.setattr("lidarslam.run.results.write_cloud", full_after_one)
     out = tmp_path / "run"
     result = lidarslam("run", small_recording, "--out", out, *FAST, "--set", "global_map.most_points=2000")
     assert result.exit_code == 1

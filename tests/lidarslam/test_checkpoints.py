@@ -23,14 +23,12 @@ from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run import checkpoints
-from lidarslam.run.checkpoints import Checkpoints
-from lidarslam.run.resuming import scans_left
+from lidarslam.run.checkpoints import Checkpoints, scans_left
+from lidarslam.run.results import TileWriter
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.storage.about import About, require_whole
 from lidarslam.storage.directory import CONFIG, RunDirectory
-from lidarslam.storage.map_tiles import TileWriter
 from lidarslam.storage.state_file import read_state
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.unfinished import About, Unfinished, require_whole
 
 
 class Clock:

@@ -23,8 +23,8 @@ from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.folders.formats import read_ply
-from lidarslam.storage.about import About
 from lidarslam.storage.directory import UNFINISHED
+from lidarslam.storage.unfinished import About
 
 FAST = ("--odometry", "constant-velocity", "--no-pose-graph", "--no-report")
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")]

@@ -13,9 +13,8 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import default_places
-from lidarslam.storage.about import About
 from lidarslam.storage.default_places import latest_run, new_place, source_name, unfinished_run
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.unfinished import About, Unfinished
 
 TIME = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d"
 FAST = ("--odometry", "constant-velocity", "--stop", "3")

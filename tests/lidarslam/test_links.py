@@ -15,8 +15,7 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import make_own_folder, only_writer, open_own
 from lidarslam.merge.parts import PartTask, remove_part, track_part
 from lidarslam.run.request import RunRequest
-from lidarslam.storage.about import About
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.unfinished import About, Unfinished
 
 FAST = ("--odometry", "constant-velocity", "--no-report", "--pose-graph", "--set", "global_map.most_points=2000")
 

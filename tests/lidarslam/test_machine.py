@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.run.summary import machine as described
-from lidarslam.run.summary.machine import machine, versions
+from lidarslam.run import machine as described
+from lidarslam.run.machine import machine, versions
 
 
 def test_the_programs_that_results_depend_on_are_named() -> None:

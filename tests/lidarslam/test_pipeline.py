@@ -21,9 +21,9 @@ from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import STAGES, ScanResult
-from lidarslam.pipeline.free_memory import EVERY_SCANS
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.threads import EVERY_SCANS
 
 
 def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 
 
 def test_items_come_in_order() -> None:

@@ -11,9 +11,7 @@ from lidarslam.core.state.stateful import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import ScanResult, SweepMotion
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary.summary import summarise
-from lidarslam.run.summary.timing import Milliseconds
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import Milliseconds, WrittenMap, summarise
 from lidarslam.run.summary_text import format_times
 
 

@@ -199,7 +199,7 @@ def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
 def test_prepared_recordings_are_the_same(small_recording: Path, tmp_path: Path) -> None:
     """To the byte, but for the order in which safetensors lists what describes the file."""
     data = pytest.importorskip("lidarslam.train.data")
-    side_by_side = pytest.importorskip("lidarslam.train.side_by_side")
+    side_by_side = pytest.importorskip("lidarslam.train.data")
     config = data.TrainingConfig(images={"columns": 96}, teacher="map")
     stretches = [
         data.recorded(small_recording, data.ReaderConfig()),

@@ -10,9 +10,7 @@ from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary.summary import GraphSummary, LostStretch, RunSummary
-from lidarslam.run.summary.timing import Milliseconds, SlowestScan
-from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, SlowestScan, WrittenMap
 from lidarslam.run.summary_text import format_map, format_outcome
 
 

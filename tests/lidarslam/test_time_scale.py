@@ -13,7 +13,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.run.summary.time_scale import time_scale, time_scale_warning
+from lidarslam.run.summary import time_scale, time_scale_warning
 
 STAMPS = 100.0 + 0.1 * np.arange(60)
 

@@ -14,8 +14,7 @@ from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
-from lidarslam.train.data import Stretch, draw_weights
-from lidarslam.train.teacher import MapTeacher
+from lidarslam.train.data import MapTeacher, Stretch, draw_weights
 
 SCANS = 14
 

@@ -69,7 +69,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
         out = default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
     require_train_extra("training")
     where = take_where(options)
-    from lidarslam.train.command import run_train
+    from lidarslam.train.train import run_train
 
     if not run_train(sources, say, out=out, where=where, **options):
         ctx.exit(EXIT_MENDABLE)

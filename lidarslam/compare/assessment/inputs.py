@@ -19,8 +19,8 @@ from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.datasets.registry import is_recording, open_recording
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.storage import directory as files
-from lidarslam.storage.about import require_whole
 from lidarslam.storage.finished_run import read_trajectory
+from lidarslam.storage.unfinished import require_whole
 
 # KITTI's LiDAR turns ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1

@@ -7,7 +7,7 @@ from lidarslam.compare.methods.process import LOST
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.evaluation.comparison.comparison import MethodStatus
 from lidarslam.storage.directory import SUMMARY
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import read_summary
 
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")

@@ -17,7 +17,7 @@ from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, final_map, write_results

@@ -20,7 +20,7 @@ from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import read_summary
 from lidarslam.viewer.drawn_runs import load_drawn_runs
 from lidarslam.viewer.page.run_result import read_series, with_run
 from lidarslam.viewer.page.run_text import changed_settings, describe_results, describe_source, describe_warnings

@@ -10,8 +10,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.comparison.comparison import MethodResult, ScanSeries
 from lidarslam.storage import directory as files
-from lidarslam.storage.finished_run import read_statuses, read_trajectory
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.finished_run import read_statuses, read_summary, read_trajectory
 
 
 def with_run(result: MethodResult, run: Path) -> MethodResult:

@@ -1,4 +1,4 @@
-"""summary.json: a run in numbers, and its warnings."""
+"""Scale of the points' times, from how fast sensors turn within their sweeps and from scan to scan."""
 
 import resource
 import sys
@@ -8,20 +8,125 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lidarslam.core.geometry import inverse
+from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.elevation import Elevation, elevation_json
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary.time_scale import time_scale, time_scale_warning
-from lidarslam.run.summary.timing import Milliseconds, SlowestScan
-from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.storage.directory import SCANS_CSV
-from lidarslam.storage.summary_file import is_unconstrained
+from lidarslam.storage.finished_run import is_unconstrained
+
+# Turns that are slower, rad/s, and fewer scans decide nothing; of scans farther apart, a shaken sensor turns otherwise
+# in between.
+_LEAST_RATE, _FEWEST, _MOST_INTERVAL_S = np.deg2rad(5.0), 15, 0.15
+# A share of the intervals by which they may differ.
+_EVEN = 0.5
+# Ratios with the right times: 0.99 to 1.19 on simulated and real recordings; with doubled ones 0.5 to 0.7.
+_RIGHT = (0.75, 1.4)
+
+
+def time_scale(
+    trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]
+) -> tuple[float, int] | None:
+    """Ratio of the turn rates within sweeps to those from scan to scan; one where the points' times are right.
+
+    Args:
+        trajectory: of N scans.
+        turn_rates: (N, 3) rad/s within each sweep, in the LiDAR frame; NaN where unknown.
+        is_tracked: (N,) whether the pose is right.
+
+    Returns:
+        It, and the number of scans that turned; None where too few did.
+    """
+    T, interval_s = trajectory.T_world_lidar, np.diff(trajectory.stamps)
+    if len(T) < _FEWEST or np.median(interval_s) > _MOST_INTERVAL_S:
+        return None
+    rates = log(inverse(T[:-1]) @ T[1:])[:, :3] / interval_s[:, None]
+    is_even = np.abs(interval_s / np.median(interval_s) - 1.0) < _EVEN
+    is_even &= is_tracked[:-1] & is_tracked[1:]
+    # A sweep may lie before or after its stamp.
+    around, within = 0.5 * (rates[:-1] + rates[1:]), turn_rates[1:-1]
+    turns = is_even[:-1] & is_even[1:] & np.isfinite(within).all(axis=1)
+    turns &= np.linalg.norm(around, axis=1) > _LEAST_RATE
+    if turns.sum() < _FEWEST:
+        return None
+    return float((within * around)[turns].sum() / (around[turns] ** 2).sum()), int(turns.sum())
+
+
+def time_scale_warning(found: tuple[float, int] | None) -> str | None:
+    """What a ratio says of the points' times; None where it is near one, or unknown."""
+    if found is None or _RIGHT[0] < found[0] < _RIGHT[1]:
+        return None
+    ratio, scans = found
+    fault = "backwards" if ratio < 0.0 else "too long" if ratio < 1.0 else "too short"
+    return (
+        f"the points' times are {fault}, as it seems: within the sweeps of {scans} scans the sensor turns {ratio:.2f}"
+        " times as fast as from scan to scan; check reader.time_unit and reader.time_field, or correct them with"
+        f" --set reader.time_scale={'-1' if ratio < 0.0 else 'FACTOR'}"
+    )
+
+
+@dataclass(frozen=True)
+class Milliseconds:
+    """Median, 95th and 99th percentile of wall times."""
+
+    median: float
+    p95: float
+    p99: float
+
+    @classmethod
+    def of(cls, values: Sequence[float] | FloatArray) -> "Milliseconds":
+        """Of at least one time."""
+        return cls(*(float(np.percentile(values, share)) for share in (50.0, 95.0, 99.0)))
+
+
+@dataclass(frozen=True)
+class SlowestScan:
+    """The longest stage of any scan but the first, which waits for loops to be loaded."""
+
+    scan: int
+    stage: str
+    ms: float
+
+    @classmethod
+    def of(cls, stage_ms: FloatArray) -> "SlowestScan | None":
+        """By the times (N, S) of the `STAGES`; None of fewer than two scans."""
+        if len(stage_ms) < 2:
+            return None
+        scan, stage = divmod(int(stage_ms[1:].argmax()), stage_ms.shape[1])
+        return cls(scan + 1, STAGES[stage], float(stage_ms[scan + 1, stage]))
+
+
+@dataclass(frozen=True)
+class WrittenMap:
+    """The map as it was written."""
+
+    # points, voxel_size_m: number of points and edge of a voxel; None without a map
+    points: int
+    voxel_size_m: float | None
+    moved: int  # number of points that were removed as moving objects
+    entropy: float | None = None  # mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed
+    fields: tuple[str, ...] = ()  # the attributes of its points
+    tiled: TiledMap | None = None  # all of it, where `points` are those of an overview
+
+    def to_json(self) -> dict[str, Any]:
+        """Its keys of summary.json."""
+        return {
+            "map_points": self.points,
+            "map_voxel_size_m": self.voxel_size_m,
+            "map_points_moved": self.moved,
+            "map_entropy": self.entropy,
+            "map_fields": list(self.fields),
+            "map_tiles": None if self.tiled is None else self.tiled.to_json(),
+        }
+
 
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
