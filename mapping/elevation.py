@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, exp, transform_points
-from lidarslam.core.state.stateful import ANY_NUMBER, TRANSFORM, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
@@ -206,7 +206,7 @@ def _means(values: FloatArray, group: IntArray) -> FloatArray:
 class ElevationEstimator(Stateful):
     """Takes registered scans, and adjusts those of a stretch once it is complete."""
 
-    _found: Annotated[FloatArray, Shape(None, 3), ANY_NUMBER]  # angle and standard deviations of each stretch
+    _found: Annotated[FloatArray, Shape(None, 3)]  # angle and standard deviations of each stretch
     _scans: list[PlacedPoints]  # of the present stretch
     _edge_m: float
     _one_in: int

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import MappingConfig
 
 # Fewer points make no pose, and no scale.

@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import TRANSFORM, Saved, Shape, State
+from lidarslam.core.state import TRANSFORM, Saved, Shape, State
 
 
 @dataclass(frozen=True, eq=False)

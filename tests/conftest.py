@@ -14,7 +14,7 @@ from hypothesis import settings
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.storage.state_file import read_state, write_state
 

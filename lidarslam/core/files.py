@@ -1,4 +1,4 @@
-"""Files that are whole or absent, directories with one writer."""
+"""Files that are whole or absent, directories with one writer, arrays read by one thread at a time."""
 
 import contextlib
 import errno
@@ -6,12 +6,23 @@ import fcntl
 import os
 import stat
 import tempfile
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.errors import OutputError
+
+ONE_READER = threading.Lock()
+"""To be held while arrays are read in another way than by `read_array`.
+
+NumPy parses the header of an array as Python. Up to Python 3.11.7 two threads that parse at a time disturb one another,
+and one of them has a SystemError (python/cpython#106905).
+"""
 
 _PARTIAL = ".partial-"
 _LOCKED = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
@@ -168,3 +179,13 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def read_array(file: IO[bytes]) -> NDArray[Any]:
+    """Read one array in NumPy's format; never a pickle.
+
+    Raises:
+        Exception: of nearly any kind, where the file is damaged.
+    """
+    with ONE_READER:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.values import ANY_NUMBER, Shape, Within
+from lidarslam.core.state import Shape
 from lidarslam.core.trajectory import Trajectory
 
 # No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
@@ -61,10 +61,10 @@ class Scan:
     # already motion compensated to the stamp
     time_offsets: Annotated[FloatArray, Shape(None)] | None = None
     # (N,) int32, the laser each point came from; None when unknown
-    rings: Annotated[NDArray[np.int32], Shape(None), Within(0, _MOST_RINGS - 1)] | None = None
+    rings: Annotated[NDArray[np.int32], Shape(None)] | None = None
     dropped: int = 0  # how many points of the raw sweep were left out as invalid
     # (N,) as recorded, on whatever scale; None when unknown
-    intensities: Annotated[NDArray[np.float32], Shape(None), ANY_NUMBER] | None = None
+    intensities: Annotated[NDArray[np.float32], Shape(None)] | None = None
     colours: Annotated[NDArray[np.uint8], Shape(None, 3)] | None = None  # (N, 3) red, green, blue; None when unknown
     untimed: int = 0  # how many points had no time of their own and got one between those of their neighbours
 

@@ -12,8 +12,7 @@ from typing import Any
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
-from lidarslam.core.state.stateful import Saved, decode
-from lidarslam.core.state.tree import encode
+from lidarslam.core.state import Saved, decode, encode
 from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.faults import Faults

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state import Shape
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.motion.prediction import GravityDirection

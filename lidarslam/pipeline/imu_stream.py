@@ -11,7 +11,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.mapping.inertial.comparison import (
     FEWEST_COMPARED,

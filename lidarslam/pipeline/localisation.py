@@ -10,7 +10,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
+from lidarslam.core.state import TRANSFORM, Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
-from lidarslam.core.state.stateful import TRANSFORM, Saved, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Saved, Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
@@ -67,16 +67,6 @@ class MapBuilder(Stateful):
         """
         self.global_map = self._new_map(1.0) if saved.has("global_map") else None
         super().restore(saved)
-
-    def _after_restore(self) -> None:
-        pending = -1 if self._pending is None else self._pending.number
-        numbers = [*self.views.numbers, *self.slides.numbers, pending]
-        if max(numbers) >= self._scans:
-            raise ValueError(f"scan {max(numbers)} is kept of {self._scans} scans")
-        sizes = {self.voxel_size_m, self._config.voxel_size_m or self.voxel_size_m}
-        drawn, most = self.global_map, self._config.most_points
-        if drawn is not None and ({*sizes, drawn.voxel_size_m} != {drawn.voxel_size_m} or drawn.most_points != most):
-            raise ValueError(f"a map of other voxels, of {drawn.voxel_size_m:g} m")
 
     @property
     def scans(self) -> int:

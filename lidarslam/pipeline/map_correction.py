@@ -7,7 +7,7 @@ from collections import deque
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-from lidarslam.core.state.stateful import State, Stateful
+from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -37,10 +37,6 @@ class MapCorrection(Stateful):
         self._registered = self._followed = 0
         self._waiting = []
         self._drawing: deque[tuple[int, Future[SurfelMap | None]]] = deque()
-
-    def _after_restore(self) -> None:
-        if self._registered != self._followed or any(drawn.scan > self._followed for drawn in self._waiting):
-            raise ValueError(f"{self._registered} scans were registered, the graph has {self._followed}")
 
     def state(self) -> State:
         """With the maps that wait; the graph must be at rest."""

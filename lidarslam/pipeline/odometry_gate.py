@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import TRANSFORM, Shape, State, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.interface import Motion, SkippingOdometry
 from lidarslam.pipeline.estimates import Localised

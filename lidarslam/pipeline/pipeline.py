@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore

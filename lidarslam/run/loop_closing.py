@@ -11,7 +11,7 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
-from lidarslam.core.state.stateful import Saved
+from lidarslam.core.state import Saved
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.loops.given import GivenLoops

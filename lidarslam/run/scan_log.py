@@ -3,15 +3,12 @@
 import csv
 import io
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
-from lidarslam.core.state.tree import checked
-from lidarslam.core.state.values import Values
+from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import STAGES, ScanResult
@@ -53,10 +50,6 @@ _ROW = np.dtype(
         ("T_odom_lidar", "f8", (4, 4)),
     ]
 )
-_MAY_BE_NAN = ("residual_m", "inlier_ratio", "sigmas", "turn_rate")
-_POSES = ("T_world_lidar", "T_odom_lidar")
-# What is checked of a restored row.
-_VALUES = {name: Values(TRANSFORM if name in _POSES else None) for name in _ROW.names or () if name != "status"}
 
 
 class ScanLog(Stateful):
@@ -197,13 +190,6 @@ class ScanLog(Stateful):
         rows = saved.value("rows")
         if getattr(rows, "dtype", None) != _ROW or not rows.shape == (len(self.messages),) == (len(self._degenerate),):
             raise saved.unfit(f"{len(self.messages)} rows of the log", rows)
-        if (rows["status"] >= len(_STATUSES)).any():
-            raise saved.refuse("unknown status")
-        for name, values in _VALUES.items():
-            known = np.nan_to_num(rows[name], nan=0.0) if name in _MAY_BE_NAN else rows[name]
-            checked(saved.at(name), partial(values.require, known))
-        if (np.diff(rows["stamp"]) <= 0.0).any():
-            raise saved.refuse("stamps do not increase")
         self._rows = bytearray(rows.tobytes())
 
     def _table(self) -> NDArray[np.void]:

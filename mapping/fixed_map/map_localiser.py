@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap, Regions

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state.stateful import State, Stateful
+from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.normals import estimate_normals
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
@@ -118,13 +118,6 @@ class GlobalMap(Stateful):
         self._after_restore()
 
     def _after_restore(self) -> None:
-        if not self.voxel_size_m > 0.0:
-            raise ValueError(f"voxels of {self.voxel_size_m:g} m")
-        self._merged.require_sorted()
-        for part in self._pending:
-            part.require_sums()
-        if self._store is not None:
-            self._store.require_tiling(self.tiling)
         self._pending_size = sum(len(part.keys) for part in self._pending)
         self._lock = threading.Lock()  # a viewer may look while a scan is added
 

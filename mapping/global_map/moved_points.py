@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import Shape, Stateful, Within
+from lidarslam.core.state import Shape, Stateful
 
 Ranges = NDArray[np.float32]
 TWO_PI = 2.0 * math.pi
@@ -90,18 +90,11 @@ class Views(Stateful):
     _offered: int
     _grid: Annotated[FloatArray, Shape(3)] | None  # of the first scan with points
     _numbers: list[int]
-    _images: list[Annotated[NDArray[np.float16], Shape(_ROWS, _COLUMNS), Within(low=0.0)]]
+    _images: list[Annotated[NDArray[np.float16], Shape(_ROWS, _COLUMNS)]]
 
     def __init__(self, every: int = _EVERY) -> None:
         self._every, self._offered, self._grid = every, 0, None
         self._numbers, self._images = [], []
-
-    def _after_restore(self) -> None:
-        is_sorted = self._numbers == sorted({*self._numbers})
-        if self._every < 1 or not is_sorted or len(self._numbers) != len(self._images):
-            raise ValueError(
-                f"{len(self._images)} images of every {self._every}th scan have {len(self._numbers)} numbers"
-            )
 
     def __len__(self) -> int:
         return len(self._images)

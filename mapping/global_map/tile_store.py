@@ -3,13 +3,11 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.state.block_file import BlockFile
-from lidarslam.core.state.stateful import ANY_NUMBER
+from lidarslam.core.state import BlockFile
 from lidarslam.mapping.global_map.voxels import Layout, Voxels, column_cells, row_cells
 
 # Edge of a tile, as near as a whole number of voxels comes.
@@ -62,8 +60,8 @@ class _Part:
     """What a block holds."""
 
     # x, y: the tile
-    x: Annotated[int, ANY_NUMBER]
-    y: Annotated[int, ANY_NUMBER]
+    x: int
+    y: int
     layout: Layout
 
 
@@ -81,27 +79,11 @@ class TileStore(BlockFile):
         super().__init__(directory, file)
         self._parts, self.brightest = [], 0.0
         self._blocks: dict[Tile, list[int]] = {}
-        self._first_keys: list[NDArray[np.int64]] = []  # of the blocks that were restored
 
     def _after_restore(self) -> None:
-        super()._after_restore()
-        if len(self._parts) != len(self):
-            raise ValueError(f"{len(self)} blocks are of {len(self._parts)} tiles")
-        self._blocks, self._first_keys = {}, []
+        self._blocks = {}
         for index, part in enumerate(self._parts):
             self._blocks.setdefault((part.x, part.y), []).append(index)
-
-    def _require(self, index: int, block: bytes) -> None:
-        if len(block) % (8 + 4 * self._parts[index].layout.width):
-            raise ValueError("a block of voxels has another length")
-        voxels = self._block(index)
-        voxels.require_sorted()
-        self._first_keys.append(voxels.keys[:1])
-
-    def require_tiling(self, tiling: Tiling) -> None:
-        """Refuse restored blocks that are not of their tiles, with a ValueError."""
-        if any(tiling.tiles(key) != [(one.x, one.y)] for key, one in zip(self._first_keys, self._parts, strict=False)):
-            raise ValueError("a block of voxels is of another tile")
 
     @property
     def tiles(self) -> set[Tile]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Within
+from lidarslam.core.state import Shape
 from lidarslam.mapping.surfels.hash_kernels import BITS, EMPTY, OFFSET, PREFETCHED, cell_of, key_of
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 
@@ -118,8 +118,8 @@ def _means(sums: Rows, unknown: float) -> NDArray[np.float32]:
 class Voxels:
     """Rows over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
 
-    keys: Annotated[NDArray[np.int64], Shape(None), Within(low=0)]
-    sums: Annotated[NDArray[np.float32], Shape(None, None), ANY_NUMBER]  # the earliest point of none is at infinity
+    keys: Annotated[NDArray[np.int64], Shape(None)]
+    sums: Annotated[NDArray[np.float32], Shape(None, None)]  # the earliest point of none is at infinity
     layout: Layout
 
     def __post_init__(self) -> None:
@@ -128,18 +128,6 @@ class Voxels:
 
     def __len__(self) -> int:
         return len(self.keys)
-
-    def require_sums(self) -> None:
-        """Refuse sums that are not finite, or of no point, with a ValueError."""
-        summed = self.sums[:, : self.layout.summed]
-        if not (np.isfinite(summed).all() and (self.sums[:, COUNT] > 0.0).all()):
-            raise ValueError("the sums of a voxel are not finite, or of no point")
-
-    def require_sorted(self) -> None:
-        """Refuse voxels that are not reduced, with a ValueError."""
-        self.require_sums()
-        if (np.diff(self.keys) <= 0).any():
-            raise ValueError("voxels are not in the order of their keys")
 
     @classmethod
     def join(cls, parts: "Sequence[Voxels]") -> "Voxels":

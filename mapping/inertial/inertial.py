@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, rotation_angle, skew
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.window import LEVER, SCALE, STANDARD_GRAVITY, InertialWindow, Knot, Preintegration
 from lidarslam.mapping.motion.prediction import GravityDirection, MotionState, Prior

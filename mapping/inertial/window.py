@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.inertial.gyroscope import Integral
 
 STANDARD_GRAVITY = 9.81  # m/s^2

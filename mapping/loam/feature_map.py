@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.loam.feature_kernels import EDGE
 from lidarslam.mapping.loam.neighbour_kernels import Voxels, add_moments, match_features
 from lidarslam.mapping.motion.deskew import Sweep
@@ -29,7 +29,7 @@ class VoxelGrid(Stateful):
     """
 
     cell_m: float
-    _keys: Annotated[NDArray[np.int64], Shape(None), ANY_NUMBER]  # (M,) of the voxels, by row
+    _keys: Annotated[NDArray[np.int64], Shape(None)]  # (M,) of the voxels, by row
     _sums: Annotated[FloatArray, Shape(None, 10)]  # (M, 10) see `Voxels`
 
     def __init__(self, cell_m: float) -> None:
@@ -76,8 +76,6 @@ class VoxelGrid(Stateful):
         return Voxels(self.cell_m, *self._hash.slots, self._sums)
 
     def _after_restore(self) -> None:
-        if len(self._keys) != len(self._sums) or len(np.unique(self._keys)) != len(self._keys):
-            raise ValueError("the voxels of a map of features differ in number, or repeat")
         self._hash = VoxelHash()
         self._hash.rebuild(self._keys)
 
@@ -178,13 +176,6 @@ class FeatureMap(LocalMap):
         voxels = self._planes[-1].voxels
         match_features(np.ascontiguousarray(points), unmatched, False, voxels, np.array(sensor), found)
         return found.normals[:, 0], np.where(found.counts > 0, found.thickness_m[:, 0], np.inf)
-
-    def _after_restore(self) -> None:
-        if not len(self._edges) == len(self._planes) == len(LEVELS):
-            raise ValueError(f"{len(self._edges)} and {len(self._planes)} grids instead of {len(LEVELS)}")
-        sizes = [grid.cell_m / level for grid, level in zip(self._grids, 2 * LEVELS, strict=True)]
-        if not (self._radius_m > 0.0 and np.allclose(sizes, self.cell_m, rtol=1e-9, atol=0.0)):
-            raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")
 
 
 def _edges_of(sweep: Sweep) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
 from lidarslam.mapping.loops.closure import RelativePose
@@ -94,15 +94,9 @@ class KeyframeDatabase(Stateful):
         self.track = Track(poses, way_m_all, segments, track.drift_rates)
 
     def rebuild(self, submaps: Iterable[FloatArray]) -> None:
-        """Go on, after the estimates were restored, with the points (N, 3) of all submaps.
-
-        Raises:
-            ValueError: there are more or fewer than estimates.
-        """
+        """Go on, after the estimates were restored, with the points (N, 3) of all submaps."""
         for points in submaps:
             self._keep(points)
-        if len(self) != len(self.track.way_m):
-            raise ValueError(f"{len(self.track.way_m)} keyframes have {len(self)} submaps")
 
     def _keep(self, points: FloatArray) -> None:
         self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import ANY_NUMBER, TRANSFORM, Shape
+from lidarslam.core.state import TRANSFORM, Shape
 
 # Chi-squared with six degrees of freedom: 99 % of consistent measurements are below.
 CHI_SQUARED_99 = 16.8
@@ -27,7 +27,7 @@ class LoopClosure(RelativePose):
     """A loop closure that was verified; the second keyframe is the later one."""
 
     overlap: float  # 0 to 1, inliers among the points that either side sees of the other; the worse side
-    residual_m: Annotated[float, ANY_NUMBER]  # root mean square residual of the inliers
+    residual_m: float  # root mean square residual of the inliers
     inlier_ratio: float  # inliers among the second keyframe's points
     by_appearance: bool  # found by its descriptor, not near the estimate
     consistent: int  # number of other closures that agree

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
@@ -55,11 +55,8 @@ class LoopDetector(Stateful):
         self._accepted, self._pending = [], []
 
     def rebuild(self, submaps: Iterable[FloatArray]) -> None:
-        """See `KeyframeDatabase.rebuild`; a ValueError refuses closures of other keyframes."""
+        """See `KeyframeDatabase.rebuild`."""
         self._database.rebuild(submaps)
-        for closure in (*self._accepted, *self._pending):
-            if not 0 <= closure.first < closure.second < len(self._database):
-                raise ValueError(f"a closure of the keyframes {closure.first} and {closure.second}")
 
     def cell_m(self, index: int) -> float:
         """The size of detail that suits a keyframe's submap."""

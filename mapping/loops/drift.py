@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
-from lidarslam.core.state.stateful import Shape, Transforms
+from lidarslam.core.state import Shape
 from lidarslam.mapping.loops.closure import RelativePose
 
 # However short the way, poses next to each other are no better than this; radians and metres.
@@ -24,7 +24,7 @@ _LEAST_TRANSLATION_M = 0.02
 class Track:
     """The present estimates of all keyframes."""
 
-    T_world_lidar: Annotated[FloatArray, Transforms(None)]  # (K, 4, 4)
+    T_world_lidar: Annotated[FloatArray, Shape(None, 4, 4)]  # (K, 4, 4)
     way_m: Annotated[FloatArray, Shape(None)]  # (K,) path length from the recording's start
     # (K,) stretch of continuous tracking; the drift model holds within one
     segment: Annotated[NDArray[np.int64], Shape(None)]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.core.state.block_file import BlockFile
+from lidarslam.core.state import BlockFile
 from lidarslam.mapping.loops.sparse_submap import PIXELS, SparseSubmap
 
 # Submaps that stay in memory, those used last: about 15 MB.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, log
-from lidarslam.core.state.stateful import Shape, Within
+from lidarslam.core.state import Shape
 
 # Below this squared angle the series are exact to double precision.
 _SERIES_ANGLE2 = 0.25
@@ -26,7 +26,7 @@ class Sweep:
     # (N,) seconds from the stamp; None when the points are motion compensated already
     times: Annotated[FloatArray, Shape(None)] | None = None
     # (N,) of features; None where points are of one kind
-    kinds: Annotated[NDArray[np.int8], Shape(None), Within(1, 2)] | None = None
+    kinds: Annotated[NDArray[np.int8], Shape(None)] | None = None
 
     def __post_init__(self) -> None:
         for what, values in (("times", self.times), ("kinds", self.kinds)):

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
-from lidarslam.core.state.stateful import TRANSFORM, Shape
+from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.mapping.config import MappingConfig
 
 # Least standard deviations of any pose, rotation first.

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state import Shape
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import MotionState
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state import Shape
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframes import Keyframe
 

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
-from lidarslam.core.state.stateful import TRANSFORM, Shape
+from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state.stateful import TRANSFORM, Stateful
+from lidarslam.core.state import TRANSFORM, Stateful
 from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
 from lidarslam.mapping.loops.closure import RelativePose
@@ -20,7 +20,6 @@ from lidarslam.mapping.pose_graph.attitude import Attitude, measured_attitude
 from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, trajectory_edges
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
-from lidarslam.mapping.pose_graph.restored import require_edges, require_scans
 from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
@@ -54,12 +53,6 @@ class KeyframeGraph(Stateful):
         self.attitudes, self.redraws = [], []
         self._submap = None
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
-
-    def _after_restore(self) -> None:
-        if len(self.keyframes) - len(self.store) not in (0, 1):
-            raise ValueError(f"{len(self.keyframes)} keyframes have {len(self.store)} submaps")
-        require_scans(self.keyframes, len(self.scan_poses))
-        require_edges(self.edges, self.attitudes, len(self.keyframes))
 
     def draw(
         self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, known: PointAttributes | None = None

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
-from lidarslam.core.state.stateful import ANY_NUMBER, TRANSFORM, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.surfels.voxel_hash import key_steps, point_keys
 
@@ -36,7 +36,7 @@ class KeyframeSelector(Stateful):
     """Remembers the last keyframe, and decides when the next is due."""
 
     _T_world_keyframe: Annotated[FloatArray, TRANSFORM] | None
-    _cells: Annotated[NDArray[np.int64], Shape(None), ANY_NUMBER]
+    _cells: Annotated[NDArray[np.int64], Shape(None)]
     _cell_m: float
     _distance_m: float
 
@@ -45,10 +45,6 @@ class KeyframeSelector(Stateful):
         self._T_world_keyframe = None
         self._cells = np.empty(0, dtype=np.int64)
         self._cell_m, self._distance_m = 1.0, _LEAST_M
-
-    def _after_restore(self) -> None:
-        if not (self._cell_m > 0.0 and self._distance_m > 0.0):
-            raise ValueError(f"cells of {self._cell_m:g} m, keyframes every {self._distance_m:g} m")
 
     def is_due(self, T_world_lidar: FloatArray, points: FloatArray) -> bool:
         """Whether a scan with a pose (4, 4) and points (N, 3) in its LiDAR frame becomes one; the first does."""

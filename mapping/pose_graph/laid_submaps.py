@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
-from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful, Transforms
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import POSITION, VIEW, Rows
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
@@ -46,7 +46,7 @@ class Drawn:
     since: int  # the first scan that is registered to it
     keys: Annotated[NDArray[np.intp], Shape(None)]  # (H,) the keyframes, ascending
     keyframes: int  # number of them then; later ones were inserted scan by scan
-    T_odom_keyframe: Annotated[FloatArray, Transforms(None)]  # (H, 4, 4)
+    T_odom_keyframe: Annotated[FloatArray, Shape(None, 4, 4)]  # (H, 4, 4)
 
 
 class LaidSubmaps(Stateful):
@@ -63,12 +63,6 @@ class LaidSubmaps(Stateful):
     def __init__(self, radius_m: float) -> None:
         self._radius_m = radius_m
         self._poses, self._held, self._drawn = [], [], []
-
-    def _after_restore(self) -> None:
-        if not all(key < len(self._poses) for key in self._held) or self._held != sorted({*self._held}):
-            raise ValueError(f"{len(self._held)} of {len(self._poses)} submaps are held, {self._held[:3]} among them")
-        if any(len(drawn.keys) != len(drawn.T_odom_keyframe) for drawn in self._drawn):
-            raise ValueError("submaps of a drawn map are without a pose")
 
     def __len__(self) -> int:
         return len(self._poses)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.pose_graph.edges import squared_error
 

@@ -21,7 +21,7 @@ from typing import Annotated, TypeVar
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import TRANSFORM
+from lidarslam.core.state import TRANSFORM
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
@@ -40,7 +40,6 @@ from lidarslam.mapping.pose_graph.laid_submaps import LaidSubmaps, connected_wit
 from lidarslam.mapping.pose_graph.neighbourhoods import REACH, Neighbourhoods
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise, relax
 from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
-from lidarslam.mapping.pose_graph.restored import require_edges, require_poses, require_rows
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 logger = logging.getLogger(__name__)
@@ -84,10 +83,6 @@ class SlamGraph(KeyframeGraph):
         self._laid, self._is_map_due = LaidSubmaps(local_radius_m), False
 
     def _after_restore(self) -> None:
-        super()._after_restore()
-        require_poses(len(self.keyframes), len(self._poses), len(self._laid))
-        require_edges((*self._closures, *self._relaxing.waiting), (), len(self._poses))
-        require_rows(self._unrefined, len(self._closures))
         self._detector.rebuild(means_points(self.store[key]) for key in range(len(self.store)))
 
     def add_recording(self, tracked: KeyframeGraph) -> None:

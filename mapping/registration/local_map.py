@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.registration.surfaces import Correspondences, Matcher

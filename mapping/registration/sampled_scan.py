@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan, squared_ranges
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import central_per_cell
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state import Shape
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # Pixels of one degree.

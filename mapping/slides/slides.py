@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.slides.scan_surfels import BIN_M, Surfels, shift_profile
 
 # A scan is kept after so many metres or scans, whichever comes first, and paired with the last two.
@@ -117,13 +117,6 @@ class SlideCheck(Stateful):
         self._due = 0
         self._T_due = None
         self._rows = []
-
-    def _after_restore(self) -> None:
-        numbers = self.tests.numbers
-        if not ((numbers == np.rint(numbers)).all() and (numbers[:, 0] >= 0.0).all()):
-            raise ValueError("the numbers of tested scans are none")
-        if not (numbers[:, 0] < numbers[:, 1]).all():
-            raise ValueError("tested scans are not in order")
 
     @property
     def numbers(self) -> tuple[int, ...]:

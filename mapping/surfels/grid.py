@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import ANY_NUMBER, Shape, State, Stateful
+from lidarslam.core.state import Shape, State, Stateful
 from lidarslam.mapping.surfels import cell_kernels as kernels
-from lidarslam.mapping.surfels.hash_kernels import FIRST_SIDE, OFFSET, OTHER_SIDE
+from lidarslam.mapping.surfels.hash_kernels import FIRST_SIDE, OTHER_SIDE
 from lidarslam.mapping.surfels.side_kernels import belong_to_others, turn_to_sensor
 from lidarslam.mapping.surfels.surfel_kernels import refresh
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC
@@ -46,7 +46,7 @@ class SurfelGrid(Stateful):
     """Cells of one size, in the world."""
 
     cell_m: float
-    _keys: Annotated[NDArray[np.int64], Shape(None), ANY_NUMBER]
+    _keys: Annotated[NDArray[np.int64], Shape(None)]
     _sums: Annotated[NDArray[np.float32], Shape(None, _SUMS)]
     _surfels: Annotated[FloatArray, Shape(None, _SURFELS)]
     _surfel_counts: Annotated[NDArray[np.float32], Shape(None)]
@@ -70,12 +70,6 @@ class SurfelGrid(Stateful):
         return super().state()
 
     def _after_restore(self) -> None:
-        if not len(self._keys) == len(self._sums) == len(self._surfels) == len(self._surfel_counts):
-            raise ValueError("the arrays of a surfel grid differ in length")
-        # Of the last cell along an axis none is made: its key would be that of no cell.
-        is_cell = (key_cells(self._keys) < OFFSET - 1).all() and len(np.unique(self._keys)) == len(self._keys)
-        if not (is_cell and self.cell_m > 0.0 and (self._sums[:, _COUNT] > 0.0).all()):
-            raise ValueError("the cells of a surfel grid are no cells, or empty")
         self._hash = VoxelHash()
         self._resize(len(self._keys))
         self._index(len(self._keys))

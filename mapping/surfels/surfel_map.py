@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state import Shape
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -59,13 +59,6 @@ class SurfelMap(LocalMap):
         for side in (faces_up, ~faces_up):
             surfel_map.insert_seen(points[side], elevations[side], normals[side])
         return surfel_map
-
-    def _after_restore(self) -> None:
-        if len(self._grids) != len(LEVELS):
-            raise ValueError(f"{len(self._grids)} grids instead of {len(LEVELS)}")
-        sizes = [grid.cell_m / level for grid, level in zip(self._grids, LEVELS, strict=True)]
-        if not (self._radius_m > 0.0 and np.allclose(sizes, self.cell_m, rtol=1e-9, atol=0.0)):
-            raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")
 
     def __len__(self) -> int:
         """See `LocalMap`."""

@@ -1,8 +1,6 @@
 """Archived maps: maps that tracking was lost in, searched now and then for the sensor's return."""
 
-from typing import Annotated
-
-from lidarslam.core.state.stateful import ANY_NUMBER, Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.tracking.attempt import Attempt
@@ -20,7 +18,7 @@ class ArchivedMaps(Stateful):
     """Keeps the first and the last of the maps that were given up."""
 
     _maps: list[LocalMap]
-    _scans_until_search: Annotated[int, ANY_NUMBER]
+    _scans_until_search: int
     _wait: float
 
     def __init__(self) -> None:

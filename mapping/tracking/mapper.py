@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
@@ -83,11 +83,6 @@ class Mapper(Stateful):
         self._map = None
         self._last = None
         self._first = None  # while it alone is the map, drawn with a guessed motion
-
-    def _after_restore(self) -> None:
-        numbers = [one.number for one in self._recent]
-        if self._map_since > self._scans or numbers != sorted(numbers) or max(numbers, default=0) > self._scans:
-            raise ValueError(f"scans {numbers}, and a map since scan {self._map_since}, of {self._scans} scans")
 
     @property
     def local_map(self) -> LocalMap | None:

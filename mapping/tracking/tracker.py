@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarslam.core.geometry import displacement_m, inverse
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import (

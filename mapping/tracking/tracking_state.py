@@ -1,8 +1,6 @@
 """Tracking state: how certain the sensor's pose is, and therefore how widely the next scan is searched."""
 
-from typing import Annotated
-
-from lidarslam.core.state.stateful import ANY_NUMBER, Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 
 # After such a gap between scans the pose is uncertain.
@@ -26,7 +24,7 @@ class TrackingState(Stateful):
     velocity_known: bool  # whether the velocity of the last scan was estimated
     tracked_s: float | None  # stamp of the last scan whose pose followed from the one before
     _was_degraded: bool
-    _to_confirm: Annotated[int, ANY_NUMBER]
+    _to_confirm: int
     _relocalised_s: float | None
     _usual_quality: float
 

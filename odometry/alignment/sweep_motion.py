@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.odometry.images.sweep_images import SweepImages
 
 Twist = Annotated[FloatArray, Shape(6)]

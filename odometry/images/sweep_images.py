@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidarslam.core.directions.spin_axis import image_axes
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals
 from lidarslam.odometry.images.projection import Floats, ImageGrid, Points, Projection, project
@@ -107,21 +107,6 @@ class Imager(Stateful):
         self._grid_points = 0
         self._R_image_lidar = np.eye(3)
         self._alignment_rows = config.rows
-
-    def _after_restore(self) -> None:
-        size = (self._config.rows, self._config.columns)
-        if self._grid is not None and (self._grid.rows, self._grid.columns) != size:
-            raise ValueError(f"the images are not {size[0]} x {size[1]}")
-        if not self._config.rows <= self._alignment_rows <= max(_MOST_ROWS, self._config.rows):
-            raise ValueError(f"{self._alignment_rows} rows are no image")
-        if not np.allclose(self._R_image_lidar @ self._R_image_lidar.T, np.eye(3)):
-            raise ValueError("the images' axes are no rotation")
-
-    def require(self, images: ScanImages) -> None:
-        """Refuse images that are not of this size, with a ValueError."""
-        for shown, rows in ((images.network, self._config.rows), (images.alignment, self._alignment_rows)):
-            if shown.offsets.shape != (rows, self._config.columns):
-                raise ValueError(f"an image is {shown.offsets.shape}, not {rows} x {self._config.columns}")
 
     def images(self, scan: Scan) -> ScanImages:
         """The scan as images, normals included."""

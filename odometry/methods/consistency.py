@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 
@@ -51,10 +51,6 @@ class ConsistencyCheck(Stateful):
     def __init__(self) -> None:
         self._reference = None
         self._T_reference_prev = np.eye(4)
-
-    def _after_restore(self) -> None:
-        if self._reference is not None and len(self._reference) < _MIN_PLANES:
-            raise ValueError(f"{len(self._reference)} points are no scan to compare with")
 
     @staticmethod
     def sample(scan: Scan) -> Scan:

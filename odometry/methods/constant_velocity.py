@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state import Stateful
 from lidarslam.odometry.interface import Motion
 
 

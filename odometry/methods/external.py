@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import TRANSFORM, Stateful
+from lidarslam.core.state import TRANSFORM, Stateful
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.interface import Motion
 

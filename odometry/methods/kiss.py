@@ -18,7 +18,7 @@ import numpy as np
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.odometry.config import KissConfig
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.kiss_worker import receive, send

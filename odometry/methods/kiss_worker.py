@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.state.npy import read_array
+from lidarslam.core.files import read_array
 
 _LENGTH = struct.Struct("<q")
 

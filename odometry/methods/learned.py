@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
 from lidarslam.odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
 from lidarslam.odometry.alignment.search import align_best
@@ -79,7 +79,6 @@ class LearnedOdometry(Stateful):
 
     def _after_restore(self) -> None:
         if self._last is not None:
-            self._imager.require(self._last.images)
             shown = self._last.images.network
             self._described = self._search.describe(shown.points, shown.normals, self._last.heading)
 

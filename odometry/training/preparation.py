@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, exp, log
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.values import TRANSFORM, Values
+from lidarslam.core.state import TRANSFORM
 from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate
 from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
@@ -59,7 +59,6 @@ class PreparedRecording:
                 raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {shape}, finite")
         if not 2 <= count <= scans or float(self.interval_s.min()) <= 0.0:
             raise ValueError(f"{count} images of {scans} scans, in intervals from {float(self.interval_s.min())} s")
-        Values(TRANSFORM).require(self.T_prev_curr.double().numpy())
 
 
 def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:

@@ -8,7 +8,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from lidarslam.core.state.npy import read_array
+from lidarslam.core.files import read_array
 
 READERS, TIMES = 4, 12_000
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Saved, Shape, Stateful
+from lidarslam.core.state import Saved, Shape, Stateful
 from lidarslam.storage.state_file import read_state, write_state
 
 

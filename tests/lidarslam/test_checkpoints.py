@@ -14,7 +14,7 @@ import pytest
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.methods.consistency import ConsistencyCheck

@@ -11,7 +11,7 @@ import pytest
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved
+from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName

@@ -11,7 +11,7 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior

@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
-from lidarslam.core.state.stateful import Saved
+from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import ScanResult, SweepMotion
 from lidarslam.run.scan_log import ScanLog

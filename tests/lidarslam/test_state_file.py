@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.state.stateful import State
+from lidarslam.core.state import State
 from lidarslam.storage.state_file import read_state, write_state
 
 STATE: State = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated_faults import Faulty, carried_off, covered, index_back
 
-from lidarslam.core.state.stateful import Saved
+from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior

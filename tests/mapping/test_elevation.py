@@ -9,7 +9,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.mounting.rotation import correct_elevation
 from lidarslam.mapping.config import MappingConfig

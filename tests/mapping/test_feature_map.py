@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State, decode
 from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE
 from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
 from lidarslam.mapping.motion.deskew import Sweep
@@ -99,7 +99,6 @@ def test_a_restored_map_goes_on(rng: np.random.Generator, through_disk: ThroughD
 
 
 def test_a_local_map_is_restored_as_what_it_is(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
-    from lidarslam.core.state.stateful import decode
 
     whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
     saved = through_disk({"map": whole.state()})

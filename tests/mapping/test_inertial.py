@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity

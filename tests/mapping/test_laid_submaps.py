@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout, Rows
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER, LaidSubmaps, draw_local_map

@@ -8,7 +8,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig

@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.global_map import GlobalMap
 

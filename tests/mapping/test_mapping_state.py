@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import KeyframeConfig, MappingConfig
 from lidarslam.mapping.global_map import global_map

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.loops.given import NEAR_SCANS, GivenLoops

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.mapping.slides.scan_surfels import Surfels, shift_profile
 from lidarslam.mapping.slides.slides import Contradiction, SlideCheck, find_contradictions
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
-from lidarslam.core.state.stateful import Saved
+from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS
 from lidarslam.mapping.registration.surfaces import Correspondences

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.core.state.stateful import Saved
+from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.surfaces import Correspondences
 from lidarslam.mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map import drawing, tile_store
 from lidarslam.mapping.global_map import global_map as module

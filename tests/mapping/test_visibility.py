@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views, seen_through
 
 ThroughDisk = Callable[[State], Saved]

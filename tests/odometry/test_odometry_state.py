@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.interface import Motion, Odometry

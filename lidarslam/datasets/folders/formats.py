@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.state.npy import read_array
+from lidarslam.core.files import read_array
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, read_bin, read_bytes
 
 TableReader = Callable[[Path], NDArray[np.void]]
