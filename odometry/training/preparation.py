@@ -14,7 +14,6 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, exp, log
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import TRANSFORM
 from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate
 from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair

@@ -1,4 +1,4 @@
-"""Saved state by type hints: what was saved comes back equal, and a forged tree is refused."""
+"""Saved state by type hints: what was saved comes back equal, and a tree of other types or shapes is refused."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -24,10 +24,6 @@ class Pose:
     T_world_lidar: Annotated[FloatArray, Shape(4, 4)]
     number: int
     weight: float | None
-
-    def __post_init__(self) -> None:
-        if self.number < 0:
-            raise ValueError("the number is negative")
 
 
 class Grid(Stateful):
@@ -86,18 +82,10 @@ def test_what_was_saved_comes_back(full, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("forge", "message"),
+    ("change", "message"),
     [
         (lambda tree: tree.pop("names"), "names is missing"),
-        (lambda tree: tree["poses"]["number"].__setitem__(0, -1), "numbers from -1 to 2"),
-        (lambda tree: tree["poses"]["T_world_lidar"].__setitem__((0, 0, 0), np.nan), "numbers from nan"),
-        (lambda tree: tree["grid"].update(cell_m=float("inf")), "expected from -1e[+]100 to 1e[+]100, finite"),
-        (lambda tree: tree["grid"].update(cell_m=-2e100), "numbers from -2e[+]100"),
-        (lambda tree: tree["grid"].update(cell_m=10**400), "an integer has more than 64 bits"),
-        (lambda tree: tree.update(pair=[2**53 + 2, 0.1]), "expected from 0.0 to 9007199254740992.0"),
-        (lambda tree: tree.update(pair=[10**30, 0.1]), "an integer has more than 64 bits"),
         (lambda tree: tree["poses"].update(number=np.arange(3)), "differ in length"),
-        (lambda tree: tree["covariances"]["known"].fill(True), "refused"),
         (lambda tree: tree["covariances"].update(values=np.zeros((1, 3, 3))), "expected an array of shape"),
         (lambda tree: tree["grid"].update(keys=np.zeros(3)), "expected an array of int64, got float64"),
         (lambda tree: tree["grid"].update(keys=[1, 2]), "got list"),
@@ -107,13 +95,12 @@ def test_what_was_saved_comes_back(full, tmp_path):
         (lambda tree: tree.update(names=[1]), "expected str"),
         (lambda tree: tree.update(names="a"), "expected a list"),
         (lambda tree: tree.update(grid=[]), "expected a tree"),
-        (lambda tree: tree.update(times={"keys": ["a"], "values": np.zeros(2)}), "zip"),
     ],
 )
-def test_a_forged_state_is_refused(forge, message):
+def test_other_types_and_shapes_are_refused(change, message):
     tree: Any = Everything(True).state()
-    forge(tree)
-    with pytest.raises(InputError, match=message if message != "refused" else "not what this program saves"):
+    change(tree)
+    with pytest.raises(InputError, match=message):
         Everything(False).restore(Saved(tree))
 
 
