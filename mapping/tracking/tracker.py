@@ -35,6 +35,9 @@ from lidarslam.mapping.tracking.tracking_state import TrackingState
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
 # error is forgotten by a factor a scan.
 _FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
+# A scan constrains its weakest direction poorly below this support or evidence: a fifth of the scans on stairs, in
+# offices, streets and crowds none. There an odometry counts with at most so many times its own standard deviations.
+_WEAK_SUPPORT, _WEAK_EVIDENCE, _WEAK_CAUTION = 0.65, 40.0, 2.0
 # Factors by which the quality of a result with any acceleration, and with any displacement, must be better.
 _BETTER, _CLEARLY_BETTER = 1.05, 1.1
 
@@ -191,6 +194,7 @@ class Tracker(Stateful):
 
     def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""
+        near = self._or_held_by_odometry(matcher, prior, near)
         best, has_odometry = self._or_turning(matcher, prior, prediction, near), prior.T_prev_curr is not None
         is_poor = has_odometry and best.status is not Status.OK
         if (prediction.contradicted or is_poor) and self._state.velocity_known and not self._budget.is_spent:
@@ -205,6 +209,21 @@ class Tracker(Stateful):
             best = best if displaced is None else self._or_displaced(best, displaced[0])
         best = best if self._budget.is_spent else matcher.or_from_odometry(best, prior)
         return best if self._budget.is_spent else matcher.or_along_weakest(best)
+
+    def _or_held_by_odometry(self, matcher: ScanMatcher, prior: Prior, near: Attempt) -> Attempt:
+        """A registration, or where the scan constrains a direction poorly, one held closer to the odometry's motion.
+
+        Errors of an odometry are correlated in time, but so are those of the few surfaces that constrain the scan.
+        """
+        if prior.covariance is None or prior.inertial is not None or near.registration is None:
+            return near
+        weak = (near.fit.support or 0.0) < _WEAK_SUPPORT or (near.fit.evidence or np.inf) < _WEAK_EVIDENCE
+        caution = min(1.0, _WEAK_CAUTION / self._config.prior_caution)
+        if not weak or self._budget.is_spent:
+            return near
+        closer = replace(prior, covariance=caution**2 * prior.covariance)
+        held = matcher.register(self.predict(matcher.scan, closer, matcher.last), coarse_first=False)
+        return replace(held, prediction=near.prediction) if _BETTER * held.quality > near.quality else near
 
     def _or_turning(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """A registration, or where it fits poorly and that is better, one with any acceleration.
