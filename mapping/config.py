@@ -67,12 +67,6 @@ class MappingConfig(BaseModel):
         le=100.0,
         description="standard deviation of an odometry's translation along each axis, where it gives none",
     )
-    prior_caution: float = Field(
-        10.0,
-        ge=1.0,
-        le=1000.0,
-        description="factor on the standard deviations of an odometry: its errors are correlated in time",
-    )
     budget_ms: BudgetMs = Field(
         None,
         description="time of a scan after which no further attempt begins, and searches go on with the"

@@ -130,7 +130,7 @@ def _likeliest(scans: list[Scan], config: MappingConfig, inertial: "Inertial") -
         tracking.process(scans[0], Prior())
         moved = exp(np.concatenate([np.zeros(3), velocity * interval_s]))
         covariance = np.diag([np.pi**2] * 3 + [(0.5 * _SPACING_M_S * interval_s) ** 2] * 3)
-        tracking.process(scans[1], Prior(moved, None, covariance / config.prior_caution**2))
+        tracking.process(scans[1], Prior(moved, covariance=covariance, caution=1.0))
         for scan in scans[2:]:
             tracking.process(scan, Prior())
         fits = [one.fit for one in tracking.results if one.fit is not None]

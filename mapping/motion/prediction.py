@@ -57,15 +57,16 @@ class Prior:
     # deviations
     covariance: FloatArray | None = None
     inertial: "MotionState | None" = None  # the state that an IMU predicts
+    caution: float = 10.0  # factor on the odometry's own standard deviations: its errors are correlated in time
 
     def without_odometry(self) -> "Prior":
         """What an IMU measured."""
         return Prior(inertial=self.inertial)
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
-        """(6, 6) of the motion: the odometry's own, inflated for errors correlated in time, or the configured one."""
+        """(6, 6) of the motion: the odometry's own, with its caution, or the configured one."""
         if self.covariance is not None:
-            return np.asarray(config.prior_caution**2 * self.covariance, dtype=np.float64)
+            return np.asarray(self.caution**2 * self.covariance, dtype=np.float64)
         sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
         return np.asarray(np.diag(sigmas**2), dtype=np.float64)
 

@@ -218,10 +218,9 @@ class Tracker(Stateful):
         if prior.covariance is None or prior.inertial is not None or near.registration is None:
             return near
         weak = (near.fit.support or 0.0) < _WEAK_SUPPORT or (near.fit.evidence or np.inf) < _WEAK_EVIDENCE
-        caution = min(1.0, _WEAK_CAUTION / self._config.prior_caution)
         if not weak or self._budget.is_spent:
             return near
-        closer = replace(prior, covariance=caution**2 * prior.covariance)
+        closer = replace(prior, caution=_WEAK_CAUTION)
         held = matcher.register(self.predict(matcher.scan, closer, matcher.last), coarse_first=False)
         return replace(held, prediction=near.prediction) if _BETTER * held.quality > near.quality else near
 

@@ -225,7 +225,6 @@ FORGED: dict[str, Callable[[dict[str, torch.Tensor]], object]] = {
     "long": lambda tensors: tensors.update({name: torch.cat([one, one]) for name, one in tensors.items()}),
     "nan": lambda tensors: tensors["points"].view(-1)[0].fill_(torch.nan),
     "interval": lambda tensors: tensors["interval_s"][0].fill_(0.0),
-    "not rigid": lambda tensors: tensors["T_prev_curr"][0].mul_(2.0),
 }
 
 

@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
 from lidarslam.core.state import Saved, State, decode
 from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE
@@ -103,24 +102,6 @@ def test_a_local_map_is_restored_as_what_it_is(rng: np.random.Generator, through
     whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
     saved = through_disk({"map": whole.state()})
     assert isinstance(decode(LocalMap | None, saved.value("map"), saved), FeatureMap)
-
-
-@pytest.mark.parametrize(
-    ("forge", "message"),
-    [
-        (lambda state: state.update(_edges=state["_edges"][:2]), "2 and 3 grids instead of 3"),
-        (lambda state: state["_planes"][0].update(_sums=state["_planes"][0]["_sums"][1:]), "differ in number"),
-        (lambda state: state["_planes"][1].update(cell_m=0.5), "grids of cells of"),
-        (lambda state: state["_edges"][0].update(_sums=np.zeros((4, 2))), "_sums.*expected an array of shape"),
-    ],
-)
-def test_a_forged_map_is_refused(
-    rng: np.random.Generator, through_disk: ThroughDisk, forge: Callable[[State], object], message: str
-) -> None:
-    state = map_of(rng.uniform(-4.0, 4.0, (300, 3)), rng.uniform(-4.0, 4.0, (300, 3))).state()
-    forge(state)
-    with pytest.raises(InputError, match=message):
-        FeatureMap(1.0, 1.0).restore(through_disk(state))
 
 
 def on_plane(rng: np.random.Generator, count: int, noise_m: float = 0.0) -> FloatArray:

@@ -131,16 +131,6 @@ def test_a_state_of_another_shape_is_refused(through_disk: ThroughDisk) -> None:
         Mapper(CONFIG).restore(through_disk(state))
 
 
-def test_a_state_whose_arrays_differ_in_length_is_refused(scans: list[Scan], through_disk: ThroughDisk) -> None:
-    mapper = Mapper(CONFIG)
-    mapper.process(scans[0], Prior())
-    state = mapper.state()
-    grid = state["_map"]["_grids"][0]
-    grid["_keys"] = grid["_keys"][:-1]
-    with pytest.raises(InputError, match="differ in length"):
-        Mapper(CONFIG).restore(through_disk(state))
-
-
 def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through_disk: ThroughDisk) -> None:
     """Values unlike those at the beginning come back, and no attribute but the settings goes unsaved."""
     mapper, restored = Mapper(CONFIG), Mapper(CONFIG)

@@ -1,5 +1,7 @@
 """Where a scan is expected, from what its odometry says and how far that is to be trusted."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,9 +22,7 @@ VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s
 MOVED = exp(0.1 * VELOCITY)
 # What the odometry says differs from going on by 3 degrees and 20 cm.
 OFF = np.array([0.03, -0.03, 0.03, 0.1, -0.1, 0.15])
-AS_TOLD = MappingConfig(prior_caution=1.0)
-
-
+CONFIG = MappingConfig()
 # Of the pose of the last scan and of its velocity.
 POSE_SIGMA, VELOCITY_SIGMA = np.array([1e-7] * 3 + [1e-6] * 3), np.array([0.5] * 3 + [1.0] * 3)
 
@@ -30,7 +30,7 @@ POSE_SIGMA, VELOCITY_SIGMA = np.array([1e-7] * 3 + [1e-6] * 3), np.array([0.5] *
 def predicted(prior: Prior, config: MappingConfig | None = None, pose: FloatArray | None = None) -> Prediction:
     known = np.diag(np.concatenate([POSE_SIGMA, VELOCITY_SIGMA]) ** 2)
     state = MotionState(5.0, np.eye(4) if pose is None else pose, VELOCITY, known, seen_until_s=0.1)
-    return predict(state, 5.1, prior, ProcessNoise(), config or AS_TOLD)
+    return predict(state, 5.1, prior, ProcessNoise(), config or CONFIG)
 
 
 def motion_covariance(prediction: Prediction) -> FloatArray:
@@ -43,24 +43,29 @@ def step(prediction: Prediction) -> FloatArray:
     return log(inverse(MOVED) @ prediction.T_world_lidar)
 
 
+def measured(*args: Any, **kwargs: Any) -> Prior:
+    """Of an odometry whose covariance is taken as it is."""
+    return Prior(*args, **kwargs, caution=1.0)
+
+
 def isotropic(sigma: float) -> FloatArray:
     return sigma**2 * np.eye(6)
 
 
 def test_without_an_odometry_the_sensor_goes_on() -> None:
-    prediction = predicted(Prior())
+    prediction = predicted(measured())
     np.testing.assert_allclose(prediction.T_world_lidar, MOVED, atol=1e-12)
     np.testing.assert_allclose(prediction.velocity, VELOCITY)
 
 
 def test_an_odometry_that_is_sure_is_believed() -> None:
-    prediction = predicted(Prior(MOVED @ exp(OFF), covariance=isotropic(1e-5)))
+    prediction = predicted(measured(MOVED @ exp(OFF), covariance=isotropic(1e-5)))
     np.testing.assert_allclose(step(prediction), OFF, atol=1e-4)
     assert np.sqrt(np.diag(motion_covariance(prediction))).max() < 1.1e-5
 
 
 def test_an_odometry_that_is_unsure_is_not() -> None:
-    alone, with_prior = (predicted(p) for p in (Prior(), Prior(MOVED @ exp(OFF), covariance=isotropic(1e3))))
+    alone, with_prior = (predicted(p) for p in (measured(), measured(MOVED @ exp(OFF), covariance=isotropic(1e3))))
     np.testing.assert_allclose(step(with_prior), 0.0, atol=1e-6)
     np.testing.assert_allclose(with_prior.covariance, alone.covariance, rtol=1e-4, atol=1e-9)
 
@@ -70,7 +75,7 @@ def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
     covariance = isotropic(1e-4)
     covariance[3, 3] = 1e6
     for pose in (np.eye(4), exp([0.4, -0.3, 1.5, 10.0, -5.0, 2.0])):
-        prediction = predicted(Prior(MOVED @ exp(OFF), covariance=covariance), pose=pose)
+        prediction = predicted(measured(MOVED @ exp(OFF), covariance=covariance), pose=pose)
         moved = log(inverse(pose @ MOVED) @ prediction.T_world_lidar)
         np.testing.assert_allclose(np.delete(moved, 3), np.delete(OFF, 3), atol=2e-3)
         sigmas = np.sqrt(np.diag(motion_covariance(prediction)))
@@ -80,8 +85,8 @@ def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
 
 def test_an_odometry_is_believed_less_than_it_says_by_the_caution() -> None:
     motion = MOVED @ exp(OFF)
-    cautious = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.01)), MappingConfig(prior_caution=5.0))
-    told = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.05)))
+    cautious = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.01), caution=5.0))
+    told = predicted(measured(motion, VELOCITY + 1.0, isotropic(0.05)))
     for name, value in vars(cautious).items():
         np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
 
@@ -90,24 +95,24 @@ def test_an_odometry_that_does_not_say_is_believed_as_configured() -> None:
     config = MappingConfig(prior_rotation_deg=2.0, prior_translation_m=0.3)
     sigmas = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)
     motion = MOVED @ exp(OFF)
-    silent = predicted(Prior(motion, VELOCITY + 1.0), config)
-    told = predicted(Prior(motion, VELOCITY + 1.0, np.diag(sigmas**2)))
+    silent = predicted(measured(motion, VELOCITY + 1.0), config)
+    told = predicted(measured(motion, VELOCITY + 1.0, np.diag(sigmas**2)))
     for name, value in vars(silent).items():
         np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
-    other = predicted(Prior(motion, VELOCITY + 1.0), MappingConfig(prior_translation_m=0.01))
+    other = predicted(measured(motion, VELOCITY + 1.0), MappingConfig(prior_translation_m=0.01))
     assert not np.allclose(silent.T_world_lidar, other.T_world_lidar, atol=1e-4)
 
 
 @pytest.mark.parametrize(("sigma", "followed"), [(1e-6, 1.0), (1e4, 0.0)])
 def test_velocities_are_believed_as_far_as_their_covariance_says(sigma: float, followed: float) -> None:
     faster = VELOCITY + 1.0
-    prediction = predicted(Prior(velocity=faster, covariance=isotropic(sigma)))
+    prediction = predicted(measured(velocity=faster, covariance=isotropic(sigma)))
     np.testing.assert_allclose(prediction.velocity, VELOCITY + followed, atol=1e-3)
 
 
 def test_a_velocity_counts_with_twice_the_deviation_of_the_motion_it_is_derived_from() -> None:
-    sigma, before = 1e-4, np.linalg.inv(predicted(Prior()).covariance)
-    prediction = predicted(Prior(velocity=VELOCITY, covariance=isotropic(sigma)))
+    sigma, before = 1e-4, np.linalg.inv(predicted(measured()).covariance)
+    prediction = predicted(measured(velocity=VELOCITY, covariance=isotropic(sigma)))
     # The least deviation of a pose is added after the measurement: compared without it, where it is next to nothing.
     gained = np.linalg.inv(prediction.covariance)[6:, 6:] - before[6:, 6:]
     np.testing.assert_allclose(np.diag(gained), (2.0 * sigma / 0.1) ** -2, rtol=1e-2)
@@ -118,7 +123,7 @@ def test_uncertainty_goes_along_with_the_sensor() -> None:
     turning = np.array([0.0, 0.0, 0.5 * np.pi / 0.1, 0.0, 0.0, 0.0])
     covariance = np.diag(np.array([1e-4] * 3 + [0.5, 1e-4, 1e-4] + [1e-4] * 6) ** 2)
     prediction = predict(
-        MotionState(5.0, np.eye(4), turning, covariance, 0.1), 5.1, Prior(), ProcessNoise(), MappingConfig()
+        MotionState(5.0, np.eye(4), turning, covariance, 0.1), 5.1, measured(), ProcessNoise(), MappingConfig()
     )
     sigmas = np.sqrt(np.diag(prediction.covariance)[:6])
     assert sigmas[4] == pytest.approx(0.5, rel=0.01)
@@ -136,7 +141,9 @@ def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_a
     way = before * (0.1 - seen_from_s) + after * seen_from_s
     known = np.diag(np.concatenate([np.full(6, 1e-9), np.full(6, VELOCITY_SIGMA[3])]) ** 2)
     state = MotionState(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.1 - seen_from_s)
-    covariance = predict(state, 5.1, Prior(), ProcessNoise(translation=15.0), MappingConfig(), seen_from_s).covariance
+    covariance = predict(
+        state, 5.1, measured(), ProcessNoise(translation=15.0), MappingConfig(), seen_from_s
+    ).covariance
     joint = covariance[np.ix_([4, 10], [4, 10])]
     uneven = (15.0 * 0.1**2 / 8.0) ** 2 + LEAST_SIGMA[4] ** 2
     np.testing.assert_allclose(joint - np.diag([uneven, 0.0]), np.cov(way, after), rtol=0.02, atol=2e-4)
@@ -146,7 +153,7 @@ def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable() ->
     """Independent, both would be likely; it is the correlation that keeps the one from making up for the other."""
     known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
     state = MotionState(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.05)
-    covariance = predict(state, 5.1, Prior(), ProcessNoise(), MappingConfig(), 0.05).covariance
+    covariance = predict(state, 5.1, measured(), ProcessNoise(), MappingConfig(), 0.05).covariance
     back_and_fast = np.zeros(12)
     back_and_fast[3], back_and_fast[9] = -0.05, 1.0
     forth_and_fast = np.abs(back_and_fast)
@@ -159,40 +166,40 @@ def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was() -> N
     """However sure the odometry is, the next pose is no better known than the last."""
     known = np.diag(np.array([1e-6] * 3 + [0.3] * 3 + [1e-6] * 6) ** 2)
     state = MotionState(5.0, np.eye(4), np.zeros(6), known)
-    prediction = predict(state, 5.1, Prior(np.eye(4), covariance=isotropic(1e-6)), ProcessNoise(), AS_TOLD)
+    prediction = predict(state, 5.1, measured(np.eye(4), covariance=isotropic(1e-6)), ProcessNoise(), CONFIG)
     np.testing.assert_allclose(np.sqrt(np.diag(prediction.covariance))[3:6], 0.3, rtol=1e-3)
 
 
 def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted() -> None:
     moved = exp(0.1 * VELOCITY)
-    assert not predicted(Prior(moved, covariance=isotropic(0.01))).contradicted
-    assert not predicted(Prior()).contradicted
+    assert not predicted(measured(moved, covariance=isotropic(0.01))).contradicted
+    assert not predicted(measured()).contradicted
     known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
     driving = MotionState(5.0, np.eye(4), np.array([0.0, 0.0, 0.0, 11.0, 0.0, 0.0]), known, 0.1)
-    standing = Prior(np.eye(4), covariance=isotropic(0.01))
-    assert predict(driving, 5.1, standing, ProcessNoise(), AS_TOLD).contradicted
+    standing = measured(np.eye(4), covariance=isotropic(0.01))
+    assert predict(driving, 5.1, standing, ProcessNoise(), CONFIG).contradicted
     doubted = OdometryNoise(variance=1e4)
-    assert not predict(driving, 5.1, standing, ProcessNoise(), AS_TOLD, odometry_noise=doubted).contradicted
+    assert not predict(driving, 5.1, standing, ProcessNoise(), CONFIG, odometry_noise=doubted).contradicted
 
 
 def test_the_noise_of_an_odometry_follows_its_errors() -> None:
     rng, noise = np.random.default_rng(0), OdometryNoise()
     for _ in range(200):
         noise = noise.updated(
-            Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.01, size=6)), AS_TOLD
+            measured(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.01, size=6)), CONFIG
         )
     assert noise.variance < 2.5
     for _ in range(200):
         noise = noise.updated(
-            Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.1, size=6)), AS_TOLD
+            measured(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.1, size=6)), CONFIG
         )
     assert 50.0 < noise.variance < 200.0
-    assert noise.updated(Prior(), MOVED, AS_TOLD) == noise
+    assert noise.updated(measured(), MOVED, CONFIG) == noise
 
 
 def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_not_change() -> None:
     last = MotionState(0.0, exp([0.0, 0.0, 0.4, 1.0, 2.0, 0.0]), np.zeros(6), UNKNOWN_VELOCITY)
-    prediction = predict(last, 0.1, Prior(), ProcessNoise(), MappingConfig())
+    prediction = predict(last, 0.1, measured(), ProcessNoise(), MappingConfig())
     held = prediction.held_along(np.array([0.0, 0.0, 1.0]))
     sigmas, before = (np.sqrt(np.diag(part.covariance)) for part in (held, prediction))
     assert sigmas[[5, 11]].max() < 0.002
