@@ -105,7 +105,8 @@ class Tracker(Stateful):
         if near.status is Status.LOST or ((uncertain or unconfirmed) and not near.is_reliable):
             best = self._relocalise(matcher, near, prior)
         elif near.status is Status.DEGRADED and self._state.searches_nearby:
-            best = best_of(filter(None, (near, self._found(matcher, near.prediction, prior, nearby=True))))
+            found = self._found(matcher, near.prediction, prior, nearby=True)
+            best = near if found is None or self._contradicts(prior, found, last) else best_of((near, found))
         elif near.status is Status.OK and not unconfirmed:
             best = self._archive.relocalise(matcher, near.prediction, self._budget) or near
         else:
@@ -191,6 +192,11 @@ class Tracker(Stateful):
     def _begins_coarse(self, scan: SampledScan, prediction: Prediction) -> bool:
         within_m = _FINE_ERROR_CELLS * scan.cell_m
         return self._prediction_error_m > within_m and not prediction.is_held_within(within_m)
+
+    def _contradicts(self, prior: Prior, found: Attempt, last: MotionState) -> bool:
+        """Whether a place found by search contradicts an odometry that was consistent, as the next step of stairs."""
+        motion = inverse(last.T_world_lidar) @ found.T_world_lidar
+        return self._odometry_noise.rejects(replace(prior, caution=_WEAK_CAUTION), motion, self._config)
 
     def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""

@@ -297,6 +297,6 @@ def test_views_go_on(after: int, rng: np.random.Generator, through_disk: Through
 def test_a_state_of_other_shapes_is_refused(through_disk: ThroughDisk) -> None:
     views = Views(every=1)
     views.add(at(10.0), 0)
-    for name, value in (("_images", np.zeros((2, ROWS, COLUMNS), np.float16)), ("_grid", np.zeros(2))):
+    for name, value in (("_images", np.zeros((1, ROWS, 3), np.float16)), ("_grid", np.zeros(2))):
         with pytest.raises(InputError, match="is not what this program saves"):
             Views().restore(through_disk(views.state() | {name: value}))
