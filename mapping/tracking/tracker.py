@@ -36,8 +36,11 @@ from lidarslam.mapping.tracking.tracking_state import TrackingState
 # error is forgotten by a factor a scan.
 _FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
 # A scan constrains its weakest direction poorly below this support or evidence: a fifth of the scans on stairs, in
-# offices, streets and crowds none. There an odometry counts with at most so many times its own standard deviations.
-_WEAK_SUPPORT, _WEAK_EVIDENCE, _WEAK_CAUTION = 0.65, 40.0, 2.0
+# offices, streets and crowds none. There an odometry counts with at most so many times its own standard deviations,
+# after motions of fewer cells than this: after longer ones it may itself be off by a step.
+_WEAK_SUPPORT, _WEAK_EVIDENCE, _WEAK_CAUTION, _WEAK_CELLS = 0.65, 40.0, 2.0, 2.0
+# Where even less constrains it, as in a corridor, nothing but the prediction does: evidence in units of the least.
+_LEAST_CONSTRAINT = 2.0
 # Factors by which the quality of a result with any acceleration, and with any displacement, must be better.
 _BETTER, _CLEARLY_BETTER = 1.05, 1.1
 
@@ -221,10 +224,13 @@ class Tracker(Stateful):
 
         Errors of an odometry are correlated in time, but so are those of the few surfaces that constrain the scan.
         """
-        if prior.covariance is None or prior.inertial is not None or near.registration is None:
+        if prior.covariance is None or prior.T_prev_curr is None or prior.inertial is not None:
             return near
-        weak = (near.fit.support or 0.0) < _WEAK_SUPPORT or (near.fit.evidence or np.inf) < _WEAK_EVIDENCE
-        if not weak or self._budget.is_spent:
+        fit, moved_m = near.fit, float(np.linalg.norm(prior.T_prev_curr[:3, 3]))
+        is_weak = (fit.support or 0.0) < _WEAK_SUPPORT or (fit.evidence or 0.0) < _WEAK_EVIDENCE
+        if not is_weak or fit.constraint < _LEAST_CONSTRAINT or self._budget.is_spent:
+            return near
+        if moved_m > _WEAK_CELLS * matcher.scan.cell_m:
             return near
         closer = replace(prior, caution=_WEAK_CAUTION)
         held = matcher.register(self.predict(matcher.scan, closer, matcher.last), coarse_first=False)
