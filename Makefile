@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint check lowest audit release docs install clean
+.PHONY: demo test test-all lint check lowest audit release docs install clean
 
 demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
@@ -14,6 +14,10 @@ PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loa
 
 test: install
 	$(PYTEST)
+
+# The slow tests too, those on recordings where they are at hand.
+test-all: install
+	$(PYTEST) -m "slow or not slow"
 
 lint: install
 	$(BIN)/ruff check .

@@ -1,8 +1,10 @@
 """Whole runs on real recordings and on those of another simulator; on none of them was anything tuned alone."""
 
 import json
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -47,4 +49,21 @@ def test_a_real_drive_at_speed_from_its_first_scan(real_data: Path, tmp_path: Pa
     source = real_data / "kitti_odometry_04" / "sequences" / "04"
     result = run(source, tmp_path / "run", "--odometry", odometry, "--step", str(step))
     assert result["ate_rmse_m"] < 0.05
+    assert result["lost_scans"] == 0
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_m", [0.0, 1e-5])
+def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noise_m: float) -> None:
+    """Few points constrain the height: the odometry's motion has to hold it, on any processor."""
+    stairs = shutil.copytree(real_data / "sim_stairs", tmp_path / "stairs")
+    rng = np.random.default_rng(2)
+    for path in sorted(stairs.glob("*.npy")):
+        scan = np.load(path)
+        for axis in "xyz":
+            scan[axis] += rng.normal(0.0, noise_m, len(scan)).astype(scan[axis].dtype)
+        np.save(path, scan)
+    result = run(stairs, tmp_path / "run")
+    assert result["ate_rmse_m"] < 0.03
     assert result["lost_scans"] == 0
