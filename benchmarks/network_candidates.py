@@ -19,8 +19,7 @@ from mapping_accuracy import Recorded, print_row, true_trajectory
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.odometry.images.sweep_images import Imager
 from lidarslam.odometry.network.candidates import Candidate
-from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
-from lidarslam.odometry.network.torch_graphs import torch_search
+from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 
 _RIGHT_DEG, _RIGHT_M = 4.0, 0.8
 

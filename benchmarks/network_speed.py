@@ -36,11 +36,10 @@ from lidarslam.odometry.images.sweep_images import Imager, SweepImages
 from lidarslam.odometry.methods import learned
 from lidarslam.odometry.network import candidates
 from lidarslam.odometry.network.candidates import Described, Search
-from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
+from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 from lidarslam.odometry.network.exported import onnx_search, read_exported
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights, shipped_folder
-from lidarslam.odometry.network.torch_graphs import torch_search
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.threads import in_order
 

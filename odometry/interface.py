@@ -1,4 +1,4 @@
-"""The protocol of every odometry method."""
+"""The protocol of every odometry method, and the method that measures nothing."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated, Protocol, runtime_checkable
@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import TRANSFORM, Saved, Shape, State
+from lidarslam.core.state import TRANSFORM, Saved, Shape, State, Stateful
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,3 +60,14 @@ class SkippingOdometry(Odometry, Protocol):
 
     def skip(self, scan: Scan) -> None:
         """Take a scan with points whose motion is not asked for; that of the next is since this one."""
+
+
+class ConstantVelocity(Stateful):
+    """Measures nothing; implements `Odometry`."""
+
+    def estimate(self, scan: Scan) -> Motion:  # noqa: ARG002
+        """No motion, not measured."""
+        return Motion(np.eye(4), points_used=0, failure="constant velocity measures nothing")
+
+    def close(self) -> None:
+        """Nothing is held."""

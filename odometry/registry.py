@@ -5,8 +5,8 @@ from typing import cast
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import ODOMETRIES, LearnedConfig, OdometryConfig
-from lidarslam.odometry.interface import Odometry
-from lidarslam.odometry.train_extra import require_train_extra
+from lidarslam.odometry.interface import ConstantVelocity, Odometry
+from lidarslam.odometry.network.shipped import default_weights, require_train_extra, shipped_folder
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
@@ -28,16 +28,15 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         from lidarslam.odometry.methods.external import ExternalOdometry
 
         return ExternalOdometry(prior)
-    if config.is_learned:
-        return _make_learned(config.learned)
-    if config.method == "kiss-icp":
-        from lidarslam.odometry.methods.kiss import KissOdometry
+    match config.method:
+        case "learned" | "learned+imu":
+            return _make_learned(config.learned)
+        case "kiss-icp":
+            from lidarslam.odometry.methods.kiss import KissOdometry
 
-        return KissOdometry(config.kiss_icp)
-    if config.method in ODOMETRIES.built_in:
-        from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
-
-        return ConstantVelocity()
+            return KissOdometry(config.kiss_icp)
+        case "constant-velocity" | "imu":  # the mapping predicts, by the IMU where there is one
+            return ConstantVelocity()
     return cast(Odometry, ODOMETRIES.make(config.method, Odometry))
 
 
@@ -47,14 +46,11 @@ def _make_learned(config: LearnedConfig) -> Odometry:
 
     if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
         from lidarslam.odometry.network.exported import onnx_search, read_exported
-        from lidarslam.odometry.network.shipped import shipped_folder
 
         exported = read_exported(config.weights or shipped_folder())
         return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config.alignment)
     require_train_extra(f"odometry.learned.device={config.device}" if config.device != "cpu" else "a file of weights")
-    from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
-    from lidarslam.odometry.network.shipped import default_weights
-    from lidarslam.odometry.network.torch_graphs import torch_search
+    from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 
     checkpoint = load_checkpoint(config.weights or default_weights())
     try:

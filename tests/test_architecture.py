@@ -61,7 +61,7 @@ CONFINED = {
     "pye57": ("lidarslam.compare.assessment.reference_cloud", "lidarslam.mapping.global_map.survey_formats"),
     "jinja2": ("lidarslam.evaluation.report.report",),
     "plotly": ("lidarslam.evaluation.report.*",),
-    "safetensors": ("lidarslam.odometry.network.tensor_file",),
+    "safetensors": ("lidarslam.odometry.network.checkpoint",),
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),

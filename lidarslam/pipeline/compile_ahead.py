@@ -149,9 +149,7 @@ PARTS = {
             "mapping.surfels.hash_kernels",
         ),
     ),
-    "alignment": Part(
-        _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("residuals", "point_to_plane", "steps"))
-    ),
+    "alignment": Part(_alignment, tuple(f"odometry.alignment.{kind}" for kind in ("point_to_plane", "steps"))),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.mounting.rotation")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),

@@ -27,7 +27,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
+from lidarslam.odometry.network.checkpoint import Kind, read_tensor_file, write_tensor_file
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.training.preparation import PreparedRecording, prepare
 from lidarslam.pipeline.threads import in_order

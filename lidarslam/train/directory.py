@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lidarslam.config.settings import SOURCES_SECTION
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
+from lidarslam.odometry.network.checkpoint import Kind, read_tensor_file, write_tensor_file
 
 CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"

@@ -15,12 +15,12 @@ from torch.nn.parallel import DistributedDataParallel
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from lidarslam.odometry.network.pair_network import PairNetwork
-from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.network.networks import PairNetwork
 from lidarslam.odometry.training.config import TrainingConfig
-from lidarslam.odometry.training.pairs import Pairs
+from lidarslam.odometry.training.losses import objective
+from lidarslam.odometry.training.pairs import PairBatch, Pairs
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.training import Validation, learning_rate, loss_of, validate
+from lidarslam.odometry.training.training import Validation, learning_rate, validate
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.train import directory as files
 from lidarslam.train.directory import Progress, save_state
@@ -113,7 +113,7 @@ class _LossModule(nn.Module):
 
     def forward(self, batch: PairBatch, generator: Generator) -> dict[str, Tensor]:
         """The loss and its parts."""
-        return dict(vars(loss_of(cast(PairNetwork, self.network), batch, self.config, generator)))
+        return dict(vars(objective(cast(PairNetwork, self.network)(batch), batch, self.config, generator)))
 
 
 class TrainingLoop:

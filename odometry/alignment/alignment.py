@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.odometry.alignment.correspondences import Motion
-from lidarslam.odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
+from lidarslam.core.directions.degeneracy import Degeneracy, lever_scale
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.odometry.alignment.point_to_plane import FINE_M, InlierSums, PairMotion, PointToPlane
 from lidarslam.odometry.alignment.steps import take_step, write_velocities
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.images.sweep_images import SweepImages
 
 # Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
 _COARSE_M = 0.5
@@ -37,6 +38,22 @@ _NEGLIGIBLE = 0.02
 _NEGLIGIBLE_PRIOR = 1e-9
 # Part of a scan that another must have in view for what is not in view to be left out.
 _MOSTLY_IN_VIEW = 0.5
+# Initial estimates that differ by less than this converge to the same motion.
+_ALIKE_RAD, _ALIKE_M = 0.05, 0.5
+# An alignment that explains less is doubtful, and steps along its weakest direction are tried, to either side.
+DOUBTFUL = 0.45
+STEPS_M: tuple[float, ...] = (0.8, 1.6, 2.4, 3.2)
+# By how much more another alignment must explain, for each standard deviation that it is less likely.
+_CLEARLY_BETTER = 0.05
+# Mean squared Jacobian of the points along a direction, from 0 to about 1. Where the end of a tunnel is in view it is
+# 0.002 and more, in an even one 0.0006 and less.
+_LEAST_SHARE = 0.001
+# Standard deviation of a normal at one metre, radians, by a centimetre of range noise over a patch; it falls with the
+# range. Along a direction with no more than this share of it, the constraint is that noise.
+_TILT_AT_1_M, _NOISE_FACTOR = 0.09, 1.25
+# Among leaves and wires most points have no normal, and a network that sees these as well knows more than alignment:
+# unless so many have one, nothing is taken for degenerate.
+_MOST = 0.7
 
 
 class Effort(NamedTuple):
@@ -47,6 +64,8 @@ class Effort(NamedTuple):
 
 
 NORMAL = Effort()
+# Several initial estimates are aligned roughly first; the best is aligned anew.
+_ROUGH = Effort(iterations=6, column_step=6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +135,13 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
     return _alignment(T_prev_curr, 0.5 * (motion.late - motion.early), cost.fit(motion), information)
 
 
-def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> Motion:
+def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> PairMotion:
     """The motion, whose change of velocity goes on as before but for the innovation."""
     early, late, last, share = np.empty(6), np.empty(6), innovation, 0.0
     if sweeps.last is not None:
         last, share = sweeps.last.velocity, sweeps.interval_s / (sweeps.interval_s + sweeps.last.interval_s)
     write_velocities(T_prev_curr, innovation, sweeps.interval_s, share, last, early, late)
-    return Motion(T_prev_curr, early, late)
+    return PairMotion(T_prev_curr, early, late)
 
 
 def _innovation_information() -> FloatArray:
@@ -152,7 +171,7 @@ def _compared(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArra
     return np.asarray(root, dtype=np.float64), ratios, axes
 
 
-def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: FloatArray) -> Alignment:
+def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: InlierSums, prior: FloatArray) -> Alignment:
     explained, weakest = _explained(fit.in_view, fit.inlier)
     return Alignment(
         T_prev_curr=T_prev_curr,
@@ -188,3 +207,88 @@ def _explained(in_view: FloatArray, inlier: FloatArray) -> tuple[float, FloatArr
     root, ratios, axes = _compared(inlier + little, in_view + little)
     weakest = np.linalg.solve(root.T, axes[:, 0])
     return float(ratios[0]), np.asarray(weakest / np.linalg.norm(weakest), dtype=np.float64)
+
+
+def align_best(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Effort = NORMAL) -> Alignment:
+    """The alignment that explains most, from initial estimates, the most likely first.
+
+    Estimates that differ are aligned roughly, and the best of them well; the less likely one is, the more it must
+    explain. If that is doubtful, so are steps along the weakest direction.
+    """
+    best = align(_choose(starts, sweeps), sweeps, effort)
+    if best.explained >= DOUBTFUL or not STEPS_M:
+        return best
+    other = try_instead(best, _along_weakest(best), sweeps, effort)
+    if other is None or other.explained - best.explained <= _CLEARLY_BETTER * _sigmas_away(other, starts):
+        return best
+    return other
+
+
+def try_instead(
+    best: Alignment, starts: Sequence[FloatArray], sweeps: SweepPair, effort: Effort = NORMAL
+) -> Alignment | None:
+    """The alignment from the most promising of many motions (4, 4), if it explains clearly more than the best."""
+    rough = align_each([InitialEstimate(T) for T in starts], sweeps, _ROUGH)
+    other = align(InitialEstimate(max(rough, key=lambda one: one.explained).T_prev_curr), sweeps, effort)
+    return other if other.explained - best.explained > _CLEARLY_BETTER else None
+
+
+def _sigmas_away(alignment: Alignment, starts: Sequence[InitialEstimate]) -> float:
+    """Mahalanobis distance from the nearest initial estimate; 0 where none has a covariance."""
+    distances = []
+    for start in starts:
+        if start.information is not None:
+            away = log(alignment.T_prev_curr @ inverse(start.T_prev_curr))
+            distances.append(float(np.sqrt(away @ start.information @ away)))
+    return min(distances, default=0.0)
+
+
+def _choose(starts: Sequence[InitialEstimate], sweeps: SweepPair) -> InitialEstimate:
+    """The first, unless another is not like it and explains more than its likelihood asks for."""
+    first = inverse(starts[0].T_prev_curr)
+    away = np.array([log(start.T_prev_curr @ first) for start in starts])
+    if (np.linalg.norm(away.reshape(-1, 2, 3), axis=2) < (_ALIKE_RAD, _ALIKE_M)).all():
+        return starts[0]
+    rough = align_each([InitialEstimate(start.T_prev_curr) for start in starts], sweeps, _ROUGH)
+    scores = [one.explained - _CLEARLY_BETTER * start.sigmas for one, start in zip(rough, starts, strict=True)]
+    return starts[int(np.argmax(scores))]
+
+
+def _along_weakest(alignment: Alignment) -> list[FloatArray]:
+    """The motion (4, 4), moved to and fro along its weakest direction."""
+    moved = np.repeat(alignment.T_prev_curr[None], 2 * len(STEPS_M), axis=0)
+    moved[:, :3, 3] += np.outer(np.outer(STEPS_M, [1.0, -1.0]), alignment.weakest)
+    return list(moved)
+
+
+def find_degeneracy(information: FloatArray, inliers: int, images: SweepImages) -> Degeneracy:
+    """Directions that the inliers of an alignment leave open.
+
+    Along an even tunnel the residuals are small for any translation. The remaining gradient is due to the noise of the
+    normals, and is biased towards no motion; so is a network's estimate from the same scans.
+
+    Args:
+        information: (6, 6) sum over the inliers of squared Jacobians, rotation first.
+        inliers: how many.
+        images: of the current sweep; its median range is the lever of rotations, its ranges the noise of normals.
+    """
+    if images.share_with_normal() < _MOST:
+        return Degeneracy(np.empty((0, 6)), 1.0)
+    lever_m = images.median_range_m()
+    scale = lever_scale(lever_m)
+    shares, axes = np.linalg.eigh(information / np.outer(scale, scale) / max(inliers, 1))
+    least = max(_LEAST_SHARE, _NOISE_FACTOR * _TILT_AT_1_M**2 * images.mean_inverse_square_range())
+    return Degeneracy(np.ascontiguousarray(axes[:, shares < least].T), lever_m)
+
+
+def replaced_along(T_prev_curr: FloatArray, expected: FloatArray, degeneracy: Degeneracy) -> FloatArray:
+    """A motion (4, 4) with its part along the degenerate directions replaced by that of the expected one."""
+    along = degeneracy.part_along() @ log(expected @ inverse(T_prev_curr))
+    return np.asarray(exp(along) @ T_prev_curr, dtype=np.float64)
+
+
+def joined_information(seen: FloatArray, expected: FloatArray, degeneracy: Degeneracy) -> FloatArray:
+    """Information (6, 6): along the degenerate directions that of an expectation of this covariance, else as seen."""
+    D = degeneracy.rows
+    across = np.eye(6) - degeneracy.part_along()
+    return np.asarray(across.T @ seen @ across + D.T @ np.linalg.solve(D @ expected @ D.T, D), dtype=np.float64)

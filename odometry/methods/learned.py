@@ -14,9 +14,15 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
-from lidarslam.odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
-from lidarslam.odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
-from lidarslam.odometry.alignment.search import align_best
+from lidarslam.odometry.alignment.alignment import (
+    INFORMATION_PER_M2,
+    InitialEstimate,
+    align,
+    align_best,
+    find_degeneracy,
+    joined_information,
+    replaced_along,
+)
 from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepPair
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.sweep_images import Imager, ScanImages

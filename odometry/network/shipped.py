@@ -1,5 +1,6 @@
-"""The network that comes with the program; without torch."""
+"""The network that comes with the program, and the libraries that its training needs; without torch."""
 
+from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 
@@ -28,3 +29,22 @@ def _required(name: str) -> Path:
             " install it again, or name a file of weights with --weights FILE"
         )
     return path
+
+
+_LIBRARIES = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript")
+
+
+def require_train_extra(purpose: str) -> None:
+    """Check that the libraries of the extra are installed; the message names the purpose.
+
+    Raises:
+        ConfigError: one is missing.
+    """
+    for name in _LIBRARIES:
+        try:
+            import_module(name)
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"{error.name} is not installed, which {purpose} needs; pip install 'lidarslam[train]'"
+                " (PyTorch's CPU build, installed first, is much smaller: https://pytorch.org/get-started/locally)"
+            ) from error

@@ -1,19 +1,208 @@
-"""Pairs of scans for training, drawn at random; the same seed and step give the same pairs."""
+"""Pairs of scans for training, drawn at random; the same seed and step give the same pairs.
+
+Pairs are augmented: turned, mirrored, scaled, thinned and made noisy; the motions follow.
+"""
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Generator, Tensor
 
 from lidarslam.odometry.images.bird_eye import bird_eye
-from lidarslam.odometry.network.torch_geometry import inverse, log
-from lidarslam.odometry.training.augmentation import AUGMENTATION, Augmentation, PairBatch, augmented
+from lidarslam.odometry.network.networks import PairImages
+from lidarslam.odometry.network.torch_geometry import inverse, log, make_transform, skew, turn_about_z
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.torch_images import compensated
+
+# Surfaces whose normals have a vertical component of more than this count as ground.
+_LEVEL = 0.9
+# Panes of glass in a scan that has any.
+_PANES = 6
+
+
+class Augmentation(NamedTuple):
+    """How pairs are changed; probabilities unless said otherwise."""
+
+    max_gap: int = 10  # steps from one scan of a pair to the other, 1 to this many, small ones more often
+    reverse: float = 0.5  # the later scan comes first
+    heading: float = 1.0  # both scans are turned about z by the same angle, any
+    roll: float = 0.8  # the current scan is turned about z by whole columns
+    roll_deg: float = 12.0  # standard deviation of most of these turns
+    any_roll: float = 0.2  # the others, by any angle; a part of those that are turned
+    mirror: float = 0.5  # y is negated
+    scale: float = 0.3  # both scans grow or shrink by up to this part
+    drop_beams: float = 0.3  # up to half of the rows are emptied
+    drop_points: float = 0.2  # up to this part of the points, of each scan anew
+    hide_sector: float = 0.2  # up to a quarter of the turn is emptied in one scan
+    range_noise_m: float = 0.02  # greatest standard deviation of noise on the ranges
+    wet_ground: float = 0.15  # level ground beyond 5 to 30 m does not return
+    glass: float = 0.15  # several rectangles of one scan do not return
+    bird_turn_deg: float = 0.7  # standard deviation of the error of the turn with which scans are seen from above
+
+
+AUGMENTATION = Augmentation()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PairBatch(PairImages):
+    """B pairs of scans: the raw sweeps, which the network sees, and what the losses compare."""
+
+    # previous_surfaces, current_surfaces: (B, 6, H, W) points and normals as of the middle of each sweep; None
+    # where the losses do not need them
+    previous_surfaces: Tensor | None = None
+    current_surfaces: Tensor | None = None
+    T_prev_curr: Tensor  # (B, 4, 4) pseudo-labels
+    valid: Tensor  # (B,) whether these are reliable
+
+    def to(self, device: torch.device) -> "PairBatch":
+        """The same on another device."""
+        values = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(self, **{name: value.to(device, non_blocking=True) for name, value in values.items()})
+
+    def changed(
+        self, previous: Callable[[Tensor], Tensor], current: Callable[[Tensor], Tensor], T_prev_curr: Tensor
+    ) -> "PairBatch":
+        """The batch with its images changed, and the motions that follow from it."""
+        return replace(
+            self,
+            previous=previous(self.previous),
+            current=current(self.current),
+            previous_surfaces=None if self.previous_surfaces is None else previous(self.previous_surfaces),
+            current_surfaces=None if self.current_surfaces is None else current(self.current_surfaces),
+            T_prev_curr=T_prev_curr,
+        )
+
+
+def augmented(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
+    """Pairs changed at random, each anew."""
+    batch = _scaled(_mirrored(_turned(batch, config, generator), config, generator), config, generator)
+    previous, current = (_worn(images, config, generator) for images in (batch.previous, batch.current))
+    return replace(batch, previous=previous, current=current)
+
+
+def _turned(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
+    """Both scans turned about z by whole columns, the current one by some more."""
+    size, width = len(batch.previous), batch.previous.shape[-1]
+    both = torch.randint(width, (size,), generator=generator)
+    both = torch.where(torch.rand(size, generator=generator) < config.heading, both, 0)
+    more = torch.randn(size, generator=generator) * (config.roll_deg * width / 360.0)
+    anywhere = torch.rand(size, generator=generator) < config.any_roll
+    more = torch.where(anywhere, torch.randint(width, (size,), generator=generator).float(), more.round())
+    more = torch.where(torch.rand(size, generator=generator) < config.roll, more, 0.0).long()
+    T = _turns(both, width) @ batch.T_prev_curr @ _turns(both + more, width).mT
+    return batch.changed(lambda images: _rotated(images, both), lambda images: _rotated(images, both + more), T)
+
+
+def _rotated(images: Tensor, columns: Tensor) -> Tensor:
+    """Points and normals (B, 6, H, W) turned about z."""
+    return torch.cat([rotate_columns(images[:, :3], columns), rotate_columns(images[:, 3:], columns)], dim=1)
+
+
+def _turns(columns: Tensor, width: int) -> Tensor:
+    R = turn_about_z(columns.double() * (2.0 * math.pi / width)).float()
+    return make_transform(R, R.new_zeros(len(R), 3))
+
+
+def _mirrored(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
+    chosen = torch.rand(len(batch.previous), generator=generator) < config.mirror
+    M = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0]))
+
+    def one(images: Tensor) -> Tensor:
+        flipped = torch.cat([mirror(images[:, :3]), mirror(images[:, 3:])], dim=1)
+        return torch.where(chosen[:, None, None, None], flipped, images)
+
+    return batch.changed(one, one, torch.where(chosen[:, None, None], M @ batch.T_prev_curr @ M, batch.T_prev_curr))
+
+
+def _scaled(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
+    exponent = 2.0 * torch.rand(len(batch.previous), generator=generator) - 1.0
+    scale = (1.0 + config.scale) ** exponent
+    factors = torch.ones(len(scale), 6, 1, 1)
+    factors[:, :3, 0, 0] = scale[:, None]
+    T = batch.T_prev_curr.clone()
+    T[:, :3, 3] *= scale[:, None]
+    return batch.changed(lambda images: images * factors, lambda images: images * factors, T)
+
+
+def _worn(images: Tensor, config: Augmentation, generator: Generator) -> Tensor:
+    """Scans of a worse sensor: noise, missing points, beams and directions."""
+    size, _, height, width = images.shape
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(size, *shape, generator=generator)
+
+    kept = uniform(height, width) >= config.drop_points * uniform(1, 1)
+    beams = uniform(height, 1) >= 0.5 * uniform(1, 1) * (uniform(1, 1) < config.drop_beams)
+    hidden = 0.25 * uniform(1, 1) * (uniform(1, 1) < config.hide_sector)
+    sector = (torch.arange(width) / width + uniform(1, 1)).remainder(1.0) >= hidden
+    sparse = _missing_returns(images, config, uniform)
+    points = images[:, :3]
+    noise = config.range_noise_m * uniform(1, 1, 1) * torch.randn(size, 1, height, width, generator=generator)
+    ranges = points.square().sum(1, keepdim=True).sqrt()
+    noisy = points * (1.0 + noise / ranges.clamp(min=1.0))
+    return torch.cat([noisy, images[:, 3:]], dim=1) * (kept & beams & sector & sparse)[:, None]
+
+
+def _missing_returns(images: Tensor, config: Augmentation, uniform: Callable[..., Tensor]) -> Tensor:
+    """(B, H, W) which points return: wet ground reflects the beam away beyond some range, glass lets it through."""
+    size, _, height, width = images.shape
+    ranges = images[:, :3].square().sum(1).sqrt()
+    wet = (uniform(1, 1) < config.wet_ground) & (images[:, 5].abs() > _LEVEL) & (ranges > 5.0 + 25.0 * uniform(1, 1))
+    row, column = torch.arange(height)[:, None] / height, torch.arange(width) / width
+    pane = torch.zeros(size, height, width, dtype=torch.bool)
+    for _ in range(_PANES):
+        across = (column - uniform(1, 1)).remainder(1.0) < 0.05 * uniform(1, 1)
+        pane |= across & ((row - uniform(1, 1)).remainder(1.0) < 0.6 * uniform(1, 1))
+    return ~(wet | (pane & (uniform(1, 1) < config.glass)))
+
+
+def rotate_columns(images: Tensor, shift: Tensor) -> Tensor:
+    """Images of the clouds turned about z by whole columns, to the left (x towards y) where positive.
+
+    Args:
+        images: (B, C, H, W), C at least 2; channels 0 and 1 are components along x and y, of points or of normals.
+        shift: columns, (B,) integers.
+    """
+    width = images.shape[-1]
+    columns = (torch.arange(width, device=images.device) - shift[:, None]).remainder(width)
+    moved = images.gather(3, columns[:, None, None, :].expand(images.shape))
+    angles = shift.double()[:, None, None] * (2.0 * math.pi / width)
+    cos, sin = angles.cos().to(images.dtype), angles.sin().to(images.dtype)
+    x, y = moved[:, 0], moved[:, 1]
+    turned = torch.stack([cos * x - sin * y, sin * x + cos * y], dim=1)
+    return torch.cat([turned, moved[:, 2:]], dim=1)
+
+
+def mirror(images: Tensor) -> Tensor:
+    """Images (B, C, H, W) of the clouds with y negated; channel 1 is the component along y."""
+    flipped = images.flip(-1)
+    return torch.cat([flipped[:, :1], -flipped[:, 1:2], flipped[:, 2:]], dim=1)
+
+
+def compensated(points: Tensor, normals: Tensor, offsets: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    """Points and normals (B, 3, H, W) as seen from the middles of the sweeps.
+
+    Args:
+        points, normals: as measured; zero where empty.
+        offsets: (B, H, W) seconds from the middle.
+        velocity: (B, 6) of bodies that move evenly, rotation first.
+    """
+    shape, t = points.shape, offsets.flatten(1)[..., None]
+    p, n = points.flatten(2).mT, normals.flatten(2).mT
+    seen = p.square().sum(-1, keepdim=True) > 0.0
+    cross = skew(velocity[:, :3]).mT  # p @ cross is the cross product of the rotation vector with p
+    moved = _second_order(p, torch.baddbmm(velocity[:, None, 3:], p, cross), t, cross) * seen
+    turned = _second_order(n, n @ cross, t, cross)
+    return moved.mT.reshape(shape), turned.mT.reshape(shape)
+
+
+def _second_order(values: Tensor, first: Tensor, t: Tensor, cross: Tensor) -> Tensor:
+    """The exponential map to second order, which is exact to 0.12 mrad for a turn of 10 degrees a sweep."""
+    return torch.addcmul(values, t, torch.baddbmm(first, (0.5 * t) * first, cross))
+
 
 # A prime that keeps the random streams of steps and processes apart.
 _STREAM = 1_000_003
@@ -54,7 +243,7 @@ class Pairs:
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
         """The pairs of one step."""
         generator = torch.Generator().manual_seed((self._seed * _STREAM**2 + step * _STREAM + process) % _SEEDS)
-        pairs = augmented(_stack([self._draw(generator) for _ in range(size)]), self._augmentation, generator)
+        pairs = augmented(stack([self._draw(generator) for _ in range(size)]), self._augmentation, generator)
         return self._seen_from_above(pairs, generator) if self._birds else pairs
 
     def _draw(self, generator: Generator) -> PairBatch:
@@ -63,7 +252,7 @@ class Pairs:
         first = int(torch.randint(len(recording) - gap, (), generator=generator))
         pair = pair_of(recording, first, first + gap, self._surfaces)
         is_reversed = float(torch.rand((), generator=generator)) < self._augmentation.reverse
-        return _reversed(pair) if is_reversed else pair
+        return reversed_pair(pair) if is_reversed else pair
 
     def _seen_from_above(self, batch: PairBatch, generator: Generator) -> PairBatch:
         """The pairs with bird's-eye grids; the turn between the scans is known to within an error."""
@@ -97,13 +286,14 @@ def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces:
     T = torch.eye(4)
     for motion in recording.T_prev_curr[previous:current]:
         T = T @ motion
-    raw = [
-        torch.cat([recording.points[i], recording.normals[i].float()])[None]  # (1, 6, H, W)
-        for i in (previous, current)
-    ]
-    still = [_compensated(recording, i) if surfaces else None for i in (previous, current)]
-    valid = recording.valid[previous:current].all()
-    return PairBatch(raw[0], raw[1], still[0], still[1], T[None], valid[None])
+    one, other = (torch.cat([recording.points[i], recording.normals[i].float()])[None] for i in (previous, current))
+    pair = PairBatch(
+        previous=one, current=other, T_prev_curr=T[None], valid=recording.valid[previous:current].all()[None]
+    )
+    if not surfaces:
+        return pair
+    still = [_compensated(recording, i) for i in (previous, current)]
+    return replace(pair, previous_surfaces=still[0], current_surfaces=still[1])
 
 
 def _compensated(recording: PreparedRecording, scan: int) -> Tensor:
@@ -121,14 +311,20 @@ def _velocity(recording: PreparedRecording, scan: int) -> Tensor:
     return (valid @ velocity) / valid.sum().clamp(min=1.0)
 
 
-def _reversed(pair: PairBatch) -> PairBatch:
-    return PairBatch(
-        pair.current, pair.previous, pair.current_surfaces, pair.previous_surfaces, inverse(pair.T_prev_curr),
-        pair.valid,
-    )  # fmt: skip
+def reversed_pair(pair: PairBatch) -> PairBatch:
+    """The later scan first."""
+    return replace(
+        pair,
+        previous=pair.current,
+        current=pair.previous,
+        previous_surfaces=pair.current_surfaces,
+        current_surfaces=pair.previous_surfaces,
+        T_prev_curr=inverse(pair.T_prev_curr),
+    )
 
 
-def _stack(pairs: Sequence[PairBatch]) -> PairBatch:
+def stack(pairs: Sequence[PairBatch]) -> PairBatch:
+    """Pairs in one batch."""
     parts = {name: [getattr(pair, name) for pair in pairs] for name in vars(pairs[0])}
     stacked: dict[str, Any] = {name: None if part[0] is None else torch.cat(part) for name, part in parts.items()}
     return PairBatch(**stacked)

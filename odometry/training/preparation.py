@@ -14,8 +14,7 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, exp, log
 from lidarslam.core.scan import Scan
-from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate
-from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
+from lidarslam.odometry.alignment.alignment import DOUBTFUL, Alignment, Effort, InitialEstimate, align_best, try_instead
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.sweep_images import Imager, SweepImages

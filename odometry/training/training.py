@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from lidarslam.odometry.network.candidates import Search
-from lidarslam.odometry.network.pair_network import PairNetwork
-from lidarslam.odometry.network.torch_graphs import torch_search
-from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.network.checkpoint import torch_search
 from lidarslam.odometry.training.config import TrainingConfig
-from lidarslam.odometry.training.objective import Objective, motion_error, objective
+from lidarslam.odometry.training.losses import motion_error
 from lidarslam.odometry.training.pairs import pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
 
@@ -49,11 +47,6 @@ def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Op
     others = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.98))
-
-
-def loss_of(network: PairNetwork, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
-    """The loss of a network on a batch."""
-    return objective(network(batch.images), batch, config, generator)
 
 
 def validate(

@@ -17,8 +17,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.odometry.interface import ConstantVelocity
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
-from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline

@@ -19,9 +19,8 @@ from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.odometry.interface import Motion, Odometry
+from lidarslam.odometry.interface import ConstantVelocity, Motion, Odometry
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
-from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, SweepMotion
 from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap, make_localiser

@@ -21,12 +21,10 @@ from click.testing import CliRunner, Result
 from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
+from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.network.tensor_file import read_tensor_file, write_tensor_file
-from lidarslam.odometry.training.augmentation import AUGMENTATION
 from lidarslam.odometry.training.config import LossConfig, SimulatedConfig
-from lidarslam.odometry.training.pairs import Pairs
+from lidarslam.odometry.training.pairs import AUGMENTATION, Pairs
 from lidarslam.odometry.training.training import summarise, validate
 from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import data as training_data
@@ -49,7 +47,7 @@ def small_steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Frequent reports; and one thread, with which small networks are fastest."""
     monkeypatch.setattr("lidarslam.train.loop.LOG_EVERY", 3)
     monkeypatch.setattr("lidarslam.train.loop.VALIDATE_EVERY", 4)
-    monkeypatch.setattr("lidarslam.odometry.training.objective._GEOMETRIC_POINTS", 64)
+    monkeypatch.setattr("lidarslam.odometry.training.losses._GEOMETRIC_POINTS", 64)
     earlier = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

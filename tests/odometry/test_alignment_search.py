@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from lidarslam.odometry.alignment import search
-from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align
-from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
+from lidarslam.odometry.alignment import alignment as search
+from lidarslam.odometry.alignment.alignment import (
+    DOUBTFUL,
+    Alignment,
+    Effort,
+    InitialEstimate,
+    align,
+    align_best,
+    try_instead,
+)
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
 

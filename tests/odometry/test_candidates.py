@@ -9,10 +9,9 @@ import torch
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
 from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Search, _peaks, _shift_scores
-from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
-from lidarslam.odometry.network.correlation import CorrelationNetwork
+from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
+from lidarslam.odometry.network.networks import CorrelationNetwork
 from lidarslam.odometry.network.shipped import default_weights
-from lidarslam.odometry.network.torch_graphs import torch_search
 
 TURN_DEG = 2.0
 

@@ -16,14 +16,15 @@ from lidarslam.odometry.network import checkpoint as module
 from lidarslam.odometry.network import shipped
 from lidarslam.odometry.network.checkpoint import (
     Checkpoint,
+    Kind,
     checkpoint_of,
     load_checkpoint,
     network_of,
     save_checkpoint,
+    write_tensor_file,
 )
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights, shipped_folder
-from lidarslam.odometry.network.tensor_file import Kind, write_tensor_file
 
 IMAGES = ImageConfig(rows=16, columns=96)
 

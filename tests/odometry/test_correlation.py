@@ -1,6 +1,7 @@
 """What the default network must give whatever its weights are."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,17 +12,18 @@ from torch.nn import functional
 from lidarslam.odometry.config import NetworkConfig
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
-from lidarslam.odometry.network.correlation import INPUT_CHANNELS, CorrelationNetwork, column_channels
-from lidarslam.odometry.network.inference_form import InferenceColumns
-from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.network.pair_network import PairImages
+from lidarslam.odometry.network.export import InferenceColumns
+from lidarslam.odometry.network.networks import (
+    INPUT_CHANNELS,
+    CorrelationNetwork,
+    PairImages,
+    column_channels,
+    make_network,
+)
 from lidarslam.odometry.network.torch_geometry import inverse, log
-from lidarslam.odometry.training.augmentation import PairBatch
 from lidarslam.odometry.training.config import TrainingConfig
-from lidarslam.odometry.training.objective import objective
-from lidarslam.odometry.training.pairs import birds, pair_of
-from lidarslam.odometry.training.torch_images import rotate_columns
-from lidarslam.odometry.training.training import loss_of
+from lidarslam.odometry.training.losses import objective
+from lidarslam.odometry.training.pairs import PairBatch, birds, pair_of, rotate_columns
 
 COLUMNS = 96
 FEATURE_COLUMNS = COLUMNS // 4
@@ -156,7 +158,7 @@ def test_turn_and_shift_are_what_the_objective_asks_for(network, scans):
 
     def losses(target: Tensor) -> tuple[float, float]:
         empty = torch.zeros(3, 6, 16, COLUMNS)
-        batch = PairBatch(empty, empty, None, None, target, torch.ones(3, dtype=torch.bool))
+        batch = PairBatch(empty, empty, T_prev_curr=target, valid=torch.ones(3, dtype=torch.bool))
         config, generator = TrainingConfig(geometric=None), torch.Generator()
         return float(objective(estimate, batch, config, generator).turn), float(
             objective(moved, batch, config, generator).shift
@@ -209,8 +211,8 @@ def test_the_default_objective_reaches_every_parameter(small_room):
     network = make().train()
     pair = pair_of(small_room.recording(3, TWIST), 0, 1)
     grids = birds(pair.previous, torch.zeros(1)), birds(pair.current, torch.zeros(1))
-    batch = PairBatch(**{**vars(pair), "bird_previous": grids[0], "bird_current": grids[1]})
-    loss = loss_of(network, batch, TrainingConfig(), torch.Generator().manual_seed(0))
+    batch = replace(pair, bird_previous=grids[0], bird_current=grids[1])
+    loss = objective(network(batch), batch, TrainingConfig(), torch.Generator().manual_seed(0))
     loss.total.backward()  # type: ignore[no-untyped-call]
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from lidarslam.odometry.training import correspondence
-from lidarslam.odometry.training.correspondence import nearest
+from lidarslam.odometry.training import losses as correspondence
+from lidarslam.odometry.training.losses import nearest
 
 
 @pytest.fixture(params=["k-d tree", "all distances"])

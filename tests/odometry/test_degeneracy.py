@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
-from lidarslam.odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
+from lidarslam.odometry.alignment.alignment import find_degeneracy, joined_information, replaced_along
 
 
 def information(normals: FloatArray, points: FloatArray) -> FloatArray:

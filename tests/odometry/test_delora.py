@@ -2,8 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarslam.odometry.network.delora import DeloraNetwork
-from lidarslam.odometry.network.pair_network import PairImages
+from lidarslam.odometry.network.networks import DeloraNetwork, PairImages
 
 
 @pytest.fixture(scope="module")

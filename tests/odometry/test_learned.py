@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform
 from lidarslam.core.scan import Scan
-from lidarslam.odometry.alignment import search
+from lidarslam.odometry.alignment import alignment as search
 from lidarslam.odometry.config import ImageConfig, LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods import learned

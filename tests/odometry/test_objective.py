@@ -7,13 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarslam.odometry.network.pair_network import Estimate
+from lidarslam.odometry.network.networks import PairEstimate
 from lidarslam.odometry.network.torch_geometry import inverse, skew
-from lidarslam.odometry.training import objective as module
-from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training import losses as module
 from lidarslam.odometry.training.config import TrainingConfig
-from lidarslam.odometry.training.objective import Objective, motion_error, objective
-from lidarslam.odometry.training.pairs import pair_of
+from lidarslam.odometry.training.losses import Objective, motion_error, objective
+from lidarslam.odometry.training.pairs import PairBatch, pair_of, stack
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 WIDTH = 24
@@ -35,15 +34,15 @@ def pair(small_room) -> PairBatch:
 def batch_of(targets: Tensor, valid: list[bool] | None = None) -> PairBatch:
     """Pairs without surfaces."""
     images = torch.zeros(len(targets), 6, 4, 8)
-    return PairBatch(images, images, None, None, targets, torch.tensor(valid or [True] * len(targets)))
+    return PairBatch(images, images, T_prev_curr=targets, valid=torch.tensor(valid or [True] * len(targets)))
 
 
-def estimate_of(T: Tensor, log_sigma: float = 0.0, scores: Tensor | None = None) -> Estimate:
+def estimate_of(T: Tensor, log_sigma: float = 0.0, scores: Tensor | None = None) -> PairEstimate:
     scores = torch.zeros(len(T), WIDTH) if scores is None else scores
-    return Estimate(T, torch.full((len(T), 6), log_sigma), scores, torch.zeros(len(T), 0, 0))
+    return PairEstimate(T, torch.full((len(T), 6), log_sigma), scores, torch.zeros(len(T), 0, 0))
 
 
-def loss(estimate: Estimate, batch: PairBatch, config: TrainingConfig = ALIGNMENT_ONLY) -> Objective:
+def loss(estimate: PairEstimate, batch: PairBatch, config: TrainingConfig = ALIGNMENT_ONLY) -> Objective:
     return objective(estimate, batch, config, torch.Generator().manual_seed(0))
 
 
@@ -136,7 +135,7 @@ def test_nothing_valid_costs_nothing_and_pulls_nowhere():
 def test_confidence_does_not_reach_the_motion():
     xi = torch.tensor([[0.01, 0.0, 0.02, 0.1, 0.0, -0.2]], requires_grad=True)
     log_sigma = torch.full((1, 6), -2.0, requires_grad=True)
-    estimate = Estimate(exp(xi), log_sigma, torch.zeros(1, WIDTH), torch.zeros(1, 0, 0))
+    estimate = PairEstimate(exp(xi), log_sigma, torch.zeros(1, WIDTH), torch.zeros(1, 0, 0))
     parts = loss(estimate, batch_of(torch.eye(4)[None]))
     reached = torch.autograd.grad(parts.confidence, [xi, log_sigma], allow_unused=True)
     assert reached[0] is None
@@ -153,7 +152,7 @@ def test_confidence_is_best_at_the_standard_deviation_of_a_laplace_distribution(
     xi[:, 4] = errors
     log_sigma = torch.tensor(math.log(sigma), dtype=torch.float64, requires_grad=True)
     none = torch.zeros(len(errors), 0)
-    estimate = Estimate(exp(xi), log_sigma.expand(len(errors), 6), none, none[..., None])
+    estimate = PairEstimate(exp(xi), log_sigma.expand(len(errors), 6), none, none[..., None])
     confidence = loss(estimate, batch_of(torch.eye(4, dtype=torch.float64).expand(len(errors), 4, 4))).confidence
     (gradient,) = torch.autograd.grad(confidence, log_sigma)
     # Five directions without an error pull by one each.
@@ -239,10 +238,7 @@ def test_geometry_is_best_at_the_truth(pair, change):
 
 def test_geometry_compares_the_compensated_surfaces(pair):
     """Not what the network sees."""
-    blind = PairBatch(
-        torch.zeros_like(pair.previous), torch.zeros_like(pair.current), pair.previous_surfaces,
-        pair.current_surfaces, pair.T_prev_curr, pair.valid,
-    )  # fmt: skip
+    blind = replace(pair, previous=torch.zeros_like(pair.previous), current=torch.zeros_like(pair.current))
     config = TrainingConfig(alignment_weight=0.0)
     estimate = estimate_of(off(1.0) @ pair.T_prev_curr)
     assert torch.equal(loss(estimate, blind, config).total, loss(estimate, pair, config).total)
@@ -251,8 +247,7 @@ def test_geometry_compares_the_compensated_surfaces(pair):
 def test_geometry_looks_at_pairs_that_are_valid(pair, monkeypatch):
     """Where alignment failed, the compensation that surfaces rest on is a guess."""
     T = torch.cat([off(0.0, 0.03) @ pair.T_prev_curr, off(0.0, 0.2) @ pair.T_prev_curr])
-    both = PairBatch(**{name: None if v is None else torch.cat([v, v]) for name, v in vars(pair).items()})
-    both = replace(both, valid=torch.tensor([True, False]))
+    both = replace(stack([pair, pair]), valid=torch.tensor([True, False]))
     monkeypatch.setattr(module, "_GEOMETRIC_POINTS", 16 * 96)
     config = TrainingConfig(alignment_weight=0.0)
     some, one = loss(estimate_of(T), both, config), loss(estimate_of(T[:1]), pair, config)
@@ -275,7 +270,7 @@ def test_the_points_looked_up_are_drawn_at_random_from_those_with_normals(pair, 
     assert pair.current_surfaces is not None
     chosen = torch.randperm(16 * 96, generator=torch.Generator().manual_seed(0)).view(1, 1, 16, 96) < with_normal
     sparse = torch.cat([pair.current_surfaces[:, :3], pair.current_surfaces[:, 3:] * chosen], dim=1)
-    batch = PairBatch(pair.previous, pair.current, pair.previous_surfaces, sparse, pair.T_prev_curr, pair.valid)
+    batch = replace(pair, current_surfaces=sparse)
     estimate = estimate_of(off(0.0, 0.05) @ pair.T_prev_curr)
 
     def value(seed: int, points: int = 64) -> float:

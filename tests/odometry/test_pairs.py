@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarslam.odometry.network.torch_geometry import inverse, log, rotate, skew, transform_points
-from lidarslam.odometry.training.augmentation import Augmentation, PairBatch, augmented
-from lidarslam.odometry.training.pairs import Pairs, pair_of
+from lidarslam.odometry.network.torch_geometry import log, rotate, skew, transform_points
+from lidarslam.odometry.training.pairs import Augmentation, PairBatch, Pairs, augmented, pair_of, reversed_pair, stack
 from lidarslam.odometry.training.preparation import PreparedRecording
 
 TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
@@ -200,12 +199,9 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
     if name == "reverse":
         two = pair_of(recording, 0, 1)
         batch = Pairs([_first_two(recording)], 0, augmentation=only(reverse=1.0)).batch(0, 3)
-        expected = fit(PairBatch(
-            two.current, two.previous, two.current_surfaces, two.previous_surfaces, inverse(two.T_prev_curr),
-            two.valid,
-        ), 0)  # fmt: skip
+        expected = fit(reversed_pair(two), 0)
     else:
-        several = PairBatch(*(None if v is None else torch.cat([v] * 3) for v in vars(as_it_is).values()))
+        several = stack([as_it_is] * 3)
         generator = torch.Generator().manual_seed(1)
         batch = augmented(several, only(**AUGMENTATIONS[name]), generator)
         expected = fit(as_it_is, 0)
@@ -214,10 +210,8 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
         torch.testing.assert_close(distance, expected[0], rtol=0, atol=1e-6)
         assert (cosine - expected[1]).abs().median() < 1e-6
         torch.testing.assert_close(cosine.mean(), expected[1].mean(), rtol=0, atol=1e-3)
-        wrong = PairBatch(
-            batch.previous, batch.current, batch.previous_surfaces, batch.current_surfaces,
-            exp(torch.tensor([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])) @ batch.T_prev_curr, batch.valid,
-        )  # fmt: skip
+        off = exp(torch.tensor([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0]))
+        wrong = replace(batch, T_prev_curr=off @ batch.T_prev_curr)
         assert (fit(wrong, item)[0] - expected[0]).abs().max() > 1e-5
 
 
@@ -268,7 +262,7 @@ def _with_holes(recording: PreparedRecording) -> PairBatch:
 @pytest.mark.parametrize("name", WORN)
 def test_worn_scans_gain_nothing_and_surfaces_are_spared(recording, name):
     whole = _with_holes(recording)
-    several = PairBatch(*(None if v is None else torch.cat([v] * 8) for v in vars(whole).values()))
+    several = stack([whole] * 8)
     worn = augmented(several, only(**{name: WORN[name]}), torch.Generator().manual_seed(2))
     for before, after in ((worn.previous_surfaces, worn.previous), (worn.current_surfaces, worn.current)):
         there, left = (images[:, :3].square().sum(1) > 0.0 for images in (before, after))
@@ -312,7 +306,7 @@ def test_a_sector_goes_in_one_piece(recording):
 
 def test_noise_is_along_the_rays_and_of_the_size_asked_for(recording):
     pair = pair_of(recording, 0, 1, surfaces=False)
-    several = PairBatch(*(None if v is None else torch.cat([v] * 40) for v in vars(pair).values()))
+    several = stack([pair] * 40)
     quiet, noisy = (
         augmented(several, only(range_noise_m=sigma), torch.Generator().manual_seed(5)) for sigma in (0.0, 0.05)
     )

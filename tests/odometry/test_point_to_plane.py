@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.odometry.alignment.correspondences import Motion
-from lidarslam.odometry.alignment.point_to_plane import FINE_M, PointToPlane
+from lidarslam.odometry.alignment.point_to_plane import FINE_M, PairMotion, PointToPlane
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.projection import ImageGrid
 
@@ -15,12 +14,12 @@ STEP, FILL, GATE_M, GATE_PER_M, LEAST_COSINE = 2, 4, 0.2, 0.04, 0.8
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)
 
 
-def motion(seed: int) -> Motion:
+def motion(seed: int) -> PairMotion:
     """Not quite the sweeps' own, and bent."""
     rng = np.random.default_rng(seed)
     velocity = np.array(TWIST) + rng.normal(0.0, 0.1, 6)
     change = rng.normal(0.0, 0.2, 6)
-    return Motion(exp(0.1 * velocity), velocity - change, velocity + change)
+    return PairMotion(exp(0.1 * velocity), velocity - change, velocity + change)
 
 
 def noisy_pair(scene, rolling: bool) -> SweepPair:
@@ -67,7 +66,7 @@ class SlowSums:
         i = min(max(whole, 0), self.grid.rows - 1)
         return (i, int(self.source[i, int(column)])), 0 <= whole < self.grid.rows
 
-    def pairs(self, motion: Motion, scale_m: float):
+    def pairs(self, motion: PairMotion, scale_m: float):
         """Jacobian (12,), residual, turned normal, and whether the point is in view and kept, of each point."""
         T, early, late = motion
         for p, n, t in self.points:
@@ -146,5 +145,5 @@ def test_an_image_without_points_says_nothing(box_room):
 def test_a_motion_that_is_none_holds_nothing(box_room):
     """NaN, as of equations without a solution, must not lead out of the image."""
     sums = PointToPlane(noisy_pair(box_room, True), STEP)
-    H, _ = sums.normal_equations(Motion(np.full((4, 4), np.nan), np.zeros(6), np.zeros(6)), 0.5)
+    H, _ = sums.normal_equations(PairMotion(np.full((4, 4), np.nan), np.zeros(6), np.zeros(6)), 0.5)
     assert not H.any()

@@ -8,7 +8,7 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import OdometryConfig
-from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
+from lidarslam.odometry.interface import ConstantVelocity
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidarslam.odometry.images import projection
 from lidarslam.odometry.images.projection import ImageGrid
-from lidarslam.odometry.training.torch_images import mirror, rotate_columns
+from lidarslam.odometry.training.pairs import mirror, rotate_columns
 
 GRID = ImageGrid(16, 90, math.radians(-15.0), math.radians(15.0))
 

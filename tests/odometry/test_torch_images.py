@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lidarslam.core.geometry import exp
 from lidarslam.odometry.network.torch_geometry import transform_points
-from lidarslam.odometry.training.torch_images import compensated
+from lidarslam.odometry.training.pairs import compensated
 
 SLOW = (0.05, -0.05, 0.1, 1.0, 0.3, 0.1)
 TURNING = (0.0, 0.0, math.radians(120.0), 1.0, 0.3, 0.0)

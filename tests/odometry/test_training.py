@@ -8,14 +8,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lidarslam.odometry.network.correlation import CorrelationNetwork
-from lidarslam.odometry.network.pair_network import Estimate, PairImages
+from lidarslam.odometry.network.networks import CorrelationNetwork, PairEstimate, PairImages
 from lidarslam.odometry.network.torch_geometry import skew
-from lidarslam.odometry.training.augmentation import PairBatch
 from lidarslam.odometry.training.config import TrainingConfig
-from lidarslam.odometry.training.pairs import birds, pair_of
+from lidarslam.odometry.training.losses import objective
+from lidarslam.odometry.training.pairs import PairBatch, birds, pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.training import learning_rate, loss_of, make_optimizer, summarise, validate
+from lidarslam.odometry.training.training import learning_rate, make_optimizer, summarise, validate
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 SCHEDULE = TrainingConfig(learning_rate=1e-3, warmup_steps=10, steps=110)
@@ -58,7 +57,7 @@ def test_a_few_steps_bring_the_loss_down(small_room):
     generator = torch.Generator().manual_seed(0)
     turns, shifts = [], []
     for _ in range(15):
-        loss = loss_of(network, pair, config, generator)
+        loss = objective(network(pair), pair, config, generator)
         optimizer.zero_grad()
         loss.total.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -92,13 +91,13 @@ class Stub(nn.Module):
         super().__init__()
         self.errors, self.log_sigma = errors, log_sigma
 
-    def forward(self, pairs: PairImages) -> Estimate:
+    def forward(self, pairs: PairImages) -> PairEstimate:
         assert pairs.previous.dtype == torch.float32  # recordings may keep halves
         previous, current = (images[:, 0, 0, 0] for images in (pairs.previous, pairs.current))
         truth = exp(0.1 * (current - previous)[:, None] * torch.tensor([TWIST]))
         T = exp(self.errors[previous.long()]) @ truth
         none = torch.zeros(len(T), 0)
-        return Estimate(T, torch.full((len(T), 6), self.log_sigma), none, none[..., None])
+        return PairEstimate(T, torch.full((len(T), 6), self.log_sigma), none, none[..., None])
 
 
 def numbered(count: int, small_room) -> PreparedRecording:

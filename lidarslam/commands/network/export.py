@@ -17,7 +17,7 @@ def export(weights: Path | None, out: Path | None) -> None:
     `lidarslam run --weights DIR` starts faster with the folder than with the weights file, as it does not import torch.
     docs/odometry.md lists inputs and outputs of the graphs.
     """
-    from lidarslam.odometry.train_extra import require_train_extra
+    from lidarslam.odometry.network.shipped import require_train_extra
 
     require_train_extra("an export")
     from lidarslam.odometry.network.checkpoint import load_checkpoint

@@ -58,7 +58,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun;
     --jobs and --ray are for the preparation of recordings.
     """
-    from lidarslam.odometry.train_extra import require_train_extra
+    from lidarslam.odometry.network.shipped import require_train_extra
     from lidarslam.storage.default_places import source_name
 
     if out is None:
