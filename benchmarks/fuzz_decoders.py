@@ -24,7 +24,7 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.config.settings import load_config
     from lidarslam.core.errors import LidarSlamError
     from lidarslam.core.scan import Scan
-    from lidarslam.core.text.trajectory_io import read_tum
+    from lidarslam.core.trajectory import read_tum
     from lidarslam.datasets.config import ReaderConfig
     from lidarslam.datasets.faults import Faults
     from lidarslam.datasets.registry import open_recording

@@ -25,7 +25,7 @@ from typing import Any
 from lidarslam.compare.comparison import Narrator, compare
 from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
-from lidarslam.core.tasks.tasks import Where
+from lidarslam.core.tasks import Where
 from lidarslam.simulation.record import RecordRequest, record
 
 WORLDS = ("office", "street", "hall", "tunnel")

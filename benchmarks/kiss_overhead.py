@@ -71,7 +71,7 @@ def run_kiss(source: Path) -> dict[str, Any]:
 def run_ours(source: Path) -> dict[str, Any]:
     """Our run on the recording."""
     from lidarslam.config.settings import load_config
-    from lidarslam.core.text.trajectory_io import read_tum
+    from lidarslam.core.trajectory import read_tum
     from lidarslam.run.request import RunRequest
     from lidarslam.run.run import execute
 

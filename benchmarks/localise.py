@@ -28,9 +28,9 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser

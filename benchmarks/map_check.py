@@ -15,8 +15,7 @@ import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.run.summary import RunSummary

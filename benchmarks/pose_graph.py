@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
-from lidarslam.core.pose_text import read_kitti_poses
-from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.correction import corrected

@@ -36,8 +36,7 @@ from peers import run_peer
 from lidarslam.cli import main as lidarslam
 from lidarslam.compare.peers.interface import PeerError
 from lidarslam.compare.peers.registry import PEERS
-from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.association import associate

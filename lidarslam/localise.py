@@ -10,9 +10,9 @@ import numpy as np
 
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, scan_span
-from lidarslam.core.text.trajectory_io import format_tum
+from lidarslam.core.text import as_typed, command_line, count, joined, scan_span
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import format_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap

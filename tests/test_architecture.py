@@ -42,8 +42,8 @@ CORE_MAY_IMPORT = {"numpy", "scipy", "typing_extensions", *sys.stdlib_module_nam
 # What odometry and mapping both need of a foreign library, and share through the core.
 CORE_EXCEPTIONS = {
     "lidarslam.core.compiled": {"numba"},
-    "lidarslam.core.tasks.on_ray": {"ray"},
-    "lidarslam.core.text.json_text": {"pydantic"},
+    "lidarslam.core.tasks": {"ray"},
+    "lidarslam.core.json_text": {"pydantic"},
 }
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
@@ -75,7 +75,7 @@ CONFINED = {
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
     "fsspec": ("lidarslam.datasets.published.fetched",),
     "pyproj": ("lidarslam.exports.projection",),
-    "ray": ("lidarslam.core.tasks.on_ray",),
+    "ray": ("lidarslam.core.tasks",),
     "rosbags": (
         "lidarslam.datasets.*",
         "lidarslam.simulation.bag_writer",

@@ -17,8 +17,7 @@ from lidarslam.commands.run import run
 from lidarslam.commands.shared.options import take_config
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.config import MappingName
 from lidarslam.merge.writing import MergedRecording, MergeOutcome, MergeSummary
 from lidarslam.odometry.config import ImageConfig, NetworkConfig

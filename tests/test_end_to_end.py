@@ -15,11 +15,9 @@ import pytest
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
-from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses, read_tum, write_tum
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.threads import in_order
 from lidarslam.run.request import RunRequest

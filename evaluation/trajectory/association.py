@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory
 
 # Interpolation over half a second at constant velocity errs by a * 0.5^2 / 8 at most, 6 cm when braking at 2 m/s^2.

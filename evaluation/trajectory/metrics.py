@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.plugins import PlugPoint, usable
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, align_poses
 from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate

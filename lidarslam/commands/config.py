@@ -7,7 +7,7 @@ import click
 
 from lidarslam.commands.shared.options import CommandWithExample, config_options
 from lidarslam.commands.shared.terminal import say
-from lidarslam.core.text.plain_text import printable
+from lidarslam.core.text import printable
 
 
 @click.command(

@@ -13,7 +13,7 @@ from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import require_no_link
-from lidarslam.core.tasks.start import open_tasks
+from lidarslam.core.tasks import open_tasks
 from lidarslam.datasets.published.evalio_names import located
 from lidarslam.datasets.published.fetched import fetched, is_url
 from lidarslam.evaluation.comparison.mean_table import TablePlan

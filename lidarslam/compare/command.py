@@ -13,8 +13,8 @@ from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import reader_settings
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.tasks.tasks import SERIAL, Where
-from lidarslam.core.text.plain_text import command_line
+from lidarslam.core.tasks import SERIAL, Where
+from lidarslam.core.text import command_line
 from lidarslam.evaluation.comparison.gates import Gate, format_gates, judge_comparison, require_methods
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.progress import show_count

@@ -14,7 +14,7 @@ from lidarslam.compare.side_by_side import run_side_by_side
 from lidarslam.compare.text import format_result
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.mean_table import mean_table
 from lidarslam.run.machine import machine, versions

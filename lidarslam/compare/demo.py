@@ -15,7 +15,7 @@ from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.core.text.plain_text import as_typed, command_line
+from lidarslam.core.text import as_typed, command_line
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.record import RecordRequest, record
 from lidarslam.storage.comparison_folder import REPORT_HTML

@@ -10,8 +10,7 @@ from lidarslam.compare.assessment.reference_map import ReferenceMap, find_refere
 from lidarslam.compare.peers.scene import scene_note
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 

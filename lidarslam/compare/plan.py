@@ -11,7 +11,7 @@ from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import require_no_link
-from lidarslam.core.text.names import safe_name
+from lidarslam.core.text import safe_name
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.comparison.comparison import MissingRecording

@@ -8,8 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lidarslam.compare.methods.names import Method
 from lidarslam.compare.supervised import Limits
-from lidarslam.core.tasks.tasks import SERIAL, Where
-from lidarslam.core.text.names import require_name
+from lidarslam.core.tasks import SERIAL, Where
+from lidarslam.core.text import require_name
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 from lidarslam.storage.comparison_folder import RESERVED
 

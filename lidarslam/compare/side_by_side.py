@@ -11,8 +11,7 @@ from pathlib import Path
 from lidarslam.compare.methods.process import MethodRun
 from lidarslam.compare.methods.run import COMMAND, PROCESS, clear, run_method
 from lidarslam.compare.supervised import Limits
-from lidarslam.core.tasks.start import open_tasks
-from lidarslam.core.tasks.tasks import Where
+from lidarslam.core.tasks import Where, open_tasks
 from lidarslam.datasets.published.fetched import fetch, url_of
 from lidarslam.evaluation.comparison.comparison import MethodResult
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.text.plain_text import as_typed, command_line, joined
+from lidarslam.core.text import as_typed, command_line, joined
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text

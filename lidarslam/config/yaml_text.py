@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from lidarslam.config.bounds import bounds_text
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 
 # A configuration has a few kilobytes.
 _LONGEST_BYTES = 4 << 20

@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

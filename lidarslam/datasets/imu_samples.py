@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.recording import ImuSummary
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g

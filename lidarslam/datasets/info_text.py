@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.plain_text import count, one_line
+from lidarslam.core.text import count, one_line
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at

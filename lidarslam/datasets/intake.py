@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting.recording import recorded_axes

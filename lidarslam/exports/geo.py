@@ -12,8 +12,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.exports.gnss import read_gnss
 from lidarslam.exports.new_file import require_new
 from lidarslam.exports.projection import Utm, utm_around

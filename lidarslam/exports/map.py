@@ -10,8 +10,8 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import make_directory, replacing
 from lidarslam.core.geometry import FloatArray, make_transform, transform_points
-from lidarslam.core.pose_text import read_transform
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
+from lidarslam.core.trajectory import read_transform
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.exports.gravity import upwards
 from lidarslam.exports.redrawn import redrawn

@@ -11,9 +11,8 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import choose_scans, take_in
 from lidarslam.datasets.registry import open_recording

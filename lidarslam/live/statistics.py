@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 
 # A stamp farther from this machine's clock is the reading of another one.
 _SAME_CLOCK_S = 60.0

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.tasks.start import open_tasks
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.tasks import open_tasks
+from lidarslam.core.text import count
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.published.fetched import url_of

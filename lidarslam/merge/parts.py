@@ -13,8 +13,8 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
 from lidarslam.core.state import Saved, decode, encode
-from lidarslam.core.tasks.tasks import SERIAL, Where
-from lidarslam.core.text.names import safe_name
+from lidarslam.core.tasks import SERIAL, Where
+from lidarslam.core.text import safe_name
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.published.fetched import fetch

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.core.state import Saved
-from lidarslam.core.text.plain_text import count, joined
+from lidarslam.core.text import count, joined
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.moved_points import PlacedViews

@@ -15,7 +15,7 @@ from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
 
 if TYPE_CHECKING:  # what a bar does not need takes a while to load

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.config.settings import Config
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.loops.given import GivenLoops

@@ -9,9 +9,8 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import cannot_write, make_own_folder
 from lidarslam.core.geometry import inverse
-from lidarslam.core.pose_text import format_kitti
-from lidarslam.core.text.plain_text import count
-from lidarslam.core.text.trajectory_io import format_tum
+from lidarslam.core.text import count
+from lidarslam.core.trajectory import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config, ViewerConfig
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording

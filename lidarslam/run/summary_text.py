@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, scan_span, small_length
+from lidarslam.core.text import as_typed, command_line, count, joined, scan_span, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.run.results import RunOutcome

@@ -13,7 +13,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in

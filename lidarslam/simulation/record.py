@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
-from lidarslam.core.pose_text import read_kitti_poses
-from lidarslam.core.tasks.start import open_tasks
-from lidarslam.core.tasks.tasks import SERIAL, Where
-from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, small_length
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.tasks import SERIAL, Where, open_tasks
+from lidarslam.core.text import as_typed, command_line, count, joined, small_length
+from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum, write_tum
 from lidarslam.simulation.formats import FORMATS, find_format
 from lidarslam.simulation.mesh import world_mesh
 from lidarslam.simulation.motion import Carrier, Motion, find_carrier, motion_along, mount_pose

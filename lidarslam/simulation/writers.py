@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.pose_text import format_kitti
 from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.imu_samples import COLUMNS, EXTRINSIC, IMU_FILE
 from lidarslam.datasets.mounting.rotation import KITTI_DEG, correct_elevation
 from lidarslam.simulation.recorder import SimulatedScan

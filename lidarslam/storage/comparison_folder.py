@@ -6,8 +6,8 @@ from pydantic import TypeAdapter
 from typing_extensions import TypedDict
 
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.text.json_text import read_json
-from lidarslam.core.text.names import require_name
+from lidarslam.core.json_text import read_json
+from lidarslam.core.text import require_name
 from lidarslam.storage.directory import TRAJECTORY_TUM
 
 # Each recording's folder holds its own comparison.json, where there are several.

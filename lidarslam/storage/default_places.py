@@ -6,7 +6,7 @@ from itertools import count
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.names import safe_name
+from lidarslam.core.text import safe_name
 from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio, resolved
 from lidarslam.datasets.registry import takes_sequence
 from lidarslam.storage.directory import TRAJECTORY_TUM

@@ -14,11 +14,10 @@ from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.json_text import read_json
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.text.json_text import read_json
-from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.formats import read_pcd, read_ply
 from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
 from lidarslam.datasets.published.unrecognised import absent

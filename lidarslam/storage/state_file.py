@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import ONE_READER, cannot_write, replacing
+from lidarslam.core.json_text import ANY_OBJECT, parse_json
 from lidarslam.core.state import Saved, State
-from lidarslam.core.text.json_text import ANY_OBJECT, parse_json
 
 # An .npz file holds a checksum of each of its members, and is refused without its end. They are not compressed: the
 # size of the file bounds what it takes to read it.

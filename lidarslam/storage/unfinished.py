@@ -14,8 +14,8 @@ from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
+from lidarslam.core.json_text import read_json
 from lidarslam.core.state import Saved
-from lidarslam.core.text.json_text import read_json
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
 

@@ -19,8 +19,7 @@ import torch
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan, ScanSequence
-from lidarslam.core.tasks.start import open_tasks
-from lidarslam.core.tasks.tasks import Where
+from lidarslam.core.tasks import Where, open_tasks
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording

@@ -11,7 +11,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import make_own_folder, open_own, replacing
-from lidarslam.core.text.plain_text import as_typed, count
+from lidarslam.core.text import as_typed, count
 from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
 

@@ -16,7 +16,7 @@ from lidarslam.config.settings import SOURCES_SECTION, reader_settings
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer, remove_partial_files, require_no_link
-from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights

@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, replacing
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.rerun_program import GRPC_PORT, open_window, require_window
 from lidarslam.viewer.rerun_recording import (

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.picture import height_colours

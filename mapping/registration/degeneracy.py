@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lidarslam.core.directions.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.tracking import Degeneracy, lever_scale
 
 # Least mean constraint of a direction. Noisy normals of a corridor's walls constrain it as well: the share that their
 # uncertainty explains does not count.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lidarslam.core.directions.degeneracy import lever_scale
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.surfaces import Surfaces
 

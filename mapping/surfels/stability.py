@@ -8,8 +8,8 @@ eigenvector of the information matrix; here by their statistical leverage, which
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.directions.degeneracy import lever_scale
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.registration.surfaces import Surfaces
 from lidarslam.mapping.surfels.cell_kernels import write_views
 from lidarslam.mapping.surfels.correspondence_kernels import match_planes

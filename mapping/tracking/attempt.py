@@ -6,9 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, log
-from lidarslam.core.tracking import Status
+from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.registration.local_map import LocalMap

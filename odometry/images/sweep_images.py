@@ -6,9 +6,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.directions.spin_axis import image_axes
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals

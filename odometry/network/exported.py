@@ -8,7 +8,7 @@ import onnxruntime
 from pydantic import ValidationError
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.json_text import ANY_OBJECT, read_json
+from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.images.projection import Floats
 from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Search, WholePairs

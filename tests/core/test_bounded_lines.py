@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.core import bounded_lines as module
-from lidarslam.core.bounded_lines import bounded_lines
+from lidarslam.core import files as module
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import bounded_lines
 
 
 def test_lines_have_no_ends_and_no_mark(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from lidarslam.core.text import json_text
-from lidarslam.core.text.json_text import ANY_OBJECT, parse_json, read_json
+from lidarslam.core import json_text
+from lidarslam.core.json_text import ANY_OBJECT, parse_json, read_json
 
 REFUSED = {
     "deep": ("[" * 100_000, "nested too deeply"),

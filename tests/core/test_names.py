@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.text.names import require_name, safe_name, stays_below
+from lidarslam.core.text import require_name, safe_name, stays_below
 
 UNSAFE = ["", " ", ".", "..", "...", ".hidden", "/abs/path", "../../x", "a/b", "a\\b", "a\0b", "a\nb", "\x1b[2J",
           "\ud800", "\u202eabc", "x" * 121, "\u00e4" * 61]  # fmt: skip

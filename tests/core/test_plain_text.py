@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarslam.core.text.plain_text import command_line, joined, one_line, printable
+from lidarslam.core.text import command_line, joined, one_line, printable
 
 
 @pytest.mark.parametrize(

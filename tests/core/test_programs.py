@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.core.text.plain_text import as_typed
+from lidarslam.core.text import as_typed
 
 
 @pytest.fixture

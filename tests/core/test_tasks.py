@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.tasks.start import open_tasks
-from lidarslam.core.tasks.tasks import InOrder, Tasks, Where
+from lidarslam.core.tasks import InOrder, Tasks, Where, open_tasks
 
 # What tasks run is imported by their processes: functions of the standard library and of this program.
 SQUARES = [0.0, 1.0, 4.0, 9.0, 16.0]
@@ -112,7 +111,7 @@ def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks: Tasks, t
 
 def test_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "lidarslam.core.tasks.on_ray", raising=False)
+    monkeypatch.delitem(sys.modules, "lidarslam.core.tasks", raising=False)
     with pytest.raises(ConfigError, match=r"ray is not installed.* pip install 'lidarslam\[ray\]'"):
         open_tasks(Where(2))
     with open_tasks(Where(1)) as serial:
@@ -141,7 +140,7 @@ def test_a_ray_that_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_one_job_does_not_load_ray() -> None:
-    code = "from lidarslam.core.tasks.start import *; from lidarslam.core.tasks.tasks import *; import sys\n"
+    code = "from lidarslam.core.tasks import *; from lidarslam.core.tasks import *; import sys\n"
     code += "with open_tasks(Where()) as tasks: print(list(tasks.run(abs, [-1])), 'ray' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[1]", "False"]

@@ -7,9 +7,15 @@ import pytest
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
-from lidarslam.core.pose_text import format_kitti, parse_numbers, read_kitti_poses
-from lidarslam.core.text.trajectory_io import format_tum, read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import (
+    Trajectory,
+    format_kitti,
+    format_tum,
+    parse_numbers,
+    read_kitti_poses,
+    read_tum,
+    write_tum,
+)
 
 # A quarter turn to the left about z; x looks along y.
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]])

@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
-from lidarslam.core.pose_text import format_kitti
+from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.odometry import KittiOdometryRecording
 from lidarslam.datasets.mounting.recording import MountedRecording

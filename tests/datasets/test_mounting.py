@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidarslam.core.directions.spin_axis import image_axes
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.spin_axis import image_axes
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import Mounting, ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting.guess import UPRIGHT, guess_mounting

@@ -9,8 +9,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.formats import read_pcd, read_ply
 from lidarslam.datasets.info_text import describe_source

@@ -8,8 +8,7 @@ import pytest
 from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.core.trajectory import Trajectory, chain, write_tum
 
 pytest.importorskip("evo")
 

@@ -8,8 +8,7 @@ import pytest
 from kiss_icp.metrics import absolute_trajectory_error, sequence_error
 
 from lidarslam.core.geometry import exp
-from lidarslam.core.pose_text import read_kitti_poses
-from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 ELSEWHERE = exp([0.3, -0.2, 2.0, 100.0, -40.0, 5.0])

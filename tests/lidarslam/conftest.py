@@ -13,8 +13,7 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 
 
 class Files(dict[str, Any]):

@@ -17,8 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from lidarslam.cli import main
-from lidarslam.core.pose_text import format_kitti
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import format_kitti, read_tum
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network

@@ -20,7 +20,7 @@ from lidarslam.cli import main
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud

@@ -23,8 +23,7 @@ from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 
 METRICS = {"association", "trajectory", "kitti", "segments", "map"}
 

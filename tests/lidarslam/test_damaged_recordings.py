@@ -19,9 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import is_rigid
-from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import read_kitti_poses, read_tum
 from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.storage.directory import UNFINISHED
 from lidarslam.storage.unfinished import About

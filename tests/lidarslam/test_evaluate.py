@@ -15,9 +15,7 @@ from lidarslam.compare.assessment.text import format_evaluation
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
-from lidarslam.core.pose_text import format_kitti, read_transform
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform, write_tum
 from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud

@@ -15,8 +15,7 @@ from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
 from lidarslam.exports.ros_messages import RosMessages, nanoseconds

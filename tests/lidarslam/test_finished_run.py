@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.storage.finished_run import load_map, load_run

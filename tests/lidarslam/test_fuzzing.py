@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.simulation.formats import FORMATS

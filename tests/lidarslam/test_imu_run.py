@@ -17,8 +17,7 @@ import lidarslam
 from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.run import interruption
 from lidarslam.run.interruption import Interruptions, ended_like_interrupted
 

@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, log, make_transform
-from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting.rotation import correct_elevation

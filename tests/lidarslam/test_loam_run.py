@@ -12,8 +12,7 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.mapping.loam.features import find_features
 
 SCANS = 8

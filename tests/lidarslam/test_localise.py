@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.finished_run import load_run
 
 Drive = Callable[[FloatArray], FloatArray]

@@ -13,8 +13,7 @@ from lidarslam.compare.methods.ending import judge
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
 
 

@@ -12,8 +12,7 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map import map_io
 from lidarslam.storage.directory import MAPS
 from lidarslam.storage.finished_run import load_map, load_run

@@ -20,9 +20,8 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.tasks.tasks import Where
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.tasks import Where
+from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeRequest
 from lidarslam.merge.writing import MergeOutcome, format_merge

@@ -16,7 +16,7 @@ import pytest
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.merge import parts as tracking
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeRequest

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam import Slam
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.core.text.trajectory_io import read_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route

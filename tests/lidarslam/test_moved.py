@@ -11,8 +11,7 @@ from click.testing import CliRunner
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry

@@ -20,7 +20,7 @@ from lidarslam.compare.methods.names import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
+from lidarslam.core.trajectory import read_tum, write_tum
 from lidarslam.datasets.registry import choose_reader
 
 GUIDE = Path(__file__).parents[2] / "CONTRIBUTING.md"

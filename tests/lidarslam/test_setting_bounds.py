@@ -17,8 +17,7 @@ from lidarslam.config.settings import Config, load_config
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.train.settings import TrainConfig
 

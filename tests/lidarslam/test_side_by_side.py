@@ -19,7 +19,7 @@ from lidarslam.cli import main
 from lidarslam.compare.comparison import CompareOutcome, Counter, Narrator, compare
 from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
-from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.tasks import SERIAL, Where
 
 pytest.importorskip("ray")
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.tracking import Degeneracy
 from lidarslam.mapping.registration.degeneracy import find_degeneracy
 
 Scene = tuple[FloatArray, FloatArray]

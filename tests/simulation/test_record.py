@@ -8,9 +8,7 @@ from scipy.spatial import cKDTree
 from lidarslam.cli import main
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import make_transform, transform_points
-from lidarslam.core.pose_text import format_kitti
-from lidarslam.core.text.trajectory_io import read_tum, write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, format_kitti, read_tum, write_tum
 from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.datasets.folders.point_table import coordinates
 from lidarslam.datasets.registry import open_recording

@@ -12,7 +12,7 @@ from textwrap import wrap
 from typing import Any
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.plain_text import count, one_line
+from lidarslam.core.text import count, one_line
 from lidarslam.datasets.published import evalio_names
 from lidarslam.datasets.published.catalogue import CATALOGUE, DataSet
 from lidarslam.datasets.registry import recognise

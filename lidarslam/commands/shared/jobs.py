@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from lidarslam.core.tasks.tasks import Where
+    from lidarslam.core.tasks import Where
 
 
 def jobs_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -29,7 +29,7 @@ def take_where(options: dict[str, Any]) -> "Where":
     Raises:
         UsageError: the options exclude each other.
     """
-    from lidarslam.core.tasks.tasks import Where
+    from lidarslam.core.tasks import Where
 
     jobs, cluster = options.pop("jobs"), options.pop("ray")
     if cluster is not None and jobs > 1:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lidarslam.core.text.plain_text import one_line, printable
+from lidarslam.core.text import one_line, printable
 
 if TYPE_CHECKING:
     from lidarslam.viewer.web_page import WebPage

@@ -11,9 +11,7 @@ from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.pose_text import read_kitti_poses
-from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.datasets.registry import is_recording, open_recording

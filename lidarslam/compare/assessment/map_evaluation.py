@@ -10,8 +10,7 @@ from lidarslam.compare.assessment.inputs import Estimate
 from lidarslam.compare.assessment.reference_map import ReferenceMap
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
-from lidarslam.core.pose_text import read_transform
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_transform
 from lidarslam.evaluation.comparison.comparison import MapErrors
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from lidarslam.compare.assessment.reference_cloud import read_cloud
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.trajectory_io import read_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.simulation.record import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 from lidarslam.compare.assessment.evaluate import Evaluation
 from lidarslam.compare.assessment.map_evaluation import MapEvaluation
-from lidarslam.core.text.plain_text import as_typed, command_line, joined
+from lidarslam.core.text import as_typed, command_line, joined
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics

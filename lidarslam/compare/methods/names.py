@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from lidarslam.compare.peers.registry import ALL_PEERS, PEERS, peer_named
 from lidarslam.compare.peers.scene import BY_SCENE
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.text.names import require_name
+from lidarslam.core.text import require_name
 from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import ODOMETRIES
 from lidarslam.storage.comparison_folder import RESERVED

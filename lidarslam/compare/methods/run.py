@@ -17,7 +17,7 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.files import remove_partial_files
-from lidarslam.core.text.json_text import read_json
+from lidarslam.core.json_text import read_json
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
 from lidarslam.run.request import describe_run

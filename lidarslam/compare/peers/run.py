@@ -8,7 +8,7 @@ from lidarslam.compare.peers.estimation import Estimate, estimate
 from lidarslam.compare.peers.registry import Peer
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import choose_scans, take_in
 from lidarslam.datasets.recording import Recording

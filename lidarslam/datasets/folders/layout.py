@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key
 from lidarslam.datasets.imu_samples import find_imu_file
 from lidarslam.datasets.times.stamps import mend_stamps, read_stamps, stamps_from_names

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
 
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.pose_text import read_kitti_poses
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.file_recording import FileRecording

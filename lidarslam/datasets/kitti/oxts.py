@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.core.pose_text import parse_numbers
+from lidarslam.core.trajectory import parse_numbers
 from lidarslam.datasets.folders.scan_files import numbered_scans
 
 _POLE_DEG = 90.0

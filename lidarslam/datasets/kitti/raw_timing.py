@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.directions.spin_axis import image_axes
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.config import Mounting
 from lidarslam.datasets.mounting.rotation import mounting_with_up, written

@@ -8,8 +8,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.pose_text import parse_numbers
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
 from lidarslam.datasets.published.poses import poses_wxyz

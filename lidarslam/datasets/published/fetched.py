@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.names import safe_name, stays_below
+from lidarslam.core.text import safe_name, stays_below
 
 logger = logging.getLogger(__name__)
 

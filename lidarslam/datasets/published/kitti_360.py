@@ -12,9 +12,8 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform, orthonormalize
-from lidarslam.core.pose_text import parse_numbers
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.file_recording import FileRecording

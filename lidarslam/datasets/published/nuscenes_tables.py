@@ -16,8 +16,8 @@ from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.text.json_text import parse_json, read_json
-from lidarslam.core.text.names import stays_below
+from lidarslam.core.json_text import parse_json, read_json
+from lidarslam.core.text import stays_below
 from lidarslam.datasets.published.poses import poses_wxyz
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')

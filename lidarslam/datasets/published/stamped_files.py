@@ -6,8 +6,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.pose_text import parse_numbers
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
 
 

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.published import evalio_names
 
 ReaderOf = Callable[[Path], str | None]

@@ -11,8 +11,8 @@ from typing import Any
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
-from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import bounded_lines
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.bag_recovery import MCAP_MAGIC, Connections, recover, require_tables

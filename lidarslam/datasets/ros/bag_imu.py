@@ -12,7 +12,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text import count
 from lidarslam.datasets.imu_samples import summarise, usable_samples
 from lidarslam.datasets.recording import ImuSummary, Topic
 from lidarslam.datasets.ros.bag_file import BagFile

@@ -10,8 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidarslam.core.bounded_lines import bounded_lines
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults

@@ -7,7 +7,7 @@ import yaml
 from pydantic import ValidationError
 
 from lidarslam.config.settings import Config
-from lidarslam.core.text.plain_text import count, scan_span, small_length
+from lidarslam.core.text import count, scan_span, small_length
 from lidarslam.storage.directory import MAP_TILES, RUN_SECTION, SCANS_CSV
 
 # Stretches of lost scans that are listed; scans.csv has them all.

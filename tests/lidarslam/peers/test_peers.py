@@ -19,8 +19,7 @@ from lidarslam.compare.peers.scene import scene_range_m
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.text.trajectory_io import write_tum
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 SWEEP_S = 0.1

@@ -1,4 +1,7 @@
-"""Tasks side by side as tasks of Ray: on this machine, or on a cluster; the only file that knows ray."""
+"""Independent tasks, one after another in this process, or side by side as tasks of Ray; the only file that knows ray.
+
+Ray takes a while to load, and is loaded only where it is used.
+"""
 
 import contextlib
 import logging
@@ -8,18 +11,14 @@ import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, TypeVar
-
-import ray
-from ray import exceptions
+from typing import Any, Protocol, TypeVar
 
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError, OutputError
-from lidarslam.core.tasks.tasks import OnDone, Tasks, Where
 
 T = TypeVar("T")
 R = TypeVar("R")
-
 # Of a task whose process or machine died.
 _RETRIES = 3
 # Results are small; what does not fit is written to disk.
@@ -27,14 +26,96 @@ _OBJECT_STORE_BYTES = 128 * 2**20
 _ANSWER_S = 5.0
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
+OnDone = Callable[[int, Any], None]
+"""Called with the index of a task and its result, in the order in which tasks end."""
+
+
+class Tasks(Protocol):
+    """Carries out independent tasks."""
+
+    @property
+    def slots(self) -> int:
+        """Number of tasks that are carried out at the same time."""
+
+    def run(
+        self, function: Callable[[T], R], items: Sequence[T], on_done: OnDone | None = None, ahead: int | None = None
+    ) -> Iterator[R]:
+        """The results of `function(item)` in the order of the items.
+
+        Args:
+            function, items: of a module that can be imported, and to be pickled; the same item always has the same
+                result, as a task whose process or machine died is carried out again.
+            on_done: called for each task; after Ctrl-C too, for tasks that come to a result nevertheless.
+            ahead: number of tasks begun before the result of the first of them is taken; None: all.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C; no task is at work any more.
+            LidarSlamError: a task raised it, or its process died repeatedly.
+        """
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where tasks are carried out."""
+
+    jobs: int = 1  # processes on this machine; 1: this process, one task after another
+    cluster: str | None = None  # address of a Ray cluster, whose CPUs are used instead
+
+    @property
+    def is_serial(self) -> bool:
+        """Whether tasks are carried out in this process."""
+        return self.jobs == 1 and self.cluster is None
+
+
+SERIAL = Where()
+
+
+class InOrder:
+    """One task after another in this process."""
+
+    slots = 1
+
+    def run(
+        self,
+        function: Callable[[T], R],
+        items: Sequence[T],
+        on_done: OnDone | None = None,
+        ahead: int | None = None,  # noqa: ARG002
+    ) -> Iterator[R]:
+        """As `Tasks.run`; each task is carried out when its result is asked for."""
+        for index, item in enumerate(items):
+            result = function(item)
+            if on_done is not None:
+                on_done(index, result)
+            yield result
+
+
+def open_tasks(where: Where) -> contextlib.AbstractContextManager[Tasks]:
+    """What carries out tasks there, for the time of the context.
+
+    Raises:
+        ConfigError: Ray is not installed, or no cluster has that address.
+    """
+    if where.is_serial:
+        return contextlib.nullcontext(InOrder())
+    try:
+        import ray  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"{error.name} is not installed, which --jobs and --ray need; pip install 'lidarslam[ray]'"
+        ) from error
+    return _ray_tasks(where)
+
 
 @contextlib.contextmanager
-def ray_tasks(where: Where) -> Iterator[Tasks]:
+def _ray_tasks(where: Where) -> Iterator[Tasks]:
     """A Ray of our own on this machine, which ends with the context, or the connection to a cluster.
 
     Raises:
         ConfigError: there is no such cluster, or Ray does not start.
     """
+    import ray
+
     logging.getLogger("ray").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_environment(where))
@@ -48,11 +129,13 @@ def ray_tasks(where: Where) -> Iterator[Tasks]:
         slots = int(ray.cluster_resources().get("CPU", 0))
         if not slots:
             raise ConfigError(f"--ray {where.cluster}: the cluster has no CPU; start nodes with ray start")
-        yield RayTasks(slots)
+        yield _RayTasks(slots)
 
 
 def _connect(where: Where, place: str) -> None:
     """To a cluster, or to a Ray of our own, which keeps its files in a folder."""
+    import ray
+
     quiet: dict[str, Any] = {"logging_level": logging.CRITICAL, "log_to_driver": False}
     if where.cluster is not None:
         _require_answer(where.cluster)
@@ -62,7 +145,7 @@ def _connect(where: Where, place: str) -> None:
     ray.init(address="local", num_cpus=where.jobs, **own, **quiet)
 
 
-class RayTasks:
+class _RayTasks:
     """The tasks of one connection."""
 
     def __init__(self, slots: int) -> None:
@@ -72,6 +155,8 @@ class RayTasks:
         self, function: Callable[[T], R], items: Sequence[T], on_done: OnDone | None = None, ahead: int | None = None
     ) -> Iterator[R]:
         """As `Tasks.run`."""
+        import ray
+
         remote: Any = ray.remote(num_cpus=1, max_retries=_RETRIES)(_carry_out)
         shared = ray.put((function, version("lidarslam")))
         running: dict[Any, int] = {}
@@ -94,13 +179,15 @@ class RayTasks:
 
 def _take(done: list[Any], running: dict[Any, int], results: dict[int, Any], on_done: OnDone | None) -> None:
     """Take the results of tasks that ended."""
+    import ray
+
     for reference in done:
         index = running.pop(reference)
         try:
             result = ray.get(reference)
-        except exceptions.RayTaskError as error:
+        except ray.exceptions.RayTaskError as error:
             raise _of_task(error) from None
-        except exceptions.RayError as error:
+        except ray.exceptions.RayError as error:
             name = type(error).__name__
             raise LidarSlamError(
                 f"a task came to no result in {_RETRIES + 1} attempts ({name}); see Ray's log"
@@ -114,6 +201,8 @@ def _take(done: list[Any], running: dict[Any, int], results: dict[int, Any], on_
 
 def _end(running: dict[Any, int], results: dict[int, Any], on_done: OnDone | None) -> None:
     """Interrupt all tasks as Ctrl-C would, and wait until they have ended; a second Ctrl-C ends that."""
+    import ray
+
     for reference in running:
         ray.cancel(reference, force=False)
     while running:

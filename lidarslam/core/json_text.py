@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from lidarslam.core.text.plain_text import one_line
+from lidarslam.core.text import one_line
 
 T = TypeVar("T")
 

@@ -1,1 +1,0 @@
-"""Text: trajectory files, and untrusted names on one line."""
