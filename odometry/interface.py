@@ -5,10 +5,10 @@ from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 
-from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Saved, Shape, State, Stateful
+from lidarslam.core.tracking import AXES
 
 
 @dataclass(frozen=True, eq=False)

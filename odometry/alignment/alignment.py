@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarslam.core.directions.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.tracking import Degeneracy, lever_scale
 from lidarslam.odometry.alignment.point_to_plane import FINE_M, InlierSums, PairMotion, PointToPlane
 from lidarslam.odometry.alignment.steps import take_step, write_velocities
 from lidarslam.odometry.alignment.sweep_motion import SweepPair

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import replacing
-from lidarslam.core.text.json_text import ANY_OBJECT, parse_json
+from lidarslam.core.json_text import ANY_OBJECT, parse_json
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.images.projection import Floats
 from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
