@@ -30,6 +30,7 @@ from mapping_accuracy import (
     Recorded,
     add_simulation_arguments,
     pipeline_results,
+    print_header,
     print_row,
     recordings,
     true_trajectory,
@@ -109,8 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.worlds = list(WORLDS)
     header = ["recording", "method", "of", "count", "left out", "median NEES/6"]
     header += [f"within {sigma} sigma, %" for sigma in SIGMAS]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     for recorded in recordings(options, options.scans):
         for method in options.methods:
             for cells in rows(recorded, method, options.all):

@@ -9,24 +9,13 @@ r"""Draw the exact map of every simulated world, as one lap of its route sees it
 import argparse
 from pathlib import Path
 
+from mapping_accuracy import in_world
+
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import reference_map
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, save_picture
-
-
-def simulate(name: str, seed: int, motion: str, sensor: str, scans: int | None) -> Simulation:
-    """A lap of a world's route, or its first scans."""
-    world = build_world(name, seed)
-    carried = motion_along_route(motion, world, seed)
-    device = find_sensor(sensor)
-    lap = int(carried.duration_s * device.rate_hz)
-    T_body_lidar = mount_pose("upright", carried.sensor_height_m)
-    return Simulation(world, device, carried, T_body_lidar, min(lap, scans or lap), seed)
 
 
 def draw_map(simulation: Simulation, path: Path, width: int) -> int:
@@ -52,7 +41,8 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.worlds:
         path = arguments.out / f"{name}.png"
-        simulation = simulate(name, arguments.seed, arguments.motion, arguments.sensor, arguments.scans)
+        world, seed = build_world(name, arguments.seed), arguments.seed
+        simulation = in_world(world, arguments.motion, arguments.sensor, arguments.scans, seed)
         points = draw_map(simulation, path, arguments.width)
         print(f"{path}: {points:,} points", flush=True)
 

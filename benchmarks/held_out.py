@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import METHODS, Recorded, pipeline_results, print_row, read, true_trajectory
+from mapping_accuracy import METHODS, Recorded, pipeline_results, print_header, print_row, read, true_trajectory
 from odometry_accuracy import estimated_motions, rms, shares_within_sigmas, squared_errors
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
@@ -68,8 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--mapped", action="store_true", help="the reference is the mapped trajectory, not the truth")
     options = parser.parse_args(arguments)
     columns = ("recording", "scans", "step, m", "method", "drift, %", "rotation, deg", "largest error, m", "lost")
-    print_row([*columns, "within 1, 2, 3 sigma, %"])
-    print_row(["---"] * (len(columns) + 1))
+    print_header([*columns, "within 1, 2, 3 sigma, %"])
     for source in options.sources:
         name, _, weights = source.partition("=")
         recorded = mapped(Path(name)) if options.mapped else with_truth(Path(name))

@@ -16,21 +16,17 @@ Every method runs in the pipeline of `lidarslam run` with its defaults; a graph 
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import BEYOND_TRUTH_S, make_simulation
+from mapping_accuracy import BEYOND_TRUTH_S, Recorded, make_simulation, print_header, print_row, read
 
 from lidarslam.config.settings import Config
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
-from lidarslam.core.imu import ImuSamples
-from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
@@ -39,7 +35,6 @@ from lidarslam.odometry.config import OdometryConfig, OdometryName
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.threads import in_order
 from lidarslam.run.loop_closing import begin_graph
 
 METHODS: dict[str, tuple[OdometryName, bool]] = {
@@ -52,16 +47,6 @@ METHODS: dict[str, tuple[OdometryName, bool]] = {
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A recording in memory, with the samples of its IMU."""
-
-    name: str
-    scans: Sequence[Scan]
-    truth: Trajectory
-    imu: ImuSamples
-
-
 def simulate(case: str, sensor: str, scans: int, seed: int) -> Recorded:
     """A recording straight from the simulator, of every STEP-th scan."""
     world, motion, *step = case.split("/")
@@ -71,25 +56,12 @@ def simulate(case: str, sensor: str, scans: int, seed: int) -> Recorded:
     return Recorded(name, list(simulation.scans(step=every)), simulation.ground_truth, simulation.imu)
 
 
-def read(source: Path, step: int) -> Recorded:
-    """A recording from disk.
-
-    Raises:
-        InputError: it cannot be read, or has no ground truth or no IMU.
-    """
-    recording = open_recording(source)
-    truth, imu = recording.ground_truth, recording.imu
-    if truth is None or imu is None or imu.T_lidar_imu is None:
-        raise InputError(f"{source}: needs ground truth, and an IMU that it is known how to mount")
-    name = recording.name + (f", every {step}th scan" if step > 1 else "")
-    return Recorded(name, list(in_order(recording.scans(step=step))), truth, imu)
-
-
 def estimate(recorded: Recorded, config: Config) -> tuple[Trajectory, list[Status]]:
     """The trajectory of a method, and the status of each scan."""
     inertial, scans = None, recorded.scans
     if config.odometry.uses_imu:
-        assert recorded.imu.T_lidar_imu is not None
+        assert recorded.imu is not None, f"{recorded.name}: has no IMU"
+        assert recorded.imu.T_lidar_imu is not None, f"{recorded.name}: it is not known how the IMU is mounted"
         inertial = Inertial(recorded.imu, recorded.imu.T_lidar_imu)
         scans = [inertial.gyroscope.evened(scan) for scan in scans]
     odometry, graph = make_odometry(config.odometry), begin_graph(config)
@@ -113,7 +85,7 @@ def vertical_error_deg(estimated: FloatArray, true: FloatArray) -> float:
     return float(np.rad2deg(np.sqrt((across**2).mean())))
 
 
-def row(recorded: Recorded, method: str, graph: bool) -> str:
+def row(recorded: Recorded, method: str, graph: bool) -> list[str]:
     """The cells of a recording and a method."""
     odometry, has_map = METHODS[method]
     config = Config(
@@ -130,7 +102,7 @@ def row(recorded: Recorded, method: str, graph: bool) -> str:
     turns = (inverse(trajectory.relative_motions()) @ true.relative_motions())[:, :3, :3]
     cosines = np.clip(0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0), -1.0, 1.0)
     turn = float(np.rad2deg(np.sqrt((np.arccos(cosines) ** 2).mean())))
-    cells = [
+    return [
         recorded.name,
         f"{errors.length_m:.0f}",
         method + ("+graph" if config.pose_graph.enabled else ""),
@@ -141,13 +113,14 @@ def row(recorded: Recorded, method: str, graph: bool) -> str:
         str(statuses.count(Status.LOST)),
         str(statuses.count(Status.DEGRADED)),
     ]
-    return f"| {' | '.join(cells)} |"
 
 
 def recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
     """All that were asked for."""
     for source in arguments.sources:
-        yield read(source, arguments.step)
+        recorded = read(source, arguments.step)
+        every = f", every {arguments.step}th scan" if arguments.step > 1 else ""
+        yield replace(recorded, name=recorded.name + every)
     for case in arguments.cases:
         for seed in arguments.seeds:
             yield simulate(case, arguments.sensor, arguments.scans, seed)
@@ -164,11 +137,11 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--graph", action="store_true", help="with the pose graph")
     arguments = parser.parse_args()
-    print("| Recording | Path, m | Method | ATE, m | Height, m | Roll, pitch, deg | Turn, deg | Lost | Degraded |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    columns = ["Recording", "Path, m", "Method", "ATE, m", "Height, m", "Roll, pitch, deg", "Turn, deg"]
+    print_header([*columns, "Lost", "Degraded"])
     for recorded in recordings(arguments):
         for method in arguments.methods:
-            print(row(recorded, method, arguments.graph), flush=True)
+            print_row(row(recorded, method, arguments.graph))
 
 
 if __name__ == "__main__":

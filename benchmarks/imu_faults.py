@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from mapping_accuracy import print_row
+from mapping_accuracy import print_header, print_row
 
 from lidarslam.cli import main as lidarslam
 from lidarslam.core.geometry import FloatArray
@@ -117,8 +117,7 @@ def main() -> None:
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
     parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of lidarslam run")
     arguments = parser.parse_args()
-    print_row(["recording", "fault", "ATE, m", "lost", "exit", "said"])
-    print_row(["---"] * 6)
+    print_header(["recording", "fault", "ATE, m", "lost", "exit", "said"])
     for source in arguments.sources:
         for fault in arguments.faults:
             print_row(row(source, fault, arguments.options))

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from mapping_accuracy import print_row
+from mapping_accuracy import print_header, print_row
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
@@ -41,8 +41,7 @@ def main() -> None:
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
     arguments = parser.parse_args()
-    print_row(["recording", "voxels", "Open3D, index", "Open3D, search", "ours, insert", "ours, search"])
-    print_row(["---"] * 6)
+    print_header(["recording", "voxels", "Open3D, index", "Open3D, search", "ours, insert", "ours, search"])
     for source in arguments.sources:
         recording = open_recording(source)
         print_row([recording.name, *_cells(list(in_order(recording.scans(0, arguments.scans))))])

@@ -18,7 +18,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import add_simulation_arguments, localise, print_row, recordings
+from mapping_accuracy import add_simulation_arguments, localise, print_header, print_row, recordings
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray
@@ -68,8 +68,7 @@ def main() -> None:
     add_simulation_arguments(parser, (), ("tracked",))
     arguments = parser.parse_args()
     odometry = OdometryConfig(method=arguments.odometry)
-    print_row(["recording", "scans", *_VARIANTS])
-    print_row(["---"] * (2 + len(_VARIANTS)))
+    print_header(["recording", "scans", *_VARIANTS])
     for recorded in recordings(arguments):
         cells = []
         for variant, mapping in _VARIANTS.values():

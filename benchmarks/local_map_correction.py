@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from imu import simulate
-from mapping_accuracy import BEYOND_TRUTH_S, print_row
+from mapping_accuracy import BEYOND_TRUTH_S, print_header, print_row
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -207,11 +207,10 @@ def main() -> None:
         mapping=MappingConfig(radius_m=options.radius_m),
         pose_graph=PoseGraphConfig(enabled=True),
     )
-    print_row([
+    print_header([
         "recording", "local map", "scans of later rounds", "apart, RMS / 95 %, m",
         "ATE as registered, m", "ATE in the end, m", "closures", "drawn", "drawing, ms", "exchange, ms",
     ])  # fmt: skip
-    print_row(["---"] * 10)
     for case in options.cases:
         recorded = simulate(case, options.sensor, options.scans, options.seed)
         measure(recorded.name, recorded.scans, recorded.truth, config)

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from mapping_accuracy import in_world, print_header, print_row
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
@@ -41,10 +42,7 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.storage.finished_run import load_map
 
@@ -56,13 +54,9 @@ _OTHER_SENSOR = {"vlp-16": "os1-64"}
 def simulate(world: str, seed: int, motion_seed: int, sensor: str, is_reversed: bool = False) -> Simulation:
     """A round of a world, from the simulator."""
     place = build_world(world, seed)
-    on_route = place
     if is_reversed:
-        on_route = replace(place, route=replace(place.route, waypoints=place.route.waypoints[::-1].copy()))
-    carried = motion_along_route(_MOTIONS.get(world, "handheld"), on_route, motion_seed)
-    model = find_sensor(sensor)
-    count = int(carried.duration_s * model.rate_hz)
-    return Simulation(place, model, carried, mount_pose("upright", carried.sensor_height_m), count, motion_seed)
+        place = replace(place, route=replace(place.route, waypoints=place.route.waypoints[::-1].copy()))
+    return in_world(place, _MOTIONS.get(world, "handheld"), sensor, None, motion_seed)
 
 
 def draw_map(simulation: Simulation, every: int) -> FixedMap:
@@ -153,11 +147,6 @@ def starts(count: int, scans: int, available: int) -> list[int]:
     return [int(first) for first in np.linspace(0, max(0, available - scans), count)]
 
 
-def print_row(cells: list[str]) -> None:
-    """A row of a Markdown table."""
-    print(f"| {' | '.join(cells)} |", flush=True)
-
-
 def of_worlds(arguments: argparse.Namespace, config: Config) -> None:
     """Rows of simulated worlds."""
     for world in arguments.worlds:
@@ -207,10 +196,9 @@ def main() -> None:
     parser.add_argument("--reasons", action="store_true", help="print why searches found no place")
     arguments = parser.parse_args()
     config = Config(odometry=OdometryConfig(method=arguments.odometry))
-    print_row(
+    print_header(
         ["map", "recording", "found", "scans", "error cm", "error deg", "wrong", "lost", "ms tracked", "ms search"]
     )
-    print_row(["---"] * 10)
     if arguments.run is not None:
         of_run(arguments, config)
     else:

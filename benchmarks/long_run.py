@@ -35,8 +35,8 @@ from typing import Any
 
 import numpy as np
 from long_run_peers import FedPeer, add_line, feed_peers
-from mapping_accuracy import make_simulation, print_row
-from mapping_memory import resident_mb
+from mapping_accuracy import make_simulation, print_header, print_row
+from memory import resident_mb
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import inverse
@@ -247,8 +247,7 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
         estimate = peer.result()
         if estimate is not None:
             found["methods"][peer.name] = errors(estimate, truth)
-    print_row(["method", "ATE, m", "drift, %", "drift, degrees in 100 m"])
-    print_row(["---"] * 4)
+    print_header(["method", "ATE, m", "drift, %", "drift, degrees in 100 m"])
     for name, measured in found["methods"].items():
         print_row([name, *("" if value is None else f"{value:.3f}" for value in measured.values())])
     return found
@@ -276,8 +275,7 @@ def main() -> None:
     simulator = context.Process(target=simulate, args=(options, sink), daemon=True)
     simulator.start()
     truth = source.recv()
-    print_row(list(Row.__dataclass_fields__))
-    print_row(["---"] * len(Row.__dataclass_fields__))
+    print_header(list(Row.__dataclass_fields__))
     peers = [FedPeer(context, name, options.every, options.out / f"{name}.jsonl") for name in options.peers]
     found = run(options, feed_peers(received(source, options.scans, options.out / "stop"), peers), truth)
     found = report(found, peers, truth)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mapping_memory import resident_mb
+from memory import resident_mb
 
 from lidarslam.compare.peers.estimation import estimate
 from lidarslam.compare.peers.interface import Poses, Sweep

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from mapping_accuracy import print_row
+from mapping_accuracy import in_world, print_header, print_row
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
@@ -37,10 +37,9 @@ from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.simulation.motion import CARRIERS, MOUNTS, mount_pose
+from lidarslam.simulation.motion import CARRIERS, MOUNTS
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import SENSORS, find_sensor
+from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS, Boxes, Route, World, build_world
 
 ROOMS = "rooms"
@@ -117,13 +116,9 @@ def build_rooms(seed: int) -> World:
 def simulate(world: str, motion: str, sensor: str, mount: str, seed: int, laps: float, every: int) -> Lap:
     """A recording straight from the simulator."""
     place = build_rooms(seed) if world == ROOMS else build_world(world, seed)
-    carried = motion_along_route(motion, place, seed)
-    T_body_lidar = mount_pose(mount, carried.sensor_height_m)
-    model = find_sensor(sensor)
-    count = int(laps * carried.duration_s * model.rate_hz)
-    simulation = Simulation(place, model, carried, T_body_lidar, count, seed)
+    simulation = in_world(place, motion, sensor, None, seed, mount=mount, laps=laps)
     truth = simulation.ground_truth
-    used = np.arange(0, count - 1, every)
+    used = np.arange(0, len(simulation) - 1, every)
     return Lap(f"{world}, {motion}", simulation, used, truth.T_world_lidar[used], truth.distances[used])
 
 
@@ -287,8 +282,7 @@ def main() -> None:
     header += ["by appearance", "false, accepted / kept"]
     header += ["off by, median / max", "degrees", "squared over covariance", "revisits found, %"]
     header += ["ms a keyframe, median / 95 % / mean"]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     notes: list[str] = []
     for lap in laps(arguments):
         estimates = drifting(lap.truth, lap.way_m, arguments.drift, arguments.seed)

@@ -17,8 +17,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from mapping_accuracy import print_row
-from mapping_memory import resident_mb
+from mapping_accuracy import print_header, print_row
+from memory import resident_mb
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.config import GlobalMapConfig
@@ -75,8 +75,7 @@ def main() -> None:
     most = None if arguments.most_points == "none" else int(arguments.most_points)
     config = GlobalMapConfig(voxel_size_m=0.2, most_points=most)
     header = ["scans", "memory, MB", "most, MB", "file, MB", "voxels in memory", "ms a scan"]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(dir=os.environ.get("TMPDIR"))))
         directory = stack.enter_context(RunDirectory.create(folder))

@@ -20,6 +20,7 @@ from mapping_accuracy import (
     Recorded,
     add_simulation_arguments,
     localise,
+    print_header,
     print_row,
     simulated_recordings,
     with_odometry,
@@ -72,8 +73,7 @@ def main() -> None:
         ates = " ".join(f"{outcome.ate_m:.3f}" for outcome in columns[-1])
         print(f"{recorded.name}: {ates}", file=sys.stderr, flush=True)
     header = ["variant", "odometry", *names, "mean", "ms a scan"]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     for label, outcomes in zip(_labels(), zip(*columns, strict=True), strict=True):
         print_row([label, *_cells(outcomes)])
 

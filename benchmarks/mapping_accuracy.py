@@ -26,6 +26,7 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
@@ -42,7 +43,7 @@ from lidarslam.simulation.motion import CARRIERS, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import SENSORS, find_sensor
-from lidarslam.simulation.world import WORLDS, build_world
+from lidarslam.simulation.world import WORLDS, World, build_world
 
 # How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
 BEYOND_TRUTH_S = 0.2
@@ -66,6 +67,7 @@ class Recorded:
     name: str
     scans: Sequence[Scan]
     truth: Trajectory
+    imu: ImuSamples | None = None
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,8 @@ class Outcome:
         return f"{self.ate_m:.3f} ({self.lost} lost, {self.degraded} degraded)"
 
 
-def read(source: Path) -> Recorded:
-    """A recording from disk.
+def read(source: Path, step: int = 1) -> Recorded:
+    """A recording from disk, every n-th scan of it.
 
     Raises:
         InputError: it cannot be read, or comes without ground truth.
@@ -93,7 +95,7 @@ def read(source: Path) -> Recorded:
     truth = recording.ground_truth
     if truth is None:
         raise InputError(f"{source}: has no ground truth to measure against")
-    return Recorded(recording.name, list(in_order(recording.scans())), truth)
+    return Recorded(recording.name, list(in_order(recording.scans(step=step))), truth, recording.imu)
 
 
 def simulate(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None) -> Recorded:
@@ -106,9 +108,17 @@ def make_simulation(
     world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None
 ) -> Simulation:
     """An upright sensor going round a world's route, at the motion's own speed or another."""
-    place = build_world(world, seed)
-    carried = motion_along_route(motion, place, seed, speed_mps)
-    return Simulation(place, find_sensor(sensor), carried, mount_pose("upright", carried.sensor_height_m), scans, seed)
+    return in_world(build_world(world, seed), motion, sensor, scans, seed, speed_mps)
+
+
+def in_world(
+    place: World, motion: str, sensor: str, scans: int | None, seed: int, speed_mps: float | None = None,
+    mount: str = "upright", laps: float = 1.0,
+) -> Simulation:  # fmt: skip
+    """The same in a world at hand; without a number of scans, so many laps."""
+    carried, model = motion_along_route(motion, place, seed, speed_mps), find_sensor(sensor)
+    scans = int(laps * carried.duration_s * model.rate_hz) if scans is None else scans
+    return Simulation(place, model, carried, mount_pose(mount, carried.sensor_height_m), scans, seed)
 
 
 def true_trajectory(recorded: Recorded) -> Trajectory:
@@ -215,8 +225,7 @@ def main() -> None:
     wrong = f"{arguments.wrong_deg:g} deg, {arguments.wrong_m:g} m a scan"
     header = ["recording", "scans", "path, m", "KISS-ICP", "KISS-ICP, best voxel", "ours, no odometry"]
     header += [f"odometry wrong by {wrong}", "ours with it", "ours, % of the path: without / with it"]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     for recorded in recordings(arguments):
         print_row(row(recorded, arguments.voxels, arguments.wrong_deg, arguments.wrong_m, arguments.seed))
 
@@ -251,6 +260,12 @@ def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterat
 def print_row(cells: Sequence[str]) -> None:
     """One row of a Markdown table."""
     print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def print_header(cells: Sequence[str]) -> None:
+    """The first row of a Markdown table, and the line below it."""
+    print_row(cells)
+    print_row(["---"] * len(cells))
 
 
 if __name__ == "__main__":

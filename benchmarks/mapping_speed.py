@@ -35,9 +35,10 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import make_simulation, print_header, print_row
 from threadpoolctl import threadpool_limits
 
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
@@ -60,31 +61,29 @@ _STAGES: dict[str, tuple[Any, str]] = {
 
 
 @dataclass
-class _Stopwatch:
-    """Wall and CPU seconds of each stage, without the stages that ran inside it."""
+class Stopwatch:
+    """Seconds of each stage without the stages that ran inside it: wall, of all threads, of the calling thread."""
 
-    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(lambda: [0.0, 0.0]))
-    _inside: list[list[float]] = field(default_factory=list)
+    seconds: dict[str, FloatArray] = field(default_factory=lambda: defaultdict(lambda: np.zeros(3)))
+    _inside: list[FloatArray] = field(default_factory=list)
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         """Count the time within for the stage."""
-        self._inside.append([0.0, 0.0])
-        wall, cpu = time.perf_counter(), time.process_time()
+        self._inside.append(np.zeros(3))
+        begun = _clocks()
         try:
             yield
         finally:
-            taken = (time.perf_counter() - wall, time.process_time() - cpu)
-            inside = self._inside.pop()
-            for kind in range(2):
-                self.seconds[stage][kind] += taken[kind] - inside[kind]
-                if self._inside:
-                    self._inside[-1][kind] += taken[kind]
+            taken = _clocks() - begun
+            self.seconds[stage] += taken - self._inside.pop()
+            if self._inside:
+                self._inside[-1] += taken
 
     def wrap(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function, timed."""
 
-        @functools.wraps(function)
+        @functools.wraps(function, updated=())
         def timed(*args: Any, **kwargs: Any) -> Any:
             with self.measure(stage):
                 return function(*args, **kwargs)
@@ -98,12 +97,16 @@ class _Stopwatch:
         return staticmethod(timed) if is_static else timed
 
 
+def _clocks() -> FloatArray:
+    return np.array([time.perf_counter(), time.process_time(), time.thread_time()])
+
+
 @dataclass(frozen=True, eq=False)
 class _Pass:
     """One method over all scans: milliseconds of each scan, wall and CPU (N, 2), in all and stage by stage."""
 
-    total_ms: np.ndarray[Any, np.dtype[np.float64]]
-    stage_ms: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = field(default_factory=dict)
+    total_ms: FloatArray
+    stage_ms: dict[str, FloatArray] = field(default_factory=dict)
     bad: int = 0
 
 
@@ -113,16 +116,14 @@ def run_ours(scans: Sequence[Scan], method: MappingName, warm_up: int) -> _Pass:
     watches, bad = [], 0
     with threadpool_limits(1, "blas"):
         for scan in scans:
-            watch = _Stopwatch()
+            watch = Stopwatch()
             with ExitStack() as stack:
                 for stage, (owner, name) in _STAGES.items():
                     stack.enter_context(patch.object(owner, name, watch.replacement(stage, owner, name)))
                 mapped = ours.process(scan, Prior())
             watches.append(watch.seconds)
             bad += mapped.status is not Status.OK
-    stage_ms = {
-        stage: 1e3 * np.array([seconds.get(stage, (0.0, 0.0)) for seconds in watches[warm_up:]]) for stage in _STAGES
-    }
+    stage_ms = {stage: 1e3 * np.array([seconds[stage][:2] for seconds in watches[warm_up:]]) for stage in _STAGES}
     return _Pass(np.sum(list(stage_ms.values()), axis=0), stage_ms, bad)
 
 
@@ -152,8 +153,9 @@ def compare(name: str, scans: Sequence[Scan], methods: Sequence[MappingName], ro
         kiss[label].append(run_kiss(scans, warm_up))
     points = np.median([len(scan) for scan in scans])
     print(f"\n{name}: {len(scans)} scans of {points:,.0f} points, {rounds} rounds; milliseconds a scan\n")
-    print_row(["", "wall median", "wall p95", "CPU median", "CPU p95", "Hz", "wall / KISS-ICP's", "CPU / KISS-ICP's"])
-    print_row(["---"] * 8)
+    print_header(
+        ["", "wall median", "wall p95", "CPU median", "CPU p95", "Hz", "wall / KISS-ICP's", "CPU / KISS-ICP's"]
+    )
     for label, passes in ours.items():
         beside = [_ratio(passes, kiss[label], kind) for kind in range(2)]
         print_row([label, *_times([one.total_ms for one in passes]), *beside])
@@ -165,8 +167,7 @@ def compare(name: str, scans: Sequence[Scan], methods: Sequence[MappingName], ro
 
 def _print_stages(label: str, passes: Sequence[_Pass]) -> None:
     print(f"\nStages, {label} ({passes[-1].bad} scans degraded or lost):\n")
-    print_row(["stage", "wall median", "wall p95", "CPU median", "CPU p95"])
-    print_row(["---"] * 5)
+    print_header(["stage", "wall median", "wall p95", "CPU median", "CPU p95"])
     for stage in _STAGES:
         print_row([stage, *_times([one.stage_ms[stage] for one in passes])[:4]])
 

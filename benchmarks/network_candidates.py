@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from held_out import mapped, with_truth
-from mapping_accuracy import Recorded, print_row, true_trajectory
+from mapping_accuracy import Recorded, print_header, print_row, true_trajectory
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.odometry.images.sweep_images import Imager
@@ -35,8 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     recorded = with_truth(options.source) if options.truth else mapped(options.source)
     columns = ("recording", "every", "weights", "turn, deg: median", "translation, m: median", "95 %", "largest")
-    print_row([*columns, "best right, %", "any right, %"])
-    print_row(["---"] * (len(columns) + 2))
+    print_header([*columns, "best right, %", "any right, %"])
     for step in options.steps:
         for weights in options.weights:
             found = _errors(recorded, step, options.scans, weights)

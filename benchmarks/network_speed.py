@@ -12,10 +12,8 @@ simulated, a car in a street.
 """
 
 import argparse
-import functools
 import itertools
 import time
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -25,6 +23,7 @@ from unittest.mock import patch
 
 import torch
 from mapping_accuracy import simulate
+from mapping_speed import Stopwatch
 
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
@@ -113,30 +112,6 @@ def _comparison(search: Search, before: Described, images: SweepImages) -> Calla
     return lambda: search.compare(before, images.points, images.normals)
 
 
-class _Stopwatch:
-    """Processor time of the calling thread in each stage, without the stages inside it."""
-
-    def __init__(self) -> None:
-        self.spent: defaultdict[str, float] = defaultdict(float)
-        self._inside: list[float] = [0.0]
-
-    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, whose time counts for the stage."""
-
-        @functools.wraps(function, updated=())
-        def call(*arguments: Any, **named: Any) -> Any:
-            self._inside.append(0.0)
-            begin = time.thread_time()
-            try:
-                return function(*arguments, **named)
-            finally:
-                whole = time.thread_time() - begin
-                self.spent[stage] += 1e3 * (whole - self._inside.pop())
-                self._inside[-1] += whole
-
-        return call
-
-
 def _print_stages(recordings: dict[str, list[Scan]], threads: int, rounds: int) -> None:
     found = {name: _stage_times(scans, threads, rounds) for name, scans in recordings.items()}
     print(f"\n| stage, ms | {' | '.join(recordings)} |\n| --- |{' ---: |' * len(recordings)}")
@@ -150,19 +125,19 @@ def _stage_times(scans: Sequence[Scan], threads: int, rounds: int) -> dict[str, 
     passes = []
     for _ in range(rounds):
         odometry = make_odometry(OdometryConfig(method="learned", learned=LearnedConfig(threads=threads)))
-        watch = _Stopwatch()
+        watch = Stopwatch()
         with ExitStack() as stack:
             for stage, places in _STAGES.items():
                 for owner, name in places:
-                    stack.enter_context(patch.object(owner, name, watch.timed(stage, getattr(owner, name))))
+                    stack.enter_context(patch.object(owner, name, watch.wrap(stage, getattr(owner, name))))
             search: Any = getattr(odometry, "_search")  # noqa: B009
-            graphs = {name: watch.timed(stage, getattr(search._parts, name)) for name, stage in _GRAPHS.items()}
+            graphs = {name: watch.wrap(stage, getattr(search._parts, name)) for name, stage in _GRAPHS.items()}
             search._parts = search._parts._replace(**graphs)
-            estimate, each = watch.timed("rest", odometry.estimate), []
+            estimate, each = watch.wrap("rest", odometry.estimate), []
             for scan in scans:
-                watch.spent.clear()
+                watch.seconds.clear()
                 estimate(scan)
-                each.append(dict(watch.spent))
+                each.append({stage: 1e3 * spent[2] for stage, spent in watch.seconds.items()})
         passes.append(each[_WARM_UP:])
     stages = {stage for each in passes for one in each for stage in one}
     return {

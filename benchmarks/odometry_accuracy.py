@@ -21,6 +21,7 @@ from mapping_accuracy import (
     Recorded,
     add_simulation_arguments,
     errors_of,
+    print_header,
     print_row,
     recordings,
     true_trajectory,
@@ -62,8 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--weights", type=Path, help="of the learned odometry, instead of the program's own")
     options = parser.parse_args(arguments)
     columns = ("recording", "step, m", "turn, deg", "method", "rotation, deg", "translation, cm", "% of the step")
-    print_row([*columns, "ATE, m", "failed", "covered, %", "CPU, ms a scan"])
-    print_row(["---"] * 12)
+    print_header([*columns, "ATE, m", "failed", "covered, %", "CPU, ms a scan"])
     methods = _methods(options.weights)
     for recorded in recordings(options):
         _print(recorded, methods)

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import make_simulation, print_header, print_row
 from numpy.typing import NDArray
 
 from lidarslam.compare.methods.names import parse_method
@@ -95,8 +95,9 @@ def _measure(name: str, scans: Sequence[Scan], source: Scans, options: argparse.
         rounds = [{method: run() for method, run in runs.items()} for _ in range(options.rounds)]
     points = int(np.mean([len(scan) for scan in scans]))
     print(f"\n{name}: {len(scans)} scans of {points:,} points, {options.rounds} rounds\n")
-    print_row(["method", "wall, ms a scan", "median", "p99", "CPU, ms a scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"])
-    print_row(["---"] * 7)
+    print_header(
+        ["method", "wall, ms a scan", "median", "p99", "CPU, ms a scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"]
+    )
     counted = len(scans) - options.warm_up
     for method in runs:
         taken = np.array([[times[method].wall, times[method].processor] for times in rounds])

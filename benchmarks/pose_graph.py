@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import print_row
+from mapping_accuracy import print_header, print_row
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -120,8 +120,7 @@ def close_kitti(folder: Path, step_m: float, seed: int, false_percents: Sequence
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     scene = Scene(poses, truth[scans], lengths[:, None, None] * covariance(DRIFT_DEG, DRIFT_M))
     pairs = revisits(scene.truth, scans, within_m=4.0, apart_s=30.0)
-    print_row(["loops", "false ones", "ATE before", "online", "optimised", "s", "true kept", "false kept"])
-    print_row(["---"] * 8)
+    print_header(["loops", "false ones", "ATE before", "online", "optimised", "s", "true kept", "false kept"])
     for percent in false_percents:
         rng = np.random.default_rng(seed)
         loops = true_loops(scene, pairs, rng)
@@ -216,8 +215,7 @@ def measure_time(keyframes: int, loops: int, seed: int) -> None:
         "online from that, m / deg": f"{np.linalg.norm(apart[:, :3, 3], axis=1).max():.1e}"
         f" / {np.rad2deg(rotation_angle(apart).max()):.1e}",
     }
-    print_row(list(cells))
-    print_row(["---"] * len(cells))
+    print_header(list(cells))
     print_row(list(cells.values()))
 
 

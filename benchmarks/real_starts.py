@@ -30,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from mapping_accuracy import print_row
+from mapping_accuracy import print_header, print_row
 from peers import run_peer
 
 from lidarslam.cli import main as lidarslam
@@ -210,8 +210,7 @@ def _total(counts: Sequence[int | None]) -> str:
 
 def print_starts(name: str, step: int, runs: dict[str, list[Judged]]) -> None:
     """A table with a row for each run."""
-    print_row(["recording", "step", "method", "start", "scans", "ATE, m", "length, %", "lost", "degraded", "exit"])
-    print_row(["---"] * 10)
+    print_header(["recording", "step", "method", "start", "scans", "ATE, m", "length, %", "lost", "degraded", "exit"])
     for method, judged in runs.items():
         for run in judged:
             counts = [_total([run.lost]), _total([run.degraded]), str(run.status)]
@@ -252,8 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ]
     header = ["recording", "step", "method", "starts", "worst ATE, m", "median ATE, m", "worst start"]
     header += ["worst length error, %", "lost", "degraded", "ok", "ok but wrong"]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     for cells in rows:
         print_row(cells)
 

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import make_simulation, print_header, print_row
 from simulated_faults import Faulty, carried_off, covered, dropped, index_back
 from threadpoolctl import threadpool_limits
 
@@ -100,8 +100,7 @@ def main() -> None:
         "back: found",
         "back: ok",
     ]
-    print_row([*header, "off, m"])
-    print_row(["---"] * (len(header) + 1))
+    print_header([*header, "off, m"])
     with threadpool_limits(1, "blas"):
         for place in arguments.places:
             world, sensor, carrier = _PLACES[place]

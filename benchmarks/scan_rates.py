@@ -27,6 +27,7 @@ from mapping_accuracy import (
     add_simulation_arguments,
     errors_of,
     localise,
+    print_header,
     print_row,
     recordings,
     true_trajectory,
@@ -77,8 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if not options.sources and not options.worlds:
         options.worlds = list(WORLDS)
-    print_row(["recording", "step", "scans", "moved, m", "turned, deg", *options.methods])
-    print_row(["---"] * (5 + len(options.methods)))
+    print_header(["recording", "step", "scans", "moved, m", "turned, deg", *options.methods])
     for recorded in recordings(options, options.scans):
         for step in options.steps:
             print_row(row(recorded, step, options.methods))

@@ -8,7 +8,7 @@ the scans go from the simulator through memory into the pipeline of `lidarslam r
 
 import argparse
 
-from mapping_accuracy import add_simulation_arguments, print_row, run_kiss, simulate
+from mapping_accuracy import add_simulation_arguments, print_header, print_row, run_kiss, simulate
 
 from lidarslam.odometry.config import KissConfig
 from lidarslam.simulation.world import WORLDS
@@ -25,8 +25,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_simulation_arguments(parser, worlds=list(WORLDS))
     arguments = parser.parse_args()
-    print_row(["world", *arguments.motions])
-    print_row(["---"] * (1 + len(arguments.motions)))
+    print_header(["world", *arguments.motions])
     for world in arguments.worlds:
         cells = [
             run_one(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)

@@ -10,10 +10,10 @@ import time
 from collections.abc import Iterator, Sequence
 from statistics import median
 
-from lidarslam.simulation.motion import CARRIERS, mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import SENSORS, find_sensor
+from mapping_accuracy import in_world
+
+from lidarslam.simulation.motion import CARRIERS
+from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS, World, build_world
 
 
@@ -33,11 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _rows(world: World, motion_name: str, sensors: Sequence[str], scans: int, seed: int) -> Iterator[str]:
-    motion = motion_along_route(motion_name, world, seed)
-    mount = mount_pose("upright", motion.sensor_height_m)
     for name in sensors:
-        sensor = find_sensor(name)
-        simulation = Simulation(world, sensor, motion, mount, scans + 1, seed)
+        simulation = in_world(world, motion_name, name, scans + 1, seed)
+        sensor = simulation.sensor
         simulation.scan(0)  # builds the scene
         seconds, points = [], []
         for index in range(1, scans + 1):

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mapping_accuracy import DEFAULT_METHODS, METHODS, make_simulation, print_row
+from mapping_accuracy import DEFAULT_METHODS, METHODS, make_simulation, print_header, print_row
 from simulated_faults import (
     Cover,
     Faulty,
@@ -242,8 +242,7 @@ def main() -> None:
     arguments = parser.parse_args()
     header = ["fault", "place", "method", "concerned", "elsewhere", "believed and wrong", "worst, after"]
     header += ["shape, after, m", "polluted, %"]
-    print_row(header)
-    print_row(["---"] * len(header))
+    print_header(header)
     for case in cases(arguments):
         for method in arguments.methods:
             print_row(row(case, method, arguments.wrong_m, arguments.keep_moved, arguments.verbose))
