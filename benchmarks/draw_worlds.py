@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mapping_accuracy import in_world
 
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import reference_map
 from lidarslam.simulation.world import WORLDS, build_world

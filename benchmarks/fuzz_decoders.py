@@ -29,8 +29,7 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.datasets.faults import Faults
     from lidarslam.datasets.registry import open_recording
     from lidarslam.live.clouds import CloudDecoder
-    from lidarslam.mapping.global_map.global_map import PointCloud
-    from lidarslam.mapping.global_map.map_io import write_cloud
+    from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
     from lidarslam.simulation.formats import FORMATS
     from lidarslam.simulation.recorder import SimulatedScan
     from lidarslam.simulation.writers import Rig

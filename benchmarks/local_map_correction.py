@@ -36,8 +36,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
-from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig

@@ -33,9 +33,9 @@ from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping.fixed_map.fixed_map import FixedMap
-from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.localization.fixed_map import FixedMap
+from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry

@@ -30,8 +30,7 @@ from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.correction import corrected
-from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise, relax
-from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
+from lidarslam.mapping.pose_graph.optimizer import Optimised, RelaxSchedule, optimise, relax
 
 SCAN_S = 0.1
 # KISS-ICP's drift on KITTI 00, 0.53 % and 0.0019 degrees a metre, mostly over some 300 m, as a random walk.

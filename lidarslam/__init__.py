@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from lidarslam.core.scan import Scan
     from lidarslam.core.tracking import Status
     from lidarslam.core.trajectory import Trajectory
-    from lidarslam.mapping.global_map.global_map import PointCloud
+    from lidarslam.mapping.global_map.point_cloud import PointCloud
 
     __version__: str
 
@@ -36,7 +36,7 @@ _MODULES = {
     "Config": "lidarslam.config.settings",
     "LidarSlamError": "lidarslam.core.errors",
     "OpenRecording": "lidarslam.api.recordings",
-    "PointCloud": "lidarslam.mapping.global_map.global_map",
+    "PointCloud": "lidarslam.mapping.global_map.point_cloud",
     "RegisteredScan": "lidarslam.api.slam",
     "Scan": "lidarslam.core.scan",
     "Slam": "lidarslam.api.slam",

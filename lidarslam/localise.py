@@ -15,10 +15,10 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import format_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping.fixed_map.fixed_map import FixedMap
-from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
 from lidarslam.mapping.global_map.drawing import DrawnMap
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
+from lidarslam.mapping.localization.fixed_map import FixedMap
+from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import ScanResult

@@ -27,7 +27,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
 from lidarslam.mapping.global_map.drawing import DrawnMap
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import Estimated, Localised
 from lidarslam.pipeline.localisation import make_localiser

@@ -26,7 +26,7 @@ from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.datasets.ros.made_messages import write_chunk_checksums
 from lidarslam.exports import ros_messages as ros
 from lidarslam.exports.run_scans import RunScans
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.finished_run import load_map
 
 # REP 105.

@@ -17,13 +17,13 @@ from lidarslam.exports.gnss import read_gnss
 from lidarslam.exports.new_file import require_new
 from lidarslam.exports.projection import Utm, utm_around
 from lidarslam.exports.source import read_source
+from lidarslam.mapping.global_map.point_cloud import write_laz
 from lidarslam.mapping.global_map.products.georeference import (
     Georeference,
     GnssTrack,
     TooFewPositionsError,
     align_to_track,
 )
-from lidarslam.mapping.global_map.survey_formats import write_laz
 from lidarslam.storage.finished_run import load_map, read_trajectory
 
 MAP, TRAJECTORY, GEOJSON, KML = "map.laz", "trajectory_utm.tum", "trajectory.geojson", "trajectory.kml"

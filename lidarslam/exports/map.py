@@ -15,8 +15,7 @@ from lidarslam.core.trajectory import read_transform
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.exports.gravity import upwards
 from lidarslam.exports.redrawn import redrawn
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.products import edits
 from lidarslam.storage.finished_run import is_run, load_map, read_summary, read_trajectory
 

@@ -7,8 +7,9 @@ import numpy as np
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.exports.run_scans import read_run_scans
-from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
+from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views, seen_through
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.storage.directory import CONFIG
 from lidarslam.storage.finished_run import read_summary

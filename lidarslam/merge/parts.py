@@ -21,9 +21,9 @@ from lidarslam.datasets.published.fetched import fetch
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat
+from lidarslam.mapping.consistency import PairTests
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
-from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.run.checkpoints import describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph

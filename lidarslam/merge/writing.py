@@ -13,7 +13,7 @@ from lidarslam.core.text import count, joined
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.moved_points import PlacedViews
-from lidarslam.mapping.pose_graph.g2o import format_g2o
+from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.merge.parts import MergeRequest, PartDone, read_part
 from lidarslam.run.loop_closing import FinishedGraph
 from lidarslam.run.request import RunRequest, describe_run

@@ -113,8 +113,8 @@ def _map() -> None:
 
 
 def _checks() -> None:
+    from lidarslam.mapping.consistency import Surfels, shift_profile
     from lidarslam.mapping.global_map.moved_points import Views, seen_through
-    from lidarslam.mapping.slides.scan_surfels import Surfels, shift_profile
 
     points, views = made_up_scans()[0].points, Views(every=1)
     views.add(points, 0)
@@ -153,7 +153,7 @@ PARTS = {
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.mounting.rotation")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),
-    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.slides.scan_surfels"), is_late=True),
+    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.consistency"), is_late=True),
 }
 """The parts whose loops are compiled."""
 

@@ -11,7 +11,7 @@ from lidarslam.core.state import Shape
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.motion.prediction import GravityDirection
-from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.keyframes import GraphScan
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.odometry.interface import Motion
 

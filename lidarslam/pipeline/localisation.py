@@ -15,7 +15,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
-from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
+from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.smoothed_start import SmoothedMotion
 from lidarslam.mapping.tracking.mapped_scan import MappedScan

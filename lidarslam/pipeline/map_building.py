@@ -9,10 +9,10 @@ from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
 from lidarslam.core.state import TRANSFORM, Saved, Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.consistency import ConsistencyCheck
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.mapping.slides.slides import SlideCheck
 from lidarslam.pipeline.estimates import Localised, SweepMotion
 
 logger = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class MapBuilder(Stateful):
     voxel_size_m: float | None
     global_map: GlobalMap | None  # None until a scan was added
     views: Views  # range images of some scans, for the removal of moving objects
-    slides: SlideCheck  # pairs of scans, for the detection of slips
+    slides: ConsistencyCheck  # pairs of scans, for the detection of slips
     _pending: PendingScan | None
     _scans: int
 
@@ -57,7 +57,7 @@ class MapBuilder(Stateful):
         self.voxel_size_m = config.voxel_size_m
         self.global_map = None
         self.views = Views()
-        self.slides = SlideCheck()
+        self.slides = ConsistencyCheck()
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state.

@@ -12,8 +12,8 @@ from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.pose_graph.keyframes import GraphScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, graph_scan

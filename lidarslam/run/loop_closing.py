@@ -13,14 +13,13 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state import Saved
 from lidarslam.mapping.global_map.global_map import GlobalMap
-from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.loops.given import GivenLoops
+from lidarslam.mapping.loops.closure import GivenLoops, LoopClosure, RelativePose
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
-    from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
     from lidarslam.mapping.pose_graph.correction import Corrected
+    from lidarslam.mapping.pose_graph.edges import ProjectedTrack
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.text import count
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.mapping.config import MapFormat
-from lidarslam.mapping.loops.given import GivenLoops
+from lidarslam.mapping.loops.closure import GivenLoops
 from lidarslam.viewer.viewer import RerunMode
 
 logger = logging.getLogger(__name__)

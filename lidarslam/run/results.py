@@ -14,13 +14,13 @@ from lidarslam.core.trajectory import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat
+from lidarslam.mapping.consistency import find_contradictions
 from lidarslam.mapping.global_map.drawing import DrawnMap, TiledMap, drawn_map
-from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.tile_store import Tile
-from lidarslam.mapping.pose_graph.g2o import format_g2o
-from lidarslam.mapping.slides.slides import find_contradictions
+from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.run.loop_closing import GraphOutcome
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged

@@ -35,7 +35,7 @@ from lidarslam.viewer.viewer import RerunMode, Viewer
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:  # loads SciPy and the pose graph
-    from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
+    from lidarslam.mapping.pose_graph.edges import ProjectedTrack
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
         return None
     from lidarslam.exports.gnss import read_gnss
     from lidarslam.exports.projection import utm_around
-    from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
+    from lidarslam.mapping.pose_graph.edges import ProjectedTrack
 
     track = read_gnss(request.source, request.config.reader)
     utm = utm_around(track.geodetic)

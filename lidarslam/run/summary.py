@@ -14,8 +14,8 @@ from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.text import count
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.drawing import TiledMap
-from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.elevation import Elevation, elevation_json
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport

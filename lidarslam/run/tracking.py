@@ -18,12 +18,12 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
+from lidarslam.mapping.consistency import PairTests
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
-from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.methods.external import ExternalOdometry

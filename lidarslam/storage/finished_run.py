@@ -22,7 +22,7 @@ from lidarslam.datasets.folders.formats import read_pcd, read_ply
 from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
 from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.datasets.registry import choose_reader
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.unfinished import require_whole

@@ -14,7 +14,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
 from lidarslam.evaluation.report.error_colours import viridis
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.viewer.drawing import annotations as notes
 from lidarslam.viewer.drawing.annotations import Colour, Entry
 from lidarslam.viewer.drawing.colouring import UNKNOWN, ColourScale, Quantity, fit_scale

@@ -1,9 +1,7 @@
 """The merged map: one averaged point a voxel, so that memory follows the mapped area, not the number of scans."""
 
 import threading
-from dataclasses import dataclass, field
-from os import PathLike
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +10,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import State, Stateful
-from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.mapping.global_map.normals import estimate_normals
+from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxels import (
     COUNT,
@@ -30,7 +27,7 @@ from lidarslam.mapping.surfels.hash_kernels import EMPTY
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
 
 if TYPE_CHECKING:
-    import open3d as o3d
+    pass
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
@@ -54,41 +51,6 @@ class VoxelMeans:
 def means_points(means: VoxelMeans) -> FloatArray:
     """(M, 3) mean points."""
     return means.rows[:, POSITION].astype(np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class PointCloud:
-    """A map or a part of it."""
-
-    points: FloatArray  # (N, 3) float64, metres, in the world
-    normals: FloatArray  # (N, 3) float64, unit length, towards the side it was seen from
-    attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def select(self, chosen: NDArray[np.bool_]) -> "PointCloud":
-        """Some of the points, by a mask (N,)."""
-        return PointCloud(self.points[chosen], self.normals[chosen], self.attributes.select(chosen))
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write a binary .ply, .pcd, .laz or .e57 file with the attributes, and normals but in .e57.
-
-        Args:
-            path: of the file; one that is there is replaced.
-
-        Raises:
-            OutputError: the cloud is empty, the suffix is another, or the file cannot be written.
-        """
-        write_cloud(Path(path), self)
-
-    def to_open3d(self) -> "o3d.geometry.PointCloud":
-        """The points and normals as a cloud of Open3D."""
-        import open3d as o3d
-
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.points))
-        cloud.normals = o3d.utility.Vector3dVector(self.normals)
-        return cloud
 
 
 class GlobalMap(Stateful):

@@ -11,11 +11,9 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
-from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.loops.drift import Track
+from lidarslam.mapping.loops.closure import RelativePose, Track
 from lidarslam.mapping.loops.registration import SubmapCloud
-from lidarslam.mapping.loops.sparse_submap import SparseSubmap
-from lidarslam.mapping.loops.submap_file import SubmapFile
+from lidarslam.mapping.loops.sparse_submap import SparseSubmap, SubmapFile
 
 # Shorter ways back are no loops, in median ranges and in metres.
 _MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0

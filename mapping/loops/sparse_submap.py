@@ -1,12 +1,16 @@
 """A keyframe's submap as loop detection keeps it: a few thousand points with normals, and a range image."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, skew
+from lidarslam.core.state import BlockFile
 from lidarslam.core.thinning import one_per_cell
 
 PLANE, LINE = 1, 2
@@ -25,6 +29,8 @@ _POLE = 0.7
 PIXELS = (120, 60)
 # From the sensor's axis, "up" may be so far.
 _LARGEST_TILT = np.cos(np.deg2rad(45.0))
+# Submaps that stay in memory, those used last: about 15 MB.
+_KEPT = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +132,54 @@ def _level_rotation(normals: FloatArray) -> FloatArray:
         axis = mean / np.linalg.norm(mean)
     K = skew(np.array([axis[1], -axis[0], 0.0]))  # the cross product of the axis and z
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + axis[2]), dtype=np.float64)
+
+
+class SubmapFile:
+    """Sparse submaps in order, in a file without a name: those of hours would take hundreds of megabytes of memory.
+
+    Args:
+        directory: where the file lies; None: where temporary files are.
+    """
+
+    def __init__(self, directory: Path | None = None) -> None:
+        self._blocks = BlockFile(directory)
+        self._points: list[int] = []
+        self._recent = lru_cache(_KEPT)(self._read)
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def __getitem__(self, index: int) -> SparseSubmap:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"submap {index} of {len(self)}")
+        return self._recent(int(index) % len(self))
+
+    def __iter__(self) -> Iterator[SparseSubmap]:
+        return (self[index] for index in range(len(self)))
+
+    def append(self, submap: SparseSubmap) -> None:
+        """Keep one more.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        record = np.zeros((), _record(len(submap)))
+        for name in record.dtype.names or ():
+            record[name] = getattr(submap, name)
+        self._blocks.write(record.tobytes())
+        self._points.append(len(submap))
+
+    def _read(self, index: int) -> SparseSubmap:
+        kind = _record(self._points[index])
+        record = np.frombuffer(self._blocks.read(index), kind)[0]
+        values = {name: record[name] for name in kind.names or ()}
+        return SparseSubmap(**values | {name: float(values[name]) for name in ("range_m", "cell_m")})
+
+
+def _record(points: int) -> np.dtype[np.void]:
+    """The attributes of a submap of so many points."""
+    return np.dtype([
+        ("R_level_lidar", "f8", (3, 3)), ("range_m", "f8"), ("cell_m", "f8"), ("points", "f4", (points, 3)),
+        ("axes", "f2", (points, 3)), ("tilt", "f2", (points,)), ("range_image", "f2", PIXELS),
+        ("kinds", "u1", (points,)),
+    ])  # fmt: skip

@@ -1,5 +1,6 @@
-"""The optimised graph, and the scans between keyframes corrected by it."""
+"""The optimised graph: the scans between keyframes corrected by it, and its text in the g2o format."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,6 +12,8 @@ from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 
 # Over a shorter way the sensor stood still, and scans are counted instead.
 _STILL_M = 0.01
+_UPPER = np.triu_indices(6)
+_TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,3 +98,31 @@ def _shares(
     behind = np.where(still, scans - left, path - path[left])
     whole = np.where(still, right - left, path[right] - path[left])
     return np.asarray(np.clip(behind / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0), dtype=np.float64)
+
+
+def format_g2o(poses: FloatArray, edges: Sequence[RelativePose]) -> str:
+    """The graph as g2o text, which GTSAM, g2o and Ceres read: poses (N, 4, 4), whose keys are their rows, and edges.
+
+    `VERTEX_SE3:QUAT key x y z qx qy qz qw` is a pose, `EDGE_SE3:QUAT first second x y z qx qy qz qw` followed by the
+    upper triangle of the information matrix, row by row, a relative pose. The information is translation first; here
+    covariances are rotation first. g2o measures rotation by the quaternion's vector part, half the angle; GTSAM and the
+    tools around it take the same numbers for the angle's, unscaled, and so does this file. Not `gtsam.writeG2o`, whose
+    six digits are a millimetre at a kilometre.
+    """
+    lines = [f"VERTEX_SE3:QUAT {key} {_text(_seven(T))}" for key, T in enumerate(poses)]
+    for edge in edges:
+        information = np.linalg.inv(edge.covariance)[np.ix_(_TRANSLATION_FIRST, _TRANSLATION_FIRST)]
+        upper = (0.5 * (information + information.T))[_UPPER]
+        lines.append(f"EDGE_SE3:QUAT {edge.first} {edge.second} {_text([*_seven(edge.T_first_second), *upper])}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _seven(T: FloatArray) -> FloatArray:
+    """x y z qx qy qz qw, qw >= 0."""
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
+    return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)])
+
+
+def _text(numbers: Iterable[float]) -> str:
+    return " ".join(f"{number:.17g}" for number in numbers)

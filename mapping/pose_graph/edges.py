@@ -1,4 +1,4 @@
-"""Edges between consecutive keyframes: scan-to-map registration, and the odometry beside it."""
+"""Measurements of the graph beside loop closures: motion between keyframes, attitude by gravity, GNSS positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +11,10 @@ from scipy.sparse.csgraph import connected_components
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.state import TRANSFORM, Shape
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.products.georeference import GnssTrack, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
 
 # Drift of scan-to-map registration between keyframes, one standard deviation: a floor, and growth with the way.
 # Compared with true errors of simulated recordings.
@@ -24,6 +26,12 @@ _UNMAPPED = 5.0
 _LOST_RAD, _LOST_M, _LOST_M_PER_M = np.deg2rad(20.0), 1.0, 0.5
 # Odometry covariances assume independent errors, but errors repeat from scan to scan: factor on standard deviations.
 _ODOMETRY_CAUTION = 10.0
+# Errors of the accelerometer repeat from one measurement to the next: least standard deviation.
+_LEAST_TILT = float(np.deg2rad(0.2))
+# Errors of GNSS are correlated over this time, seconds: positions within it count as one.
+_CORRELATED_S = 10.0
+# Standard deviations, metres: where none is stated, and at least. That of the height is larger by the factor.
+_UNKNOWN_M, _LEAST_GNSS_M, _HEIGHT = 3.0, 0.02, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,3 +110,79 @@ def first_connected(count: int, pairs: Sequence[tuple[int, int]]) -> NDArray[np.
     _, labels = connected_components(adjacency, directed=False)
     _, firsts = np.unique(labels, return_index=True)
     return np.asarray(firsts[labels], dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class Attitude:
+    """Where a keyframe's LiDAR frame has the world's vertical; unit vectors."""
+
+    key: int
+    lidar: Annotated[FloatArray, Shape(3)]  # (3,) in the keyframe
+    world: Annotated[FloatArray, Shape(3)]  # (3,) in the world of its recording
+    sigma: float  # radians
+
+    def __post_init__(self) -> None:
+        if not self.sigma > 0.0:
+            raise ValueError(f"an attitude has the standard deviation {self.sigma:g}")
+
+
+def measured_attitude(
+    scan: GraphScan, keyframes: Sequence[Keyframe], scan_poses: Sequence[FloatArray]
+) -> list[Attitude]:
+    """Gravity as measured with the latest scan, in the last keyframe; nothing where nothing was measured."""
+    if scan.gravity is None or not keyframes:
+        return []
+    T_lidar_keyframe = inverse(scan.T_world_lidar) @ scan_poses[keyframes[-1].scan]
+    gravity = scan.gravity.turned(T_lidar_keyframe[:3, :3])
+    sigma = max(_LEAST_TILT, float(np.sqrt(np.linalg.eigvalsh(gravity.covariance)[-1])))
+    return [Attitude(len(keyframes) - 1, gravity.lidar, gravity.world, sigma)]
+
+
+@dataclass(frozen=True, eq=False)
+class AntennaPosition:
+    """A measured position, assigned to the keyframe nearest in time."""
+
+    key: int
+    antenna: FloatArray  # (3,) in the keyframe's LiDAR frame, by the registered motion between both
+    measured: FloatArray  # (3,) x east, y north, z up, metres
+    sigmas: FloatArray  # (3,) metres
+    repeats: float  # number of positions whose errors are correlated
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedTrack:
+    """A GNSS track in a map projection."""
+
+    track: GnssTrack
+    projected: FloatArray  # (N, 3) metres
+    scale: float  # of the projection at this place
+
+    def aligned(self, trajectory: Trajectory) -> FloatArray:
+        """T_map_world (4, 4) of a trajectory; the origin of the map is the first position.
+
+        Raises:
+            TooFewPositionsError: too few positions are within its time.
+        """
+        T = align_to_track(trajectory, self.track, self.projected - self.projected[0], self.scale).T_map_world.copy()
+        T[:3, 3] /= self.scale
+        return T
+
+    def positions(self, trajectory: Trajectory, keyframe_scans: Sequence[int]) -> list[AntennaPosition]:
+        """The positions within the time of a trajectory (M poses), assigned to the keyframes among its scans."""
+        stamps, track = trajectory.stamps, self.track
+        rows = np.flatnonzero(track.is_within(trajectory, self.projected))
+        if not len(rows):
+            return []
+        scans = np.asarray(keyframe_scans)
+        keys = np.abs(stamps[scans][None, :] - track.stamps[rows, None]).argmin(axis=1)
+        antennas = trajectory.at(track.stamps[rows]) @ np.append(track.lidar_antenna, 1.0)
+        T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])
+        antennas = np.einsum("nij,nj->ni", T_keyframe_world, antennas)[:, :3]
+        measured = (self.projected[rows] - self.projected[0]) / self.scale
+        repeats = max(1.0, len(rows) * _CORRELATED_S / max(float(np.ptp(track.stamps[rows])), _CORRELATED_S))
+        stated = np.where(np.isfinite(track.sigma_m[rows]), track.sigma_m[rows], _UNKNOWN_M)
+        sigmas = np.maximum(stated, _LEAST_GNSS_M)[:, None] * np.array([1.0, 1.0, _HEIGHT])
+        return [
+            AntennaPosition(int(key), antenna, position, sigma, repeats)
+            for key, antenna, position, sigma in zip(keys, antennas, measured, sigmas, strict=True)
+        ]

@@ -12,16 +12,37 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state import TRANSFORM, Stateful
+from lidarslam.core.state import TRANSFORM, BlockFile, Stateful
 from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
+from lidarslam.mapping.global_map.voxels import Layout
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.attitude import Attitude, measured_attitude
-from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, trajectory_edges
-from lidarslam.mapping.pose_graph.graph_scan import GraphScan
-from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
-from lidarslam.mapping.pose_graph.submap_store import SubmapStore
+from lidarslam.mapping.pose_graph.edges import Attitude, MotionSinceKeyframe, measured_attitude, trajectory_edges
+from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe, KeyframeSelector
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+
+class SubmapStore(BlockFile):
+    """Submaps in order, in a file: hours of recording would not fit into memory. See `BlockFile`."""
+
+    _layouts: list[Layout]
+
+    def __init__(self, directory: Path | None = None, file: Path | None = None) -> None:
+        super().__init__(directory, file)
+        self._layouts = []
+
+    def append(self, means: VoxelMeans) -> None:
+        """Keep one more.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        self.write(np.ascontiguousarray(means.rows, dtype="<f4").tobytes())
+        self._layouts.append(means.layout)
+
+    def __getitem__(self, index: int) -> VoxelMeans:
+        layout = self._layouts[index]
+        return VoxelMeans(np.frombuffer(self.read(index), dtype="<f4").reshape(-1, layout.width), layout)
 
 
 class KeyframeGraph(Stateful):

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.antenna import AntennaPosition
-from lidarslam.mapping.pose_graph.attitude import Attitude
-from lidarslam.mapping.pose_graph.edges import first_connected
+from lidarslam.core.state import Stateful
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.pose_graph.edges import AntennaPosition, Attitude, first_connected, squared_error
 
 # Standard deviations of a pose that is held, radians and metres: firm beside every edge, but no singular system.
 _HELD = np.array([np.deg2rad(0.01)] * 3 + [0.001] * 3)
@@ -36,6 +35,11 @@ _INLIER_SIGMAS = 6.0
 _NEARLY, _CONVERGED = 1e-4, 1e-9
 # Factors of edges, each made once: to make them anew takes longer than to optimise from poses that are nearly right.
 _factors: WeakKeyDictionary[RelativePose, gtsam.BetweenFactorPose3] = WeakKeyDictionary()
+# An optimisation takes time in proportion to the keyframes. The next one waits for the hundredth part of their number,
+# so that its time for each keyframe does not grow: none waits with 100 keyframes, 300 m or so with 10,000.
+_PART = 100
+# Only a closure farther from the present poses than its own deviation moves them: squared, in six dimensions.
+_DEVIATIONS = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,3 +173,34 @@ def _matrices(values: gtsam.Values) -> FloatArray:
     T: FloatArray = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
     return T
+
+
+class RelaxSchedule(Stateful):
+    """Collects accepted loop closures until the poses are optimised: not at every one of a long recording."""
+
+    _waiting: list[LoopClosure]
+    _keyframes: int  # when they were optimised last
+
+    def __init__(self) -> None:
+        self._waiting, self._keyframes = [], 0
+
+    @property
+    def waiting(self) -> Sequence[LoopClosure]:
+        """Closures that the poses are not optimised with yet."""
+        return self._waiting
+
+    def is_due(self, found: Sequence[LoopClosure], poses: Sequence[FloatArray]) -> bool:
+        """Whether to optimise now: a closure contradicts the poses (4, 4) of all keyframes, which are enough by now.
+
+        Args:
+            found: closures since the last call, rejected ones too.
+            poses: as estimated now.
+        """
+        self._waiting += [closure for closure in found if closure.accepted]
+        if _PART * (len(poses) - self._keyframes) < len(poses):
+            return False
+        waiting, self._waiting = self._waiting, []
+        if not any(squared_error(closure, poses) > _DEVIATIONS for closure in waiting):
+            return False
+        self._keyframes = len(poses)
+        return True

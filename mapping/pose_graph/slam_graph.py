@@ -13,7 +13,7 @@ import logging
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -26,25 +26,22 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
-from lidarslam.mapping.loops.given import GivenLoops
-from lidarslam.mapping.loops.refinement import refine
-from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
+from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
-from lidarslam.mapping.pose_graph.edges import first_connected, squared_error
-from lidarslam.mapping.pose_graph.graph_scan import GraphScan
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
-from lidarslam.mapping.pose_graph.keyframes import Keyframe
-from lidarslam.mapping.pose_graph.laid_submaps import LaidSubmaps, connected_with_last
-from lidarslam.mapping.pose_graph.neighbourhoods import REACH, Neighbourhoods
-from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise, relax
-from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
+from lidarslam.mapping.pose_graph.edges import ProjectedTrack, drift_covariance, first_connected, squared_error
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph, SubmapStore
+from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
+from lidarslam.mapping.pose_graph.optimizer import Optimised, RelaxSchedule, optimise, relax
+from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, connected_with_last
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+# So many submaps on either side: one alone is as sparse as the sensor, and over a longer way drift bends them.
+REACH = 1
 
 
 class SlamGraph(KeyframeGraph):
@@ -64,7 +61,7 @@ class SlamGraph(KeyframeGraph):
     _closures: list[LoopClosure]
     _relaxing: RelaxSchedule
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
-    _laid: LaidSubmaps  # in the running local map
+    _laid: SubmapPlacement  # in the running local map
     _is_map_due: bool  # whether closures have been refined since the local map was compared with them
 
     def __init__(
@@ -80,7 +77,7 @@ class SlamGraph(KeyframeGraph):
         self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
         self._first_scans, self._poses, self._closures, self._unrefined = [], [], [], []
         self._relaxing = RelaxSchedule()
-        self._laid, self._is_map_due = LaidSubmaps(local_radius_m), False
+        self._laid, self._is_map_due = SubmapPlacement(local_radius_m), False
 
     def _after_restore(self) -> None:
         self._detector.rebuild(means_points(self.store[key]) for key in range(len(self.store)))
@@ -276,3 +273,28 @@ class SlamGraph(KeyframeGraph):
 def _by_key(items: Sequence[T], key: Callable[[T], int]) -> dict[int, list[T]]:
     """Items of keyframes, in their order."""
     return {one: list(group) for one, group in groupby(items, key)}
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbourhoods:
+    """The keyframes with submaps, their poses and submaps."""
+
+    keyframes: Sequence[Keyframe]
+    poses: Sequence[FloatArray]  # (4, 4) of keyframes, as estimated now
+    submaps: SubmapStore
+
+    def submap(self, key: int, max_range_m: float, cell_m: float) -> DenseSubmap:
+        """A keyframe's submap united with its neighbours' of the same segment."""
+        T_keyframe_world = inverse(self.poses[key])
+        submaps = [(T_keyframe_world @ self.poses[k], means_points(self.submaps[k])) for k in self._around(key)]
+        return DenseSubmap.join(submaps, max_range_m, cell_m)
+
+    def drift(self, key: int) -> FloatArray:
+        """(6, 6) of a keyframe's neighbours relative to it; each axis has a third of the squared error."""
+        path_m = self.keyframes[key].path_m
+        return drift_covariance(max(abs(self.keyframes[k].path_m - path_m) for k in self._around(key))) / 3.0
+
+    def _around(self, key: int) -> list[int]:
+        """A keyframe with those beside it in its segment that have submaps by now."""
+        near = range(max(0, key - REACH), min(len(self.submaps), key + REACH + 1))
+        return [k for k in near if self.keyframes[k].segment == self.keyframes[key].segment]

@@ -17,8 +17,7 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform, write_tum
 from lidarslam.datasets.folders.formats import read_ply
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 # Where the run's world lies in the recording's.
 T_TRUTH_RUN = exp([0.0, 0.0, 2.0, 5.0, -3.0, 0.5])

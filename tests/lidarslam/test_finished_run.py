@@ -9,8 +9,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map, load_run
 
 

@@ -21,8 +21,7 @@ from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.simulation.formats import FORMATS
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers import Rig, write_kitti, write_ply_scans

@@ -15,8 +15,8 @@ from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.pose_graph.graph_scan import GraphScan
-from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
+from lidarslam.mapping.pose_graph.keyframes import GraphScan
+from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.methods.external import ExternalOdometry

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map import map_io
+from lidarslam.mapping.global_map import point_cloud
 from lidarslam.storage.directory import MAPS
 from lidarslam.storage.finished_run import load_map, load_run
 
@@ -140,7 +140,7 @@ def test_further_formats(source: Path, tmp_path: Path) -> None:
 def test_a_missing_library_is_said_before_the_run(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    monkeypatch.setattr(map_io, "find_spec", lambda _name: None)
+    monkeypatch.setattr(point_cloud, "find_spec", lambda _name: None)
     out = tmp_path / "run"
     result = CliRunner().invoke(main, [command, str(source), "--out", str(out), "--map-format", "e57"])
     assert result.exit_code != 0

@@ -352,7 +352,7 @@ def test_an_interrupted_merge_goes_on_where_it_was(
 
 KILLED_MERGE = """
 import os, signal, sys
-import lidarslam.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph
+import lidarslam.merge.merge, mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
 from lidarslam.cli import main
 
 count = 0

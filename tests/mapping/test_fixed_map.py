@@ -10,9 +10,9 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.fixed_map.fixed_map import FixedMap
-from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
 from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.localization.fixed_map import FixedMap
+from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 

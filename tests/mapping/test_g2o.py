@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.g2o import format_g2o
+from lidarslam.mapping.pose_graph.correction import format_g2o
 
 
 def random_covariance(rng: np.random.Generator) -> FloatArray:

@@ -9,8 +9,8 @@ import pytest
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import exp
 from lidarslam.mapping.global_map import global_map as module
-from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud, voxel_size_for
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 
 def test_a_voxel_holds_the_mean_of_its_points() -> None:

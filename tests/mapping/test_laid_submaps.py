@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.state import Saved, State
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout, Rows
-from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER, LaidSubmaps, draw_local_map
+from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER, SubmapPlacement, draw_local_map
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 CELL_M, RADIUS_M, SPACING_M = 0.3, 10.0, 3.0
@@ -48,9 +48,11 @@ def test_scans_that_follow_do_not_shift_what_was_drawn(rng: np.random.Generator)
     assert off_wall_m(drawn, 1.5) < 0.02
 
 
-def laid(submaps: dict[int, Rows], poses: Iterable[FloatArray], targets: FloatArray) -> tuple[LaidSubmaps, SurfelMap]:
+def laid(
+    submaps: dict[int, Rows], poses: Iterable[FloatArray], targets: FloatArray
+) -> tuple[SubmapPlacement, SurfelMap]:
     """After the poses as registered, the map drawn with others, before scan 40."""
-    laid = LaidSubmaps(RADIUS_M)
+    laid = SubmapPlacement(RADIUS_M)
     for pose in poses:
         laid.follow(pose)
     members = np.ones(len(targets), dtype=np.bool_)
@@ -71,7 +73,7 @@ def test_a_drawn_map_holds_all_that_its_submaps_reach(rng: np.random.Generator) 
 
 
 @pytest.fixture
-def revisited(rng: np.random.Generator) -> tuple[LaidSubmaps, FloatArray]:
+def revisited(rng: np.random.Generator) -> tuple[SubmapPlacement, FloatArray]:
     """Out and back: keyframe 9 is beside keyframe 0, and has drifted off; keyframes 4 and 5 are beyond the radius."""
     ways = [SPACING_M * min(key, 9 - key) for key in range(10)]
     poses = np.array([at(way + (0.5 if key > 4 else 0.0)) for key, way in enumerate(ways)])
@@ -82,11 +84,11 @@ def revisited(rng: np.random.Generator) -> tuple[LaidSubmaps, FloatArray]:
 
 @pytest.mark.parametrize("resumed", [False, True])
 def test_where_a_submap_lay_when_a_scan_was_registered(
-    revisited: tuple[LaidSubmaps, FloatArray], through_disk: Callable[[State], Saved], resumed: bool
+    revisited: tuple[SubmapPlacement, FloatArray], through_disk: Callable[[State], Saved], resumed: bool
 ) -> None:
     laid, poses = revisited
     if resumed:
-        again = LaidSubmaps(RADIUS_M)
+        again = SubmapPlacement(RADIUS_M)
         again.restore(through_disk(laid.state()))
         laid = again
     exchanged = 40 + SCANS_LATER

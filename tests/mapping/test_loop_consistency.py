@@ -5,8 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import exp, inverse, make_transform
 from lidarslam.mapping.config import LoopConfig
-from lidarslam.mapping.loops.closure import CHI_SQUARED_99, RelativePose
-from lidarslam.mapping.loops.drift import Track
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, RelativePose, Track
 
 RATES = LoopConfig().drift_rates
 SIGMAS = np.array([0.003] * 3 + [0.03] * 3)

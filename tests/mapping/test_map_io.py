@@ -9,9 +9,8 @@ import pytest
 
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import PointAttributes
-from lidarslam.mapping.global_map import map_io
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import require_format, write_cloud
+from lidarslam.mapping.global_map import point_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, require_format, write_cloud
 from lidarslam.storage.finished_run import load_map
 
 FORMATS = ["map.ply", "map.pcd", "map.laz", "map.e57"]
@@ -45,7 +44,7 @@ def test_a_map_is_read_back(tmp_path: Path, name: str) -> None:
 def test_open3d_reads_every_attribute(
     tmp_path: Path, cloud: PointCloud, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(map_io, "_POINTS_AT_A_TIME", 200)
+    monkeypatch.setattr(point_cloud, "_POINTS_AT_A_TIME", 200)
     write_cloud(tmp_path / name, cloud)
     read = o3d.t.io.read_point_cloud(str(tmp_path / name)).point
     np.testing.assert_array_equal(read.positions.numpy(), cloud.points)
@@ -133,7 +132,7 @@ def test_an_empty_map_is_no_full_disk(tmp_path: Path) -> None:
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     require_format("laz")
-    monkeypatch.setattr(map_io, "find_spec", lambda _name: None)
+    monkeypatch.setattr(point_cloud, "find_spec", lambda _name: None)
     with pytest.raises(OutputError, match=r"E57 maps need pye57; type: pip install 'lidarslam\[e57\]'$"):
         require_format("e57")
 

@@ -9,8 +9,7 @@ from click.testing import CliRunner
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.products.occupancy_grid import (
     FREE,
     OCCUPIED,

@@ -10,8 +10,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.attitude import Attitude
-from lidarslam.mapping.pose_graph.edges import first_connected
+from lidarslam.mapping.pose_graph.edges import Attitude, first_connected
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, bounded, optimise, relax
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2

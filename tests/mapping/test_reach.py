@@ -10,10 +10,10 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
-from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
+from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 from lidarslam.mapping.tracking.mapper import Mapper

@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarslam.core.geometry import exp
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
+from lidarslam.mapping.pose_graph.optimizer import RelaxSchedule
 
 
 def closure(second: int, off_m: float, reason: str = "") -> LoopClosure:

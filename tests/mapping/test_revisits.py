@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.mapping.loops.revisits import as_registered
+from lidarslam.mapping.pose_graph.submap_placement import as_registered
 
 SIGMA = np.array([1e-3] * 3 + [5e-3] * 3)
 REGISTERED = np.diag(SIGMA**2)

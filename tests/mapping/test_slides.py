@@ -8,8 +8,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.state import Saved, State
-from lidarslam.mapping.slides.scan_surfels import Surfels, shift_profile
-from lidarslam.mapping.slides.slides import Contradiction, SlideCheck, find_contradictions
+from lidarslam.mapping.consistency import ConsistencyCheck, Contradiction, Surfels, find_contradictions, shift_profile
 
 # A street of 120 m with buildings, parked vans and posts, driven through at 8 m/s.
 SCANS, STEP_M = 40, 0.8
@@ -50,9 +49,9 @@ def scans(street: object) -> list[FloatArray]:
     return record(street)
 
 
-def check(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> SlideCheck:
+def check(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> ConsistencyCheck:
     """All scans offered at these poses."""
-    slides = SlideCheck()
+    slides = ConsistencyCheck()
     for number, (points, T) in enumerate(zip(scans, T_world_lidar, strict=True)):
         slides.add(points, number, T)
     slides.finish()
@@ -127,7 +126,7 @@ def test_poses_that_were_corrected_are_judged_as_corrected(scans: list[FloatArra
 
 def test_it_goes_on_from_its_state(scans: list[FloatArray], through_disk: Callable[[State], Saved]) -> None:
     slid = poses([0.9 * STEP_M] * (SCANS - 1))
-    begun, resumed = SlideCheck(), SlideCheck()
+    begun, resumed = ConsistencyCheck(), ConsistencyCheck()
     for number in range(25):
         begun.add(scans[number], number, slid[number])
     resumed.restore(through_disk(begun.state()))
@@ -154,7 +153,7 @@ def test_long_runs_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
         return Surfels(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
     monkeypatch.setattr(Surfels, "of", empty)
-    slides = SlideCheck()
+    slides = ConsistencyCheck()
     for number in range(20_000):
         slides.add(np.empty((0, 3)), number, np.eye(4))
     assert 500 < len(looked_at) < 1200

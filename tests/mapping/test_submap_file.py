@@ -5,8 +5,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from lidarslam.mapping.loops.sparse_submap import SparseSubmap
-from lidarslam.mapping.loops.submap_file import SubmapFile
+from lidarslam.mapping.loops.sparse_submap import SparseSubmap, SubmapFile
 
 
 def submap(points: int, seed: int) -> SparseSubmap:

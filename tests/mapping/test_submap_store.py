@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.geometry import exp
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout
-from lidarslam.mapping.pose_graph.submap_store import SubmapStore
+from lidarslam.mapping.pose_graph.keyframe_graph import SubmapStore
 
 
 def test_submaps_come_back_in_any_order(rng: np.random.Generator, tmp_path: Path) -> None:

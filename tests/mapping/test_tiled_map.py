@@ -16,8 +16,9 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map import drawing, tile_store
 from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.drawing import drawn_map
-from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
+from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.surfels.voxel_hash import cell_keys, key_cells, point_keys
 

@@ -60,7 +60,7 @@ def edit(sources: tuple[Path, ...], out: Path, overwrite: bool, **options: Any) 
     """
     from lidarslam.exports.map import SUFFIXES, MapEdits, edit_map
     from lidarslam.exports.new_file import require_new
-    from lidarslam.mapping.global_map.map_io import require_format
+    from lidarslam.mapping.global_map.point_cloud import require_format
 
     if out.suffix not in SUFFIXES:
         raise click.UsageError(f"--out {out}: expected a file {', '.join(SUFFIXES)}")

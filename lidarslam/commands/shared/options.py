@@ -12,7 +12,7 @@ from lidarslam.commands.shared.terminal import note, verbose_option
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
     from lidarslam.mapping.config import MapFormat
-    from lidarslam.mapping.loops.given import GivenLoops
+    from lidarslam.mapping.loops.closure import GivenLoops
 
 
 class CommandWithExample(click.Command):
@@ -170,7 +170,7 @@ def take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":
     Raises:
         OutputError: a library for one is not installed.
     """
-    from lidarslam.mapping.global_map.map_io import require_format
+    from lidarslam.mapping.global_map.point_cloud import require_format
 
     formats = (*options.pop("map_format"), *(["pcd"] if options.pop("pcd") else []))
     for one in formats:
@@ -184,7 +184,7 @@ def take_loops(options: dict[str, Any]) -> "GivenLoops":
     Raises:
         UsageError: a pair is one scan, or is both.
     """
-    from lidarslam.mapping.loops.given import GivenLoops
+    from lidarslam.mapping.loops.closure import GivenLoops
 
     closed, forbidden = (dict.fromkeys((min(p), max(p)) for p in options.pop(name)) for name in ("loops", "no_loops"))
     for first, second in (*closed, *forbidden):

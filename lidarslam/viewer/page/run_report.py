@@ -17,7 +17,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import MapErrors, MethodResult, SequenceComparison
 from lidarslam.evaluation.report.run_page import RunPage, render_run
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.finished_run import read_summary

@@ -9,8 +9,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, rotation_angle, transform_points
 from lidarslam.core.scan import PointAttributes
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.normals import estimate_normals
+from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
 
 # Angles about the present direction within which normals are averaged to the next.
 _NARROWING = np.deg2rad([45.0, 30.0, 20.0, 10.0, 5.0, 5.0])

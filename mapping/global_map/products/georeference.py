@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform, skew
 from lidarslam.core.trajectory import Trajectory
@@ -103,6 +102,8 @@ def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArr
 
 def _heading(x: FloatArray, y: FloatArray) -> FloatArray:
     """Rotation (3, 3) about z that aligns centred positions (N, 3) best."""
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     sine = (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum()
     cosine = (x[:, :2] * y[:, :2]).sum()
     return np.asarray(Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix(), dtype=np.float64)

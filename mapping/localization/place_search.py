@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
-from lidarslam.mapping.fixed_map.fixed_map import FixedMap, Regions
-from lidarslam.mapping.fixed_map.local_mapping import KeptScan, KeptScans
+from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
+from lidarslam.mapping.localization.local_mapping import KeptScan, KeptScans
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.registration import Registration, register

@@ -14,9 +14,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.fixed_map.fixed_map import FixedMap, Regions
-from lidarslam.mapping.fixed_map.local_mapping import LocalMapping
-from lidarslam.mapping.fixed_map.place_search import Place, PlaceSearch, Search
+from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
+from lidarslam.mapping.localization.local_mapping import LocalMapping
+from lidarslam.mapping.localization.place_search import Place, PlaceSearch, Search
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.sampling import SurfelSampler

@@ -1,1 +1,0 @@
-"""Detecting maps that contradict themselves."""
