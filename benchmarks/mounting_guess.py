@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.scan import ScanSequence
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.mounting.guess import Guess, guess_mounting
-from lidarslam.datasets.mounting.rotation import transform_of
+from lidarslam.datasets.mounting import Guess, guess_mounting, transform_of
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.caster import Caster
 from lidarslam.simulation.motion import CARRIERS

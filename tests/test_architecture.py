@@ -73,7 +73,7 @@ CONFINED = {
         "lidarslam.datasets.published.evalio*",
     ),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
-    "fsspec": ("lidarslam.datasets.published.fetched",),
+    "fsspec": ("lidarslam.datasets.fetched",),
     "pyproj": ("lidarslam.exports.projection",),
     "ray": ("lidarslam.core.tasks",),
     "rosbags": (

@@ -9,7 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.mounting.rotation import corrected, transform_of
+from lidarslam.datasets.mounting import corrected, transform_of
 
 # Three rows of more columns than any point has are the coordinates of many points.
 _TRANSPOSED, _MOST_COLUMNS = 3, 32

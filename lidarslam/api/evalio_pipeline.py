@@ -21,7 +21,7 @@ from lidarslam.config.settings import load_config
 from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.mounting.rotation import transform_of
+from lidarslam.datasets.mounting import transform_of
 
 logger = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from lidarslam.config.settings import make_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.fetched import fetched
 from lidarslam.datasets.intake import take_in
-from lidarslam.datasets.published.fetched import fetched
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 

@@ -14,8 +14,8 @@ from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import require_no_link
 from lidarslam.core.tasks import open_tasks
-from lidarslam.datasets.published.evalio_names import located
-from lidarslam.datasets.published.fetched import fetched, is_url
+from lidarslam.datasets.fetched import fetched, is_url
+from lidarslam.datasets.published.evalio import located
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 from lidarslam.evaluation.comparison.quantities import find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow

@@ -12,7 +12,7 @@ from lidarslam.compare.methods.process import MethodRun
 from lidarslam.compare.methods.run import COMMAND, PROCESS, clear, run_method
 from lidarslam.compare.supervised import Limits
 from lidarslam.core.tasks import Where, open_tasks
-from lidarslam.datasets.published.fetched import fetch, url_of
+from lidarslam.datasets.fetched import fetch, url_of
 from lidarslam.evaluation.comparison.comparison import MethodResult
 
 

@@ -1,12 +1,9 @@
 """Faults of a recording's scans, counted while they are read."""
 
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TypeVar
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.scan import Scan
 
 T = TypeVar("T")
 
@@ -65,36 +62,3 @@ def _counted(number: int, kind: str) -> str:
         for several, one in _SINGULAR:
             kind = kind.replace(several, one)
     return f"{number:,} {kind}"
-
-
-def readable_scans(items: Iterable[T], read: Callable[[T], Scan], faults: Faults | None) -> Iterator[Scan]:
-    """The scans of these items; an unreadable one is counted and left out, or raised where `faults` is None.
-
-    Raises:
-        InputError: a scan cannot be read and `faults` is None.
-    """
-    for item in items:
-        try:
-            scan = read(item)
-        except InputError as error:
-            if faults is None:
-                raise
-            faults.unreadable(error)
-            continue
-        yield scan
-
-
-def first_readable(source: Path, items: Iterable[T], read: Callable[[T], Scan]) -> tuple[T, Scan, Faults]:
-    """The first item with a readable scan, that scan, and the faults of those before it.
-
-    Raises:
-        InputError: none can be read; the first one's error.
-    """
-    faults, first_error = Faults(), None
-    for item in items:
-        try:
-            return item, read(item), faults
-        except InputError as error:
-            first_error = first_error or error
-            faults.unreadable(error)
-    raise first_error or InputError(f"{source}: holds no scan that could be used; record it again")

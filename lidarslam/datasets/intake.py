@@ -11,7 +11,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.recording import recorded_axes
+from lidarslam.datasets.mounted_recording import recorded_axes
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.stamps import in_stamp_order
 

@@ -10,11 +10,11 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
-from lidarslam.datasets.mounting.recording import MountedRecording
-from lidarslam.datasets.mounting.rotation import KITTI_DEG
-from lidarslam.datasets.published.evalio_names import is_of_evalio, located
-from lidarslam.datasets.published.unrecognised import absent, result_of_program, unrecognised
+from lidarslam.datasets.mounted_recording import MountedRecording
+from lidarslam.datasets.mounting import KITTI_DEG
+from lidarslam.datasets.published.evalio import is_of_evalio, located
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.unrecognised import absent, result_of_program, unrecognised
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ READERS: dict[str, Reader] = {
         is_of_evalio,
     ),
     "kitti-odometry": Reader(
-        "lidarslam.datasets.kitti.odometry",
+        "lidarslam.datasets.published.kitti_odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
         takes_sequence=True,
@@ -70,7 +70,7 @@ READERS: dict[str, Reader] = {
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        "lidarslam.datasets.kitti.raw",
+        "lidarslam.datasets.published.kitti_raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
         lambda source: (source / "velodyne_points" / "data").is_dir(),
         elevation_deg=KITTI_DEG,
@@ -104,7 +104,7 @@ READERS: dict[str, Reader] = {
     ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "packets": Reader(
-        "lidarslam.datasets.packets.capture",
+        "lidarslam.datasets.packets.velodyne",
         ".pcap of a Velodyne, or of an Ouster with its metadata .json beside it; Ouster's .osf",
         lambda source: source.suffix.lower() in _PACKET_SUFFIXES,
     ),

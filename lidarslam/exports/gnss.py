@@ -8,13 +8,13 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti.raw import KittiRawRecording
-from lidarslam.datasets.mounting.recording import recorded_axes
+from lidarslam.datasets.mounted_recording import recorded_axes
+from lidarslam.datasets.published.kitti_raw import KittiRawRecording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_imu import static_transform
 from lidarslam.datasets.ros.bag_message import deserialize
 from lidarslam.datasets.ros.rosbag import BagRecording
-from lidarslam.datasets.ros.static_transforms import static_transform
 from lidarslam.mapping.global_map.products.georeference import GnssTrack
 
 _FIX_TYPE = "sensor_msgs/msg/NavSatFix"

@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.mounting.recording import recorded_axes
+from lidarslam.datasets.mounted_recording import recorded_axes
 from lidarslam.datasets.registry import open_recording
 from lidarslam.exports.source import read_source
 from lidarslam.storage.directory import CONFIG

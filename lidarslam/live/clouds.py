@@ -6,12 +6,11 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.rotation import corrected, transform_of
-from lidarslam.datasets.ros import livox
+from lidarslam.datasets.mounting import corrected, transform_of
+from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.ros.timed_scan import field_offsets, timed_scan
-from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, TimedCloud, is_return, learn_point_time
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, TimedCloud, learn_point_time
 
 # Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
 _MOST_LOOKED_AT = 10
@@ -72,8 +71,8 @@ class CloudDecoder:
         self._last_ns, self._last_published_ns, self._frame_id = stamp_ns, published_ns, frame_id
         self._ahead = 0
         model = self._point_time
-        offsets = None if model is None else field_offsets(cloud, model, stamp)
-        scan = timed_scan(cloud, offsets, stamp, model is not None, self._faults)
+        offsets = None if model is None else cloud.offsets(model, stamp)
+        scan = cloud.scan(stamp, offsets, model is not None, self._faults)
         scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
         return LiveScan(scan, stamp_ns, frame_id)
 
@@ -125,10 +124,9 @@ class CloudDecoder:
         if self._is_settled:
             return
         unit, reference, defined_unit = self._config.time_unit, self._config.time_reference, None
-        if self._type in livox.CUSTOM_MESSAGE_TYPES:
-            reference, defined_unit = "absolute", livox.TIME_UNIT
-        times = None if cloud.times is None else cloud.times[is_return(cloud.points)]
-        self._clouds.append(TimedCloud(cloud.time_field, times, stamp))
+        if self._type in driver_messages.CUSTOM_MESSAGE_TYPES:
+            reference, defined_unit = "absolute", driver_messages.TIME_UNIT
+        self._clouds.append(cloud.timed(stamp))
         stamps = [cloud.stamp for cloud in self._clouds if cloud.stamp is not None]
         period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) if len(stamps) > 1 else None
         learned = learn_point_time(self._clouds, unit, reference, period_s, defined_unit)

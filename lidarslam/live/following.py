@@ -10,9 +10,9 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
 from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
-from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.live.clouds import CloudDecoder, LiveScan
 from lidarslam.live.dds import DdsNode, PublishedTopic
 from lidarslam.live.messages import PosePublisher

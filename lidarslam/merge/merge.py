@@ -15,8 +15,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import open_tasks
 from lidarslam.core.text import count
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.fetched import url_of
 from lidarslam.datasets.intake import take_in
-from lidarslam.datasets.published.fetched import url_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.global_map import voxel_size_for
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph

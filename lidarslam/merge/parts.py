@@ -16,8 +16,8 @@ from lidarslam.core.state import Saved, decode, encode
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.core.text import safe_name
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.published.evalio_names import resolved
-from lidarslam.datasets.published.fetched import fetch
+from lidarslam.datasets.fetched import fetch
+from lidarslam.datasets.published.evalio import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat

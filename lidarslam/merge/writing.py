@@ -10,7 +10,7 @@ from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.core.state import Saved
 from lidarslam.core.text import count, joined
-from lidarslam.datasets.published.evalio_names import resolved
+from lidarslam.datasets.published.evalio import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.pose_graph.correction import format_g2o

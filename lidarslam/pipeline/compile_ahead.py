@@ -48,7 +48,7 @@ def made_up_scans() -> tuple[Scan, ...]:
 
 
 def _reading() -> None:
-    from lidarslam.datasets.mounting.rotation import correct_elevation
+    from lidarslam.datasets.mounting import correct_elevation
 
     as_stored = np.ones((1, 4), dtype=np.float32)
     squared_ranges(Scan.from_raw(correct_elevation(as_stored[:, :3], 0.0), 0.0).points)

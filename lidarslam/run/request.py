@@ -9,7 +9,7 @@ from typing import Any
 
 from lidarslam.config.settings import Config
 from lidarslam.core.text import count
-from lidarslam.datasets.published.evalio_names import resolved
+from lidarslam.datasets.published.evalio import resolved
 from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.loops.closure import GivenLoops
 from lidarslam.viewer.viewer import RerunMode

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
-from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
+from lidarslam.datasets.ros.driver_messages import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
 from lidarslam.datasets.ros.made_messages import (
     POINT_CLOUD2_TYPE,
     header,

@@ -12,7 +12,7 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.imu_samples import COLUMNS, EXTRINSIC, IMU_FILE
-from lidarslam.datasets.mounting.rotation import KITTI_DEG, correct_elevation
+from lidarslam.datasets.mounting import KITTI_DEG, correct_elevation
 from lidarslam.simulation.recorder import SimulatedScan
 
 # Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.text import safe_name
-from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio, resolved
+from lidarslam.datasets.published.evalio import full_name, is_of_evalio, resolved
 from lidarslam.datasets.registry import takes_sequence
 from lidarslam.storage.directory import TRAJECTORY_TUM
 from lidarslam.storage.unfinished import About

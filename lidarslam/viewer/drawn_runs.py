@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import associate

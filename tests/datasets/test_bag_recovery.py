@@ -21,9 +21,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_file import BagFile, unpacked
 from lidarslam.datasets.ros.bag_recovery import recover
-from lidarslam.datasets.ros.decompression import unpacked
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -444,7 +443,7 @@ def test_frames_are_unpacked_one_after_the_other(pack, rng):
 @pytest.mark.parametrize("is_indexed", [True, False])
 def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, monkeypatch, kind, is_indexed):
     """A scan has some kilobytes here."""
-    monkeypatch.setattr("lidarslam.datasets.ros.decompression.MOST_BYTES", 1_000)
+    monkeypatch.setattr("lidarslam.datasets.ros.bag_file.MOST_BYTES", 1_000)
     storage, _, form = kind.partition(" ")
     compression = {"mcap": (CompressionMode.STORAGE, CompressionFormat.ZSTD)}.get(
         storage, (CompressionMode.MESSAGE, CompressionFormat.ZSTD)
@@ -460,7 +459,7 @@ def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, mo
 
 
 def test_a_file_compressed_as_a_whole_that_unpacks_to_too_much_is_refused(write_drive, monkeypatch):
-    monkeypatch.setattr("lidarslam.datasets.ros.decompression.MOST_BYTES", 1_000)
+    monkeypatch.setattr("lidarslam.datasets.ros.bag_file.MOST_BYTES", 1_000)
     _, folder, _ = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
     (file,) = folder.glob("*.zstd")
     file.write_bytes(zstd.compress(bytes(10_000_000)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarslam.datasets.mounting.rotation import correct_elevation
+from lidarslam.datasets.mounting import correct_elevation
 
 
 def _cloud(rng: np.random.Generator, count: int = 20_000) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Counting what is wrong with the scans of a recording."""
+"""Faults of a recording's scans: counted by kind, or raised where nobody counts."""
 
 from pathlib import Path
 
@@ -7,44 +7,56 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.faults import Faults, first_readable, readable_scans
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.stored_recording import FileRecording
 
 
-def read(index):
-    if index % 2:
-        raise InputError(f"scan {index} is damaged")
-    return Scan(np.ones((1, 3)), float(index))
+class Odd(FileRecording):
+    """Scans of which those with an odd number are damaged."""
+
+    reader = "odd"
+
+    def __init__(self, numbers: list[int]) -> None:
+        super().__init__(Path("drive"), ReaderConfig(), [Path(str(number)) for number in numbers])
+        self.stamps = np.array(numbers, dtype=np.float64)
+
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
+        if self.stamps[index] % 2:
+            raise InputError(f"{self._files[index]} is damaged")
+        return Scan(np.ones((1, 3)), float(self.stamps[index]))
 
 
-def test_each_kind_is_counted_and_its_first_remembered():
+def test_kinds_are_counted_and_the_first_of_each_is_remembered():
     faults = Faults()
-    faults.note("scans look odd", "scan 1")
-    faults.note("scans look odd", "scan 2")
-    faults.leave_out("scans were left out: too old", "scan 3")
-    faults.leave_out("scans are missing", "the index", count=5)
-    assert faults.left_out == 6
-    assert faults.warnings() == (
-        "2 scans look odd; the first: scan 1",
-        "1 scan was left out: too old; the first: scan 3",
-        "5 scans are missing; the first: the index",
-    )
-
-
-def test_scans_that_cannot_be_read_are_left_out_where_somebody_counts():
-    faults = Faults()
-    assert [scan.stamp for scan in readable_scans(range(5), read, faults)] == [0.0, 2.0, 4.0]
+    faults.note("scans have a fault", "a")
+    faults.leave_out("scans were left out: why", "b", 2)
+    faults.note("scans have a fault", "c")
     assert faults.left_out == 2
-    assert faults.warnings() == ("2 scans were left out: they could not be read; the first: scan 1 is damaged",)
-    scans = readable_scans(range(5), read, None)
-    next(scans)
-    with pytest.raises(InputError, match="scan 1 is damaged"):
+    assert faults.warnings() == ("2 scans have a fault; the first: a", "2 scans were left out: why; the first: b")
+
+
+def test_one_scan_is_singular():
+    faults = Faults()
+    faults.unreadable(InputError("x"))
+    assert faults.warnings() == ("1 scan was left out: it could not be read; the first: x",)
+
+
+def test_unreadable_scans_are_left_out_where_they_are_counted_and_raised_elsewhere():
+    faults = Faults()
+    assert [scan.stamp for scan in Odd([0, 1, 2, 3, 4]).scans(faults=faults)] == [0.0, 2.0, 4.0]
+    assert faults.left_out == 2
+    scans = Odd([0, 1]).scans()
+    assert next(scans).stamp == 0.0
+    with pytest.raises(InputError, match="1 is damaged"):
         next(scans)
 
 
-def test_the_first_scan_that_can_be_read_describes_a_recording():
-    index, scan, faults = first_readable(Path("drive"), [1, 3, 4, 6], read)
-    assert (index, scan.stamp, faults.left_out) == (4, 4.0, 2)
-    with pytest.raises(InputError, match="scan 1 is damaged"):
-        first_readable(Path("drive"), [1, 3], read)
+def test_a_recording_is_described_by_its_first_readable_scan():
+    info = Odd([1, 3, 4, 6]).describe()
+    assert (info.first.stamp, info.scans, info.last_stamp) == (4.0, 4, 6.0)
+    assert info.notes == ("2 scans were left out: they could not be read; the first: 1 is damaged",)
+    with pytest.raises(InputError, match="1 is damaged"):
+        Odd([1, 3]).describe()
     with pytest.raises(InputError, match="drive: holds no scan"):
-        first_readable(Path("drive"), [], read)
+        Odd([]).describe()

@@ -9,8 +9,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti.odometry import KittiOdometryRecording
-from lidarslam.datasets.mounting.recording import MountedRecording
+from lidarslam.datasets.mounted_recording import MountedRecording
+from lidarslam.datasets.published.kitti_odometry import KittiOdometryRecording
 from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 
 # The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.

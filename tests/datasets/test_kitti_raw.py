@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti.oxts import oxts_poses
+from lidarslam.datasets.published.kitti_raw import oxts_poses
 from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps

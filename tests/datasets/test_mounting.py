@@ -14,9 +14,8 @@ from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import Mounting, ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.guess import UPRIGHT, guess_mounting
-from lidarslam.datasets.mounting.recording import MountedRecording
-from lidarslam.datasets.mounting.rotation import mounting_with_up, transform_of, written
+from lidarslam.datasets.mounted_recording import MountedRecording
+from lidarslam.datasets.mounting import UPRIGHT, guess_mounting, mounting_with_up, transform_of, written
 from lidarslam.datasets.recording import RecordingInfo
 from lidarslam.datasets.registry import open_recording
 

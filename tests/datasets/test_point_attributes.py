@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from lidarslam.datasets.folders.formats import read_ply
 from lidarslam.datasets.folders.point_table import (
     find_colour_fields,
     find_intensity_field,
     read_colours,
     read_intensities,
 )
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.ros.livox import decode_custom_message
+from lidarslam.datasets.ros.driver_messages import decode_custom_message
 from lidarslam.datasets.ros.point_cloud2 import decode_point_cloud2
 
 STAMP_NS = 1_700_000_000_250_000_000

@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.recording import PointField
-from lidarslam.datasets.ros.livox import decode_custom_message
+from lidarslam.datasets.ros.driver_messages import decode_custom_message
 from lidarslam.datasets.ros.point_cloud2 import decode_point_cloud2
 from lidarslam.datasets.times.point_time import PointTimeModel, infer_point_time
 

@@ -14,11 +14,11 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.layout import find_truth_file
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.recording import PointField, Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.stored_recording import find_truth_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 STAMP_NS = 1_700_000_000_250_000_000

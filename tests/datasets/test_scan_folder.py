@@ -11,7 +11,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.folders.formats import read_pcd, read_ply
+from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.times.stamps import read_stamps, stamps_from_names

@@ -21,7 +21,7 @@ from lidarslam.cli import main
 from lidarslam.core.geometry import is_rigid
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_kitti_poses, read_tum
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.storage.directory import UNFINISHED
 from lidarslam.storage.unfinished import About
 

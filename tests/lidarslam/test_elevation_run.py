@@ -13,7 +13,7 @@ from lidarslam.cli import main
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.geometry import exp
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.mounting.rotation import correct_elevation
+from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
 
 LOW_DEG, SCANS = 0.4, 36

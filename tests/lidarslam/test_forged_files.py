@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.odometry.network.exported import DESCRIPTION, read_exported
 from lidarslam.odometry.network.shipped import default_weights
 from lidarslam.storage.comparison_folder import run_directories

@@ -22,9 +22,9 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.rotation import correct_elevation
+from lidarslam.datasets.mounting import correct_elevation
+from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
-from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.live import bounded
 from lidarslam.live.messages import PosePublisher, serialize_transform

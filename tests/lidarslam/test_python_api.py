@@ -17,7 +17,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.trajectory import read_tum, write_tum
-from lidarslam.datasets.mounting.rotation import correct_elevation
+from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.run import open_odometry

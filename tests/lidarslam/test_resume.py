@@ -22,7 +22,7 @@ from lidarslam.cli import main
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 from lidarslam.storage.finished_run import load_run
 

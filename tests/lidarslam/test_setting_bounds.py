@@ -18,7 +18,7 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, read_tum
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.train.settings import TrainConfig
 
 

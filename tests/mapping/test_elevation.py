@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
-from lidarslam.datasets.mounting.rotation import correct_elevation
+from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.elevation import ElevationEstimator, PlacedPoints, combined, estimate_bias
 from lidarslam.mapping.motion.prediction import MotionState

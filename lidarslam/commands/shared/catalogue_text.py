@@ -13,7 +13,7 @@ from typing import Any
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.text import count, one_line
-from lidarslam.datasets.published import evalio_names
+from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.catalogue import CATALOGUE, DataSet
 from lidarslam.datasets.registry import recognise
 
@@ -39,7 +39,7 @@ def choose(arguments: Sequence[str]) -> tuple[list[DataSet], list[Path]]:
     known = {one.name: one for one in CATALOGUE}
     chosen, folders = [], []
     for argument in arguments:
-        name = argument.removeprefix(evalio_names.PREFIX)
+        name = argument.removeprefix(evalio.PREFIX)
         if name in known:
             chosen.append(known[name])
         elif Path(argument).exists():
@@ -55,7 +55,7 @@ def find_on_disk(folders: Sequence[Path]) -> OnDisk:
     """Recordings of known data sets in evalio's data folder and in these, down to three folders below."""
     readers = {one.reader: one.name for one in CATALOGUE if one.reader != "evalio"}
     found: dict[str, list[Path]] = defaultdict(list)
-    for path, reader in dict(_recordings([evalio_names.data_folder(), *folders], _DEPTH)).items():
+    for path, reader in dict(_recordings([evalio.data_folder(), *folders], _DEPTH)).items():
         if (name := path.parent.name if reader == "evalio" else readers.get(reader)) is not None:
             found[name].append(path)
     return found
@@ -87,7 +87,7 @@ def list_data_sets(on_disk: OnDisk) -> str:
         [
             *lines,
             "",
-            f"looked for in {evalio_names.data_folder()} (EVALIO_DATA) and in folders that are named",
+            f"looked for in {evalio.data_folder()} (EVALIO_DATA) and in folders that are named",
             "more about one, with its sequences: lidarslam datasets hilti_2022",
         ]
     )
@@ -119,8 +119,8 @@ def _rows(one: DataSet, found: Sequence[Path]) -> Iterator[tuple[str, str]]:
     if one.reader == "evalio":
         sequence = sequences[0] if sequences else "SEQUENCE"
         yield "reader", "evalio" if sequences else "evalio, which is not installed: pip install 'lidarslam[datasets]'"
-        yield "download", evalio_names.how_to_get(evalio_names.data_folder() / one.name / sequence)
-        yield "run", f"lidarslam run {evalio_names.PREFIX}{one.name}/{sequence}"
+        yield "download", evalio.how_to_get(evalio.data_folder() / one.name / sequence)
+        yield "run", f"lidarslam run {evalio.PREFIX}{one.name}/{sequence}"
     else:
         yield "reader", one.reader
         yield "download", "from its page, under its licence"
@@ -130,7 +130,7 @@ def _rows(one: DataSet, found: Sequence[Path]) -> Iterator[tuple[str, str]]:
 
 
 def _sequences(one: DataSet) -> tuple[str, ...]:
-    return evalio_names.sequences().get(one.name, ()) if one.reader == "evalio" else ()
+    return evalio.sequences().get(one.name, ()) if one.reader == "evalio" else ()
 
 
 def as_json(chosen: Sequence[DataSet], on_disk: OnDisk) -> str:

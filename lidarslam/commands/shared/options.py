@@ -38,8 +38,8 @@ class _Path(click.Path):
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        from lidarslam.datasets.published.evalio_names import located
-        from lidarslam.datasets.published.fetched import fetched, is_url
+        from lidarslam.datasets.fetched import fetched, is_url
+        from lidarslam.datasets.published.evalio import located
 
         if value == "":
             self.fail("the path is empty; name a file or a folder", param, ctx)

@@ -23,7 +23,7 @@ def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:
 
 
 def coordinates(table: NDArray[np.void]) -> FloatArray:
-    """The fields x, y and z as (N, 3) float64.
+    """The fields x, y and z of a table (...) as (N, 3) float64.
 
     Raises:
         ValueError: a field is missing or is no number.
@@ -31,11 +31,11 @@ def coordinates(table: NDArray[np.void]) -> FloatArray:
     names = scalar_fields(table)
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"expected the point fields x, y and z, each one number, got {', '.join(names)}")
-    points = np.empty((len(table), 3))
+    points = np.empty((*table.shape, 3))
     with np.errstate(invalid="ignore", over="ignore"):  # damaged bytes may be signalling NaN
         for column, name in enumerate("xyz"):
-            points[:, column] = table[name]
-    return points
+            points[..., column] = table[name]
+    return points.reshape(-1, 3)
 
 
 def find_intensity_field(names: Sequence[str]) -> str | None:

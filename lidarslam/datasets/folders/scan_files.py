@@ -1,13 +1,19 @@
-"""Files that hold one scan each: their order, their numbers, and the `.bin` format."""
+"""Files that hold one scan each: their order, their numbers, and the formats, read into tables of points."""
 
 import re
 import stat
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import cast
 
+import lzf
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import read_array
 
 # No sweep is larger; reading on would fill the memory.
 _LARGEST_BYTES = 1 << 31
@@ -21,19 +27,6 @@ KITTI_FIELDS = ("x", "y", "z", "intensity")
 def natural_key(name: str) -> list[tuple[bool, int, str]]:
     """Sort key that counts: scan_2 stands before scan_10."""
     return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"([0-9]+)", name)]
-
-
-def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
-    """The indices `range(start, stop, step)` of a recording of `count` scans, a stop past the end being the end.
-
-    Raises:
-        InputError: a negative start or stop, or a step below one.
-    """
-    if start < 0 or step < 1 or (stop is not None and stop < 0):
-        raise InputError(
-            f"expected start >= 0, stop >= 0 and step >= 1, got start {start}, stop {stop} and step {step}"
-        )
-    return range(start, count if stop is None else min(stop, count), step)
 
 
 def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDArray[np.intp]]:
@@ -92,3 +85,285 @@ def read_bin(path: Path, columns: int = len(KITTI_FIELDS)) -> NDArray[np.float32
             " the file is damaged or of another format: copy it again or remove it"
         )
     return np.frombuffer(data, dtype="<f4").astype(np.float32, copy=False).reshape(-1, columns)
+
+
+TableReader = Callable[[Path], NDArray[np.void]]
+
+# Fields of the float32 numbers of a .bin point, by how many there are; in the order of preference.
+_BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
+_MOST_RINGS = 256
+_WIDEST_ARRAY = 16
+# Bytes; no format has a point with so many fields.
+_WIDEST_POINT = 1 << 16
+_LONGEST_HEADER = 1 << 16
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDER = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_KINDS = {"F": "f", "I": "i", "U": "u"}
+_SIZES = ("1", "2", "4", "8")
+# LZF's longest copy is of 264 bytes and takes three.
+_MOST_OF_A_BYTE = 88
+
+
+def read_ascii_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
+    """The first `rows` lines of blank-separated numbers; ValueError where there are fewer."""
+    _require_points(body, rows)
+    # A line takes a digit and a blank at least; NumPy makes room for all lines that it is told to expect.
+    possible = dtype.itemsize <= _WIDEST_POINT and rows <= (len(body) + 1) // 2 and body.strip()
+    table = np.loadtxt(BytesIO(body), dtype=dtype, max_rows=rows, ndmin=1, comments=None) if possible else np.empty(0)
+    if len(table) != rows:
+        raise ValueError(f"expected {rows} points, got {len(table)} in {len(body)} bytes of text: it is truncated")
+    return np.asarray(table, dtype)
+
+
+def read_binary_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
+    """The first `rows` rows of packed numbers; ValueError where there are fewer."""
+    _require_points(body, rows)
+    if len(body) < rows * dtype.itemsize:
+        raise ValueError(f"expected {rows} points of {dtype.itemsize} bytes, got {len(body)} bytes: it is truncated")
+    return np.frombuffer(body, dtype, count=rows)
+
+
+def _require_points(body: bytes, rows: int) -> None:
+    if not rows and body.strip(b"\0\t\n\r "):
+        raise ValueError(f"its header promises no points, and {len(body):,} bytes follow")
+
+
+def table_reader(files: Sequence[Path]) -> TableReader:
+    """The reader for scan files, all with one suffix.
+
+    Raises:
+        InputError: the number of values a point of a `.bin` file is ambiguous.
+    """
+    suffix = files[0].suffix.lower()
+    if suffix == ".bin":
+        fields = _BIN_FIELDS[_bin_columns(files)]
+        return lambda path: _as_table(read_bin(path, len(fields)), fields)
+    return {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy}[suffix]
+
+
+def _bin_columns(files: Sequence[Path]) -> int:
+    """How many numbers a point has: so that the sizes of most files fit, since the file itself does not say.
+
+    Four fit almost always where they are right; five, as nuScenes has them, only count where the fifth number is a
+    small integer in every point.
+    """
+    sizes = np.array([path.stat().st_size if path.exists() else 0 for path in files])
+    fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in _BIN_FIELDS}
+    if fits[5] and not _fifth_is_ring(files[int(np.argmax(sizes * (sizes % 20 == 0)))]):
+        fits[5] = 0
+    columns = max(fits, key=lambda columns: fits[columns])
+    if not fits[columns]:
+        raise InputError(
+            f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 bytes, or of 20 bytes"
+            f" with a ring, got {sizes[0]} bytes, which fit none; copy it again, or convert the scans to .npy or .ply"
+        )
+    return columns
+
+
+def _fifth_is_ring(path: Path) -> bool:
+    fifth = read_bin(path, 5)[:, 4]
+    return bool(len(fifth) and ((fifth >= 0) & (fifth < _MOST_RINGS) & (fifth == np.floor(fifth))).all())
+
+
+def read_npy(path: Path) -> NDArray[np.void]:
+    """The points (N,) of a .npy file: a structured array with fields, or (N, >=3) numbers that begin with x, y, z.
+
+    Four columns are x, y, z and intensity. Organised arrays are flattened.
+
+    Raises:
+        InputError: the file is damaged or holds another array.
+    """
+    data = read_bytes(path)
+    try:
+        array = read_array(BytesIO(data))
+    except Exception as error:  # NumPy parses the header as Python, which fails in many ways
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"{path}: cannot be read as .npy ({reason}); it is truncated or damaged: copy it again or remove it"
+        ) from None
+    if array.dtype.names:
+        return cast("NDArray[np.void]", array.reshape(-1))
+    if array.ndim < 2 or not 3 <= array.shape[-1] <= _WIDEST_ARRAY or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: expected an array (N, 3) or wider of numbers that begin with x, y, z, or a structured array,"
+            f" got {array.shape} of {array.dtype}"
+        )
+    further = tuple(f"column_{column}" for column in range(3, array.shape[-1]))
+    names = KITTI_FIELDS if len(further) == 1 else (*"xyz", *further)
+    return _as_table(array.reshape(-1, array.shape[-1]), names)
+
+
+def _as_table(numbers: NDArray[np.generic], names: tuple[str, ...]) -> NDArray[np.void]:
+    """An array (N, columns) of one type as a structured array (N,) with these names."""
+    dtype = np.dtype([(name, numbers.dtype) for name in names])
+    return np.ascontiguousarray(numbers).view(dtype).reshape(-1)
+
+
+def read_ply(path: Path) -> NDArray[np.void]:
+    """The vertices (N,) of a PLY file, ascii or binary; other elements, such as faces, are left out.
+
+    Raises:
+        InputError: the file cannot be read, is no PLY file, or is damaged.
+    """
+    data = read_bytes(path)
+    try:
+        lines, length = _split_header(data)
+        encoding, rows, dtype, skipped, further = _ply_header(lines)
+        if dtype.itemsize > _WIDEST_POINT:
+            raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
+        if max(skipped[0], further) > len(data):
+            raise ValueError(
+                f"expected {max(skipped[0], further):,} other elements in {len(data):,} bytes: it is truncated"
+            )
+        body = data[length:].split(b"\n", skipped[0])[-1] if encoding == "ascii" else data[length + skipped[1] :]
+        if not rows and further:
+            return np.empty(0, dtype)
+        return (read_ascii_table if encoding == "ascii" else read_binary_table)(body, dtype, rows)
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable PLY file: {error}; copy it again or remove it") from None
+
+
+def _split_header(data: bytes) -> tuple[list[list[str]], int]:
+    """The words of each header line and the header's length in bytes."""
+    lines: list[list[str]] = []
+    at = 0
+    while not lines or lines[-1] != ["end_header"]:
+        end = data.find(b"\n", at, _LONGEST_HEADER)
+        if end < 0 or (lines and lines[0] != ["ply"]):
+            raise ValueError("expected a header from `ply` to `end_header`, found none")
+        lines.append(data[at:end].decode("ascii", errors="replace").split())
+        at = end + 1
+    return lines, at
+
+
+def _ply_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], tuple[int, int], int]:
+    """Encoding, number of vertices, their type, (lines, bytes) of the elements before, and number of those behind."""
+    encoding = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "")
+    if encoding not in _BYTE_ORDER:
+        raise ValueError(f"expected the format {', '.join(_BYTE_ORDER)}, got {encoding!r}")
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for words in lines:
+        if words[:1] == ["element"] and len(words) == 3:
+            if not words[2].isdecimal():
+                raise ValueError(f"expected a number of elements, got {words[2][:40]!r}: it is invalid")
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and elements:
+            elements[-1][2].append(words[1:])
+    skipped_lines = skipped_bytes = 0
+    for place, (name, rows, properties) in enumerate(elements):
+        dtype = _ply_row_type(properties, _BYTE_ORDER[encoding])
+        if name == "vertex":
+            further = sum(rows for _, rows, _ in elements[place + 1 :])
+            return encoding, rows, dtype, (skipped_lines, skipped_bytes), further
+        skipped_lines += rows
+        skipped_bytes += rows * dtype.itemsize
+    raise ValueError("expected an element `vertex`, found none")
+
+
+def _ply_row_type(properties: list[list[str]], order: str) -> np.dtype[np.void]:
+    columns = []
+    for words in properties:
+        if len(words) != 2 or words[0] not in _TYPES:
+            raise ValueError(f"expected properties of a plain type up to the vertices, got {' '.join(words)!r}")
+        columns.append((words[1], order + _TYPES[words[0]]))
+    return np.dtype(columns)
+
+
+@dataclass(frozen=True)
+class _Header:
+    dtype: np.dtype[np.void]
+    points: int
+    encoding: str
+    length: int
+
+
+def read_pcd(path: Path) -> NDArray[np.void]:
+    """The points (N,) of a PCD file, ascii, binary or binary_compressed; organised clouds are flattened.
+
+    Raises:
+        InputError: the file cannot be read, is no PCD file, or is damaged.
+    """
+    data = read_bytes(path)
+    try:
+        header = _pcd_header(data)
+        body = data[header.length :]
+        if header.encoding == "ascii":
+            return read_ascii_table(body, header.dtype, header.points)
+        if header.encoding == "binary":
+            return read_binary_table(body, header.dtype, header.points)
+        return _read_compressed(body, header)
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable PCD file: {error}; copy it again or remove it") from None
+
+
+def _pcd_header(data: bytes) -> _Header:
+    entries: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in entries:
+        end = data.find(b"\n", at, _LONGEST_HEADER)
+        if end < 0:
+            raise ValueError("expected a header that ends in a DATA line, found none")
+        words = data[at:end].decode("ascii", errors="replace").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    names = entries.get("FIELDS") or entries.get("COLUMNS") or []
+    sizes, kinds = entries.get("SIZE", []), entries.get("TYPE", [])
+    counts = entries.get("COUNT", ["1"] * len(names))
+    if not names or not len(names) == len(sizes) == len(kinds) == len(counts):
+        raise ValueError("expected FIELDS, SIZE, TYPE and COUNT of one length each")
+    points = entries.get("POINTS", [])
+    if len(points) != 1:
+        raise ValueError("expected a line POINTS with their number")
+    encoding = " ".join(entries["DATA"])
+    if encoding not in ("ascii", "binary", "binary_compressed"):
+        raise ValueError(f"expected DATA ascii, binary or binary_compressed, got {encoding!r}")
+    if not points[0].isdecimal():
+        raise ValueError(f"expected a number of POINTS, got {points[0][:40]!r}: it is invalid")
+    return _Header(_pcd_row_type(names, sizes, kinds, counts), int(points[0]), encoding, at)
+
+
+def _pcd_row_type(names: list[str], sizes: list[str], kinds: list[str], counts: list[str]) -> np.dtype[np.void]:
+    columns: list[tuple[str, str, tuple[int, ...]]] = []
+    for place, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
+        if kind not in _KINDS:
+            raise ValueError(f"expected the TYPE F, I or U, got {kind!r}")
+        if size not in _SIZES or not count.isdecimal():
+            raise ValueError(f"expected sizes of 1, 2, 4 or 8 bytes and a COUNT, got {size[:20]!r} and {count[:20]!r}")
+        # PCL calls every padding field `_`, and NumPy wants names to differ.
+        unique = name if name not in names[:place] else f"{name}{place}"
+        columns.append((unique, f"<{_KINDS[kind]}{size}", () if count == "1" else (int(count),)))
+    try:
+        return np.dtype(columns)
+    except TypeError as error:
+        raise ValueError(f"expected sizes of 1, 2, 4 or 8 bytes ({error})") from None
+
+
+def _read_compressed(body: bytes, header: _Header) -> NDArray[np.void]:
+    """The body is two sizes and an LZF stream that holds the fields one after another, not the points."""
+    if len(body) < 8:
+        raise ValueError("expected two sizes before the compressed points: it is truncated")
+    compressed, size = (int(word) for word in np.frombuffer(body, "<u4", count=2))
+    expected = header.points * header.dtype.itemsize
+    if size != expected or len(body) < 8 + compressed:
+        raise ValueError(
+            f"expected {expected} bytes in {compressed} compressed ones, got {size} in {len(body) - 8}: it is truncated"
+        )
+    if size > _MOST_OF_A_BYTE * compressed:
+        raise ValueError(f"expected {size} bytes in {compressed} compressed ones, more than LZF can hold")
+    data = lzf.decompress(body[8 : 8 + compressed], size)
+    if data is None or len(data) != size:
+        raise ValueError("the compressed points are damaged")
+    table = np.empty(header.points, header.dtype)
+    at = 0
+    for name in header.dtype.names or ():
+        column = table[name]
+        table[name] = np.frombuffer(data, column.dtype, count=column.size, offset=at).reshape(column.shape)
+        at += column.nbytes
+    return table

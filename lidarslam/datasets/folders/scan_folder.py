@@ -1,7 +1,9 @@
-"""A folder of scan files: `.bin`, `.pcd`, `.ply` or `.npy`, one sweep each."""
+"""A folder of scan files: .bin, .pcd, .ply or .npy, one sweep each; their stamps, and what lies beside them."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -12,22 +14,19 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory, read_tum
+from lidarslam.core.text import count
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
-from lidarslam.datasets.folders.formats import table_reader
-from lidarslam.datasets.folders.layout import find_layout
 from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
-from lidarslam.datasets.imu_samples import IMU_FILE, read_imu_csv
+from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key, table_reader
+from lidarslam.datasets.imu_samples import IMU_FILE, find_imu_file, read_imu_csv
 from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.stored_recording import FileRecording, find_truth_file
 from lidarslam.datasets.times.azimuth import (
-    AZIMUTH_TIME,
-    AzimuthTiming,
+    PointTiming,
     Sweep,
-    infer_azimuth_timing,
     pair_starts,
-    time_warnings,
+    point_timing,
 )
 from lidarslam.datasets.times.point_time import (
     CLOCK_LIMIT_S,
@@ -39,7 +38,108 @@ from lidarslam.datasets.times.point_time import (
     is_return,
     learn_point_time,
 )
-from lidarslam.datasets.times.stamps import assumed_rate, scan_rate
+from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate, stamps_from_names
+
+_STAMP_FILES = ("timestamps.txt", "times.txt")
+
+
+@dataclass(frozen=True, eq=False)
+class FolderLayout:
+    """The scans of a folder."""
+
+    files: tuple[Path, ...]  # N files in the order of time, all with one suffix
+    stamps: FloatArray  # (N,) seconds, strictly increasing
+    from_clock: bool  # whether the stamps were found; else they are made from the rate
+    truth: Path | None  # a TUM file, or None
+    imu: Path | None  # a table of samples, or None
+    notes: tuple[str, ...]  # facts for the user
+    warnings: tuple[str, ...]  # faults and repairs
+
+
+def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
+    """The layout by names and the stamp file; no scan is opened.
+
+    Raises:
+        InputError: there is no scan, or the stamp file does not go with the scans.
+    """
+    files, notes, warnings = _find_scans(folder)
+    places = (folder, folder.resolve().parent)
+    stamp_file = next((place / name for place in places for name in _STAMP_FILES if (place / name).is_file()), None)
+    stamps, from_clock = np.arange(len(files)) / rate_hz, True
+    named = stamps_from_names([path.stem for path in files])
+    if stamp_file is not None:
+        stamps, replaced, faults = _read_stamp_file(stamp_file, files)
+        warnings += faults
+        if replaced:
+            warnings.append(
+                f"{count(replaced, 'stamp')} of {stamp_file.name} interpolated: repeated, backwards or far ahead."
+            )
+    elif named is not None and len(set(named)) == len(named):
+        notes.append("The stamps are the file names.")
+        order = np.argsort(named)  # not that of the names: 5.36 comes before 5.4
+        files, stamps = [files[i] for i in order], named[order]
+    else:
+        from_clock = False
+        if named is not None:
+            warnings.append("The file names look like stamps, but some are equal.")
+    whole = (
+        folder.resolve().parent.parent if folder.resolve().parent.name == "velodyne_points" else folder.resolve().parent
+    )
+    if folder.resolve().name == "velodyne" or whole != folder.resolve().parent:
+        warnings.append(f"The folder is part of a KITTI recording; name {whole} for its times, poses and calibration.")
+    return FolderLayout(
+        tuple(files), stamps, from_clock, find_truth_file(places), find_imu_file(places), tuple(notes), tuple(warnings)
+    )
+
+
+def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
+    """The scan files in natural order, the most common suffix and numbered names first; notes and warnings."""
+    named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
+    candidates = [path for path in named if path.is_file()]
+    if not candidates:
+        raise InputError(f"{folder}: expected scan files ({', '.join(SCAN_SUFFIXES)}), found none")
+    counts = Counter(path.suffix.lower() for path in candidates)
+    suffix = max(SCAN_SUFFIXES, key=lambda s: counts[s])  # of equals the first, so that a map beside a scan loses
+    same = [path for path in candidates if path.suffix.lower() == suffix]
+    numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
+    files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
+    skipped = sorted(path.name for path in set(candidates) - set(files))
+    shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
+    gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
+    no_files = "is no file" if len(gone) == 1 else "are no files"
+    return (
+        files,
+        [f"{count(len(skipped), 'other file')} not taken for scans: {shown}."] if skipped else [],
+        [f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}."] if gone else [],
+    )
+
+
+def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int, list[str]]:
+    """The stamps, how many of them were replaced, and a warning where lines and scans differ in number."""
+    lines = read_stamps(path)
+    stamps, numbers = lines[np.isfinite(lines)], np.arange(len(files))
+    warnings, left = [], max(0, len(files) - len(stamps))
+    if len(stamps) > len(files):
+        named = [int(file.stem) for file in files if file.stem.isdecimal()]
+        if len(named) == len(files) and named[-1] < len(lines):  # as in KITTI, where scans may have been left away
+            stamps, numbers, which = lines[named], np.array(named), "each takes the line of its number, from 0 on"
+        else:
+            stamps, which = stamps[: len(files)], "the first are taken"
+        warnings = [f"{path.name} has {len(lines):,} stamps for {count(len(files), 'scan')}; {which}."]
+    elif left:
+        warnings = [
+            f"{path.name} has {count(len(stamps), 'stamp')} for {count(len(files), 'scan')}; those of the last {left:,}"
+            " continue at its rate."
+        ]
+        stamps = np.append(stamps, np.full(left, np.nan))
+    try:
+        mended, replaced = mend_stamps(stamps, numbers.astype(np.float64))
+    except ValueError:
+        raise InputError(
+            f"{path}: expected stamps that increase from line to line, no two of them do; mend it, or move it away to"
+            " use the file names or the rate"
+        ) from None
+    return mended, replaced - left, warnings
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -66,11 +166,6 @@ class ScanFolderRecording(FileRecording):
         self._read_table = table_reader(self._layout.files)
 
     @cached_property
-    def ground_truth(self) -> Trajectory | None:
-        """The TUM file ground_truth.tum, groundtruth.tum or the like, in the folder or the one above."""
-        return None if self._layout.truth is None else read_tum(self._layout.truth)
-
-    @cached_property
     def imu(self) -> ImuSamples | None:
         """The table imu.csv in the folder or the one above."""
         return None if self._layout.imu is None else read_imu_csv(self._layout.imu)
@@ -80,7 +175,7 @@ class ScanFolderRecording(FileRecording):
         """An assumed rate, how the stamps were mended, and what is wrong with the times of the points."""
         assumed = assumed_rate("The scans have no stamps", self._config) if self._rate_is_assumed else None
         assumed_warnings = () if assumed is None else (assumed,)
-        return (*self._layout.warnings, *assumed_warnings, *time_warnings(self._learned, self._azimuth))
+        return (*self._layout.warnings, *assumed_warnings, *self._point_time.warnings)
 
     def _table(self, index: int) -> tuple[NDArray[np.void], FloatArray]:
         path = self._files[index]
@@ -96,16 +191,16 @@ class ScanFolderRecording(FileRecording):
         names = scalar_fields(table)
         rings = _rings(table)
         if offsets is None:
-            offsets = self._azimuth.offsets(Sweep(points, rings))
+            offsets = self._point_time.azimuth.offsets(Sweep(points, rings))
         scan = Scan.from_raw(points, stamp, offsets, rings, read_intensities(table, names), read_colours(table, names))
-        if self._point_time_model() is not None and scan.time_offsets is None and len(scan):
+        if self._point_time.model is not None and scan.time_offsets is None and len(scan):
             faults.note(NO_POINT_TIME, str(self._files[index]))
         return scan
 
     def _stamp_and_offsets(
         self, index: int, table: NDArray[np.void], points: FloatArray
     ) -> tuple[float, FloatArray | None]:
-        stamp, model = float(self.stamps[index]), self._point_time
+        stamp, model = float(self.stamps[index]), self._learned.model
         if model is None or not len(table) or model.field not in scalar_fields(table):
             return stamp, None
         values = table[model.field]
@@ -117,10 +212,6 @@ class ScanFolderRecording(FileRecording):
                 return stamp, None
             stamp = float(seconds[np.abs(seconds - np.median(seconds)) <= CLOCK_LIMIT_S].min())
         return stamp, model.offsets(values, stamp)
-
-    @property
-    def _point_time(self) -> PointTimeModel | None:
-        return self._learned.model
 
     @cached_property
     def _learned(self) -> LearnedTime:
@@ -134,17 +225,14 @@ class ScanFolderRecording(FileRecording):
 
     @property
     def _rate_is_assumed(self) -> bool:
-        model = self._point_time
+        model = self._learned.model
         return not (self._layout.from_clock or (model is not None and model.reference == "absolute"))
 
     @cached_property
-    def _azimuth(self) -> AzimuthTiming:
-        """Decided once, as well."""
-        if self._point_time is not None:
-            return AzimuthTiming()
+    def _point_time(self) -> PointTiming:
         rate = scan_rate(self.stamps)
         runs = (self._sweeps(index) for index in pair_starts(len(self)))
-        return infer_azimuth_timing(runs, None if rate is None else 1.0 / rate, self._config.time_reference)
+        return point_timing(self._learned, runs, None if rate is None else 1.0 / rate, self._config.time_reference)
 
     def _sweeps(self, first: int) -> Iterator[Sweep]:
         """Two consecutive scans, as far as they can be read."""
@@ -163,27 +251,25 @@ class ScanFolderRecording(FileRecording):
             values = None if field is None else table[field][is_return(points)]
             yield TimedCloud(field, values, float(stamp) if self._layout.from_clock else None)
 
-    def _last_stamp(self) -> float:
+    def _last_stamp(self, first: Scan) -> float:
         """By its points' clock, which may be better than the rate."""
         try:
             return self._read(len(self) - 1, Faults()).stamp
         except InputError:
-            return super()._last_stamp()
+            return super()._last_stamp(first)
 
     def _truth_path(self) -> Path | None:
         return self._layout.truth
 
     def _point_time_model(self) -> PointTimeModel | None:
-        return self._point_time if self._azimuth.period_s is None else AZIMUTH_TIME
+        return self._point_time.model
 
-    def _fields(self, index: int) -> tuple[PointField, ...]:
-        table, _ = self._table(index)
+    def _fields(self, item: int) -> tuple[PointField, ...]:
+        table, _ = self._table(item)
         return tuple(PointField(name, str(table.dtype[name].base)) for name in table.dtype.names or ())
 
     def _notes(self) -> Iterator[str]:
-        yield from self._layout.notes
-        if self._azimuth.note is not None:
-            yield self._azimuth.note
+        return iter((*self._layout.notes, *self._point_time.notes))
 
 
 def _rings(table: NDArray[np.void]) -> NDArray[np.generic] | None:

@@ -13,9 +13,9 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.packets.libraries import require
-from lidarslam.datasets.packets.packet_recording import PacketRecording
+from lidarslam.datasets.packets.packet_recording import PacketRecording, require
 from lidarslam.datasets.recording import PointField
 from lidarslam.datasets.times.point_time import PointTimeModel
 
@@ -67,14 +67,9 @@ class OusterRecording(PacketRecording):
 
         return XYZLut(self.sensor, use_extrinsics=False)
 
-    def frames(self, wanted: range) -> Iterator[Any]:
-        """The library's LidarFrames with these indices."""
-        raise NotImplementedError
-
-    def _sweeps(self, wanted: range) -> Iterator[Scan]:
-        return (self._scan(frame) for frame in self.frames(wanted))
-
-    def _scan(self, frame: Any) -> Scan:
+    def _read(self, item: Any, faults: Faults) -> Scan:  # noqa: ARG002
+        """The scan of one of the library's LidarFrames."""
+        frame = item
         valid = (frame.status & _VALID).astype(bool)
         ranges = frame.field("RANGE")
         points = self._directions(np.where(valid, ranges, 0))
@@ -87,9 +82,8 @@ class OusterRecording(PacketRecording):
         times = None if offsets is None else offsets.T
         return Scan.from_raw(points.transpose(1, 0, 2), first_ns / 1e9, times, rings.T, intensity)
 
-    def _fields(self) -> tuple[PointField, ...]:
-        frame = next(self.frames(range(1)))
-        return tuple(PointField(name.lower(), str(frame.field(name).dtype)) for name in frame.fields)
+    def _fields(self, item: Any) -> tuple[PointField, ...]:
+        return tuple(PointField(name.lower(), str(item.field(name).dtype)) for name in item.fields)
 
     def _packets_of_imu(self) -> Iterator[Any]:
         """The library's ImuPackets."""
@@ -193,11 +187,10 @@ class OusterFile(OusterRecording):
     @cached_property
     def _extent(self) -> tuple[int, float]:
         count = len(self._frame_sets.single(0))
-        last = next(self._sweeps(range(count - 1, count)), None) if count else None
+        last = next(self._scans(range(count - 1, count), Faults()), None) if count else None
         return count, 0.0 if last is None else last.stamp
 
-    def frames(self, wanted: range) -> Iterator[Any]:
-        """See `OusterRecording`."""
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
         of_sensor = self._frame_sets.single(0)
         stop = min(wanted.stop, len(of_sensor))
         frame_sets = of_sensor[wanted.start : stop : wanted.step] if wanted.start < stop else ()

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.point_table import coordinates
-from lidarslam.datasets.packets.libraries import require
-from lidarslam.datasets.packets.packet_recording import PacketRecording
-from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
+from lidarslam.datasets.packets.packet_recording import PacketRecording, require
+from lidarslam.datasets.recording import PointField, Recording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # Beyond the range of any model; the library's own limit is short of some.
@@ -23,6 +24,8 @@ _FARTHEST_M = 1000.0
 _PACKETS_LOOKED_AT = 2000
 # First bytes and lengths of others' packets.
 _HESAI, _ROBOSENSE = b"\xee\xff", (b"\x55\xaa", b"\xa5\xff")
+
+_StampedCloud = tuple[float, NDArray[np.void]]
 
 
 class VelodyneCapture(PacketRecording):
@@ -41,14 +44,15 @@ class VelodyneCapture(PacketRecording):
             count, last = count + 1, stamp
         return count, last
 
-    def _sweeps(self, wanted: range) -> Iterator[Scan]:
-        return (self._scan(*cloud) for cloud in islice(self._clouds(), wanted.start, wanted.stop, wanted.step))
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[_StampedCloud]:  # noqa: ARG002
+        return islice(self._clouds(), wanted.start, wanted.stop, wanted.step)
 
-    def _scan(self, stamp: float, cloud: NDArray[np.void]) -> Scan:
+    def _read(self, item: _StampedCloud, faults: Faults) -> Scan:  # noqa: ARG002
+        stamp, cloud = item
         offsets = self._offsets(cloud["time"].astype(np.float64))
         return Scan.from_raw(coordinates(cloud), stamp, offsets, cloud["ring"], cloud["intensity"])
 
-    def _clouds(self) -> Iterator[tuple[float, NDArray[np.void]]]:
+    def _clouds(self) -> Iterator[_StampedCloud]:
         """Stamp and points of each sweep.
 
         Raises:
@@ -70,12 +74,11 @@ class VelodyneCapture(PacketRecording):
         if not found:
             raise InputError(f"{self._source}: {_other_sensor(self._source)}")
 
-    def _fields(self) -> tuple[PointField, ...]:
-        _, cloud = next(self._clouds())
-        return fields_of(cloud)
+    def _fields(self, item: _StampedCloud) -> tuple[PointField, ...]:
+        return fields_of(item[1])
 
 
-def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> tuple[float, NDArray[np.void]]:
+def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> _StampedCloud:
     """The host's stamp in seconds that the times of the points count from, and the points (N,), of one or more packets.
 
     Args:
@@ -129,3 +132,17 @@ def _other_sensor(path: Path) -> str:
         "holds no packets of a Velodyne; for an Ouster, put the sensor's metadata beside it as"
         f" {path.with_suffix('.json').name}; else play it through the sensor's driver, and record a bag"
     )
+
+
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open a capture of a Velodyne's or an Ouster's packets.
+
+    Raises:
+        ConfigError: the library that decodes them is not installed.
+        InputError: the source is no file, or of another sensor.
+    """
+    if not source.is_file():
+        raise InputError(f"{source}: expected a file of packets, got a folder")
+    if source.suffix.lower() == ".osf" or find_metadata(source) is not None:
+        return OusterFile(source, config)
+    return VelodyneCapture(source, config)

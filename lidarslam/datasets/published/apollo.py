@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
-from lidarslam.datasets.published.poses import poses_wxyz
+from lidarslam.datasets.published.stamped_files import poses_wxyz
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.stamps import increasing_rows
 

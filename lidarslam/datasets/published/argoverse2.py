@@ -18,9 +18,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
-from lidarslam.datasets.published.poses import poses_wxyz
+from lidarslam.datasets.published.stamped_files import poses_wxyz
 from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows
 
 _NANOSECOND = 1e-9
@@ -55,12 +55,12 @@ class Argoverse2Recording(FileRecording):
     @property
     def name(self) -> str:
         """Such as argoverse2_02678d04."""
-        return f"argoverse2_{self._folder.resolve().name.partition('-')[0]}"
+        return f"argoverse2_{self._source.resolve().name.partition('-')[0]}"
 
     @cached_property
     def _T_ego_lidar(self) -> FloatArray | None:
         """The mounting of the upper LiDAR; None without a calibration."""
-        path = self._folder / "calibration" / "egovehicle_SE3_sensor.feather"
+        path = self._source / "calibration" / "egovehicle_SE3_sensor.feather"
         if not path.is_file():
             return None
         sensors = _read_columns(path, ("sensor_name", *_POSITION, *_QUATERNION))
@@ -94,7 +94,7 @@ class Argoverse2Recording(FileRecording):
         return Scan.from_raw(points, stamp, rings=table["laser_number"], intensities=table["intensity"])
 
     def _truth_path(self) -> Path | None:
-        path = self._folder / "city_SE3_egovehicle.feather"
+        path = self._source / "city_SE3_egovehicle.feather"
         return path if path.is_file() else None
 
     def _fields(self, index: int) -> tuple[PointField, ...]:

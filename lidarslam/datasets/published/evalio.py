@@ -1,8 +1,8 @@
-"""Data sets that evalio reads: its scans, IMU samples, true poses and extrinsic calibrations as a recording.
+"""Data sets that evalio reads: their names and folders, and their scans, IMU, truth and calibration as a recording.
 
-evalio decodes points one after another; the scans between the wanted ones are decoded too.
-"""
+evalio decodes points one after another; the scans between the wanted ones are decoded too."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -19,11 +19,108 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.scan_files import scan_indices
-from lidarslam.datasets.published import evalio_names
-from lidarslam.datasets.recording import ImuSummary, PointField, Recording, RecordingInfo
+from lidarslam.datasets.published.catalogue import CATALOGUE
+from lidarslam.datasets.recording import ImuSummary, PointField, Recording
+from lidarslam.datasets.stored_recording import StoredRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows
+
+PREFIX = "evalio:"
+MISSING_EXTRA = "evalio is not installed, which this data set needs; pip install 'lidarslam[datasets]'"
+
+# As evalio 0.6.1 has them.
+DATA_SETS = tuple(one.name for one in CATALOGUE if one.reader == "evalio")
+# Published where no program can download.
+_BY_HAND = ("botanic_garden",)
+_LISTED = 6
+
+
+def data_folder() -> Path:
+    """Where evalio keeps its data: EVALIO_DATA, or evalio_data in the current folder."""
+    return Path(os.environ.get("EVALIO_DATA", "evalio_data")).absolute()
+
+
+def located(source: Path) -> Path:
+    """The folder DATASET/SEQUENCE that a name stands for; other sources as they are."""
+    name = str(source)
+    return data_folder() / name.removeprefix(PREFIX) if name.startswith(PREFIX) else source
+
+
+def is_of_evalio(source: Path) -> bool:
+    """Whether a path reads DATASET/SEQUENCE as evalio lays out its data; data sets of others need EVALIO_CUSTOM."""
+    data_set = source.absolute().parent.name
+    return data_set in DATA_SETS or (bool(os.environ.get("EVALIO_CUSTOM")) and data_set in sequences())
+
+
+def resolved(source: Path) -> Path:
+    """The absolute path; links are resolved, but for one that would hide DATASET/SEQUENCE."""
+    path = source.resolve()
+    return source.absolute() if is_of_evalio(source) and not is_of_evalio(path) else path
+
+
+def full_name(source: Path) -> str:
+    """DATASET/SEQUENCE of a folder."""
+    return f"{source.absolute().parent.name}/{source.name}"
+
+
+def sequences() -> dict[str, tuple[str, ...]]:
+    """The sequences of each data set that evalio knows, those of EVALIO_CUSTOM too; none where it is not installed."""
+    try:
+        from evalio import datasets
+    except ImportError:
+        return {}
+    known = datasets.all_datasets()
+    return {name: tuple(one.seq_name for one in known[name].sequences()) for name in sorted(known)}
+
+
+def how_to_get(source: Path) -> str:
+    """The command that downloads a sequence to where it is looked for."""
+    if source.absolute().parent.name in _BY_HAND:
+        return f"its page has the files, for {source.absolute()}"
+    root = source.absolute().parent.parent
+    place = "" if os.environ.get("EVALIO_DATA") and root == data_folder() else f"-D {root} "
+    return f"evalio {place}dl {full_name(source)}"
+
+
+def absent(source: Path) -> str | None:
+    """Why a folder of evalio's is not there and how to get it; None of any other path."""
+    folder = source.absolute()
+    if not (folder.is_relative_to(data_folder()) or is_of_evalio(folder) or folder.name in DATA_SETS):
+        return None
+    known = sequences()
+    if folder.name in {*DATA_SETS, *known}:
+        return f"{source}: is a data set of evalio; name one of its sequences{_choice(folder.name, known)}"
+    data_set = folder.parent.name
+    if known and data_set not in known:
+        return f"{source}: evalio has no data set {data_set}; there are: {', '.join(known)}"
+    if known and source.name not in known[data_set]:
+        return f"{source}: evalio has no {full_name(source)}; there are{_choice(data_set, known)}"
+    install = "" if known else "; evalio comes with pip install 'lidarslam[datasets]'"
+    return f"{source}: is not downloaded: {how_to_get(source)}{install}"
+
+
+def require_known(source: Path) -> None:
+    """Check that evalio has the sequence.
+
+    Raises:
+        InputError: evalio is not installed, or has no such sequence.
+    """
+    known = sequences()
+    if not known:
+        raise InputError(f"{source}: {MISSING_EXTRA}")
+    data_set = source.absolute().parent.name
+    if source.name not in known.get(data_set, ()):
+        raise InputError(
+            f"{source}: evalio has no {full_name(source)}{_choice(data_set, known)}; a folder of another data set is"
+            " read with --reader"
+        )
+
+
+def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
+    names = [f"{PREFIX}{data_set}/{name}" for name in known.get(data_set, ())]
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f": {', '.join(names[:_LISTED])}{more}" if names else ""
+
 
 _POINT = attrgetter("x", "y", "z", "intensity", "row")
 _FIELDS = (*((name, "float64") for name in ("x", "y", "z", "intensity")), ("t", "ns"), ("row", "uint8"))
@@ -32,27 +129,27 @@ _POSITIONS_ALONE = ("enwide", "fomo")
 _UNREADABLE = "scans were left out: evalio could not read on"
 
 
-def open_recording(source: Path, config: ReaderConfig) -> Recording:  # noqa: ARG001
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
     """Open a sequence in the folder DATASET/SEQUENCE that evalio downloads it to.
 
     Raises:
         InputError: evalio is not installed, does not know the sequence, or a file of it is missing.
     """
-    evalio_names.require_known(source)
+    require_known(source)
     from evalio import datasets
 
-    recording = EvalioRecording(source, datasets.get_sequence(evalio_names.full_name(source)))
+    recording = EvalioRecording(source.absolute(), config, datasets.get_sequence(full_name(source)))
     recording.require_files()
     return recording
 
 
-class EvalioRecording:
-    """One sequence; implements `Recording`."""
+class EvalioRecording(StoredRecording):
+    """One sequence."""
 
-    T_cam_lidar: FloatArray | None = None
+    reader = "evalio"
 
-    def __init__(self, folder: Path, sequence: Any) -> None:
-        self._folder = folder.absolute()
+    def __init__(self, folder: Path, config: ReaderConfig, sequence: Any) -> None:
+        super().__init__(folder, config)
         self._sequence = sequence  # evalio.datasets.Dataset
 
     @contextmanager
@@ -60,12 +157,12 @@ class EvalioRecording:
         """evalio's data folder as that of this recording, and any error of evalio as one of the input."""
         from evalio.datasets import set_data_dir
 
-        set_data_dir(self._folder.parent.parent)
+        set_data_dir(self._source.parent.parent)
         try:
             yield
         except Exception as error:  # of whatever library reads the data set
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise InputError(f"{self._folder}: evalio cannot read {what} ({reason}); download it again") from error
+            raise InputError(f"{self._source}: evalio cannot read {what} ({reason}); download it again") from error
 
     def require_files(self) -> None:
         """Check that every file is there.
@@ -74,10 +171,10 @@ class EvalioRecording:
             InputError: one is missing.
         """
         with self._reading("its list of files"):
-            missing = [file for file in self._sequence.files() if not (self._folder / file).exists()]
+            missing = [file for file in self._sequence.files() if not (self._source / file).exists()]
         if missing:
-            command = evalio_names.how_to_get(self._folder)
-            raise InputError(f"{self._folder}: {missing[0]} is missing, the download is not complete; {command}")
+            command = how_to_get(self._source)
+            raise InputError(f"{self._source}: {missing[0]} is missing, the download is not complete; {command}")
 
     @property
     def name(self) -> str:
@@ -140,25 +237,22 @@ class EvalioRecording:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Truth without orientations."""
-        if self._folder.parent.name in _POSITIONS_ALONE:
+        if self._source.parent.name in _POSITIONS_ALONE:
             return ("The truth has positions alone; errors of rotation against it say nothing.",)
         return ()
 
-    def scans(
-        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
-    ) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)`; see `Recording`."""
-        indices, given = scan_indices(len(self), start, stop, step), 0
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Scan]:
+        given = 0
         try:
-            for scan in self._read(indices):
+            for scan in self._decoded(wanted):
                 given += 1
                 yield scan
         except InputError as error:
-            if faults is None:
+            if strict or not given:
                 raise
-            faults.leave_out(_UNREADABLE, str(error), len(indices) - given)
+            faults.leave_out(_UNREADABLE, str(error), len(wanted) - given)
 
-    def _read(self, wanted: range) -> Iterator[Scan]:
+    def _decoded(self, wanted: range) -> Iterator[Scan]:
         with self._reading("the scans"):
             measurements = self._sequence.data_iter().lidar_iter()
         for index in range(wanted.stop):
@@ -168,27 +262,25 @@ class EvalioRecording:
             if scan is not None:
                 yield scan
 
-    def describe(self) -> RecordingInfo:
-        """By the first scan; see `Recording`."""
-        first = next(self.scans(0, 1), None)
-        if first is None:
-            raise InputError(f"{self._folder}: holds no scan; download it again")
+    def _read(self, item: Scan, faults: Faults) -> Scan:  # noqa: ARG002
+        return item
+
+    def _fields(self, item: Scan) -> tuple[PointField, ...]:  # noqa: ARG002
+        return tuple(PointField(name, kind) for name, kind in _FIELDS)
+
+    def _last_stamp(self, first: Scan) -> float:
+        return float(first.stamp + (len(self) - 1) / self._sequence.lidar_params().rate)
+
+    def _truth_path(self) -> Path | None:
+        return None if self.ground_truth is None else self._source
+
+    def _point_time_model(self) -> PointTimeModel | None:
+        return PointTimeModel("t", "ns", "relative")
+
+    def _notes(self) -> Iterator[str]:
         lidar = self._sequence.lidar_params()
-        return RecordingInfo(
-            reader="evalio",
-            scans=len(self),
-            first=first,
-            last_stamp=first.stamp + (len(self) - 1) / lidar.rate,
-            ground_truth=self._folder if self.ground_truth is not None else None,
-            point_time=None if first.time_offsets is None else PointTimeModel("t", "ns", "relative"),
-            imu=self._imu_summary(),
-            fields=tuple(PointField(name, kind) for name, kind in _FIELDS),
-            notes=(
-                f"{self._sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep.",
-                f"The duration is that of the scans at {lidar.rate:g} Hz, the sensor's rate.",
-                *self.warnings,
-            ),
-        )
+        yield f"{self._sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep."
+        yield f"The duration is that of the scans at {lidar.rate:g} Hz, the sensor's rate."
 
 
 def _scan(measurement: Any) -> Scan:

@@ -16,12 +16,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
-from lidarslam.datasets.kitti.calibration import read_calibration
-from lidarslam.datasets.kitti.raw_timing import read_sweep_timing
+from lidarslam.datasets.published.kitti_files import read_calibration, read_sweep_timing
 from lidarslam.datasets.published.stamped_files import increasing, read_table
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import scan_rate
 
@@ -85,7 +84,7 @@ class Kitti360Recording(FileRecording):
 
     @cached_property
     def _T_pose_lidar(self) -> FloatArray | None:
-        folder = self._folder.parent.parent / "calibration"
+        folder = self._source.parent.parent / "calibration"
         to_lidar, to_pose = folder / "calib_cam_to_velo.txt", folder / "calib_cam_to_pose.txt"
         if not (to_lidar.is_file() and to_pose.is_file()):
             return None
@@ -102,7 +101,7 @@ class Kitti360Recording(FileRecording):
         return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, intensities=rows[:, 3])
 
     def _truth_path(self) -> Path | None:
-        path = self._folder.parent.parent / "data_poses" / self._folder.name / "poses.txt"
+        path = self._source.parent.parent / "data_poses" / self._source.name / "poses.txt"
         return path if path.is_file() else None
 
     def _point_time_model(self) -> PointTimeModel | None:

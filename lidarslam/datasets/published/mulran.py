@@ -18,11 +18,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import increasing, read_table, stamped_scans
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 SCANS = "Ouster"
@@ -60,7 +60,7 @@ class MulRanRecording(FileRecording):
         self.stamps = stamps
 
     def _beside(self, name: str) -> Path | None:
-        places = (self._folder, self._folder / "sensor_data")
+        places = (self._source, self._source / "sensor_data")
         return next((place / name for place in places if (place / name).is_file()), None)
 
     @cached_property

@@ -19,11 +19,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import read_bytes
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import increasing, read_table, stamped_scans
 from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.stored_recording import FileRecording
 
 SCANS = "velodyne_sync"
 _POINT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
@@ -72,7 +72,7 @@ class NcltRecording(FileRecording):
     @cached_property
     def imu(self) -> ImuSamples | None:
         """The samples of ms25.csv: stamp, magnetic field, acceleration, angular velocity."""
-        path = self._folder / self.imu_name
+        path = self._source / self.imu_name
         if not path.is_file():
             return None
         rows = read_table(path, 10)
@@ -90,8 +90,8 @@ class NcltRecording(FileRecording):
 
     def _truth_path(self) -> Path | None:
         name = f"groundtruth_{self.name}.csv"
-        above = self._folder.resolve().parent
-        places = (self._folder, above, above / "ground_truth")
+        above = self._source.resolve().parent
+        places = (self._source, above, above / "ground_truth")
         return next((place / name for place in places if (place / name).is_file()), None)
 
     def _fields(self, index: int) -> tuple[PointField, ...]:  # noqa: ARG002

@@ -1,22 +1,147 @@
 """nuScenes: the sweeps and samples of LIDAR_TOP of one scene, 20 a second.
 
 The tables are read without nuscenes-devkit, which brings image and plotting libraries along. The frame is the
-sensor's: x to the right, y forward, z up.
-"""
+sensor's: x to the right, y forward, z up."""
 
-from collections.abc import Iterator
+import mmap
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.json_text import parse_json, read_json
 from lidarslam.core.scan import Scan
+from lidarslam.core.text import stays_below
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import read_bin
-from lidarslam.datasets.published.nuscenes_tables import read_sweeps, scenes
+from lidarslam.datasets.published.stamped_files import poses_wxyz
 from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows
+
+_TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
+_LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
+_MICROSECOND = 1e-6
+_TAIL = 100  # bytes
+_LONGEST_RECORD = 1 << 13  # bytes; those of the data set have some hundred
+
+T = TypeVar("T")
+
+
+class _Scene(TypedDict):
+    name: str
+    token: str
+
+
+class _Sample(TypedDict):
+    token: str
+    scene_token: str
+
+
+class _Sweep(TypedDict):
+    sample_token: str
+    ego_pose_token: str
+    calibrated_sensor_token: str
+    timestamp: float
+    filename: str
+
+
+class _Pose(TypedDict):
+    token: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+
+
+_SCENES, _SAMPLES, _POSES = (TypeAdapter(list[_Scene]), TypeAdapter(list[_Sample]), TypeAdapter(list[_Pose]))
+_SWEEP, _POSE = TypeAdapter(_Sweep), TypeAdapter(_Pose)
+
+
+class Sweeps(NamedTuple):
+    """The sweeps of a scene in the order of time, samples (key frames) among them."""
+
+    files: list[str]  # N paths below the root
+    stamps: FloatArray  # (N,) seconds
+    T_world_lidar: FloatArray  # (N, 4, 4)
+
+
+def scenes(version: Path) -> dict[str, str]:
+    """The tokens of the scenes of a version by their names.
+
+    Raises:
+        InputError: the table is missing or damaged.
+    """
+    return {record["name"]: record["token"] for record in _table(version / "scene.json", _SCENES)}
+
+
+def read_sweeps(version: Path, scene: str) -> Sweeps:
+    """The sweeps of a scene, given by its token.
+
+    Raises:
+        InputError: a table is missing or damaged, or the scene has no sweep.
+    """
+    samples = {one["token"] for one in _table(version / "sample.json", _SAMPLES) if one["scene_token"] == scene}
+    data = _select(version / "sample_data.json", _LIDAR_FILE, lambda _: True, _SWEEP)
+    sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
+    if not sweeps:
+        raise InputError(f"{version / 'sample_data.json'}: has no sweep of LIDAR_TOP for the scene; download it again")
+    if outside := next((one["filename"] for one in sweeps if not stays_below(one["filename"])), None):
+        raise InputError(
+            f"{version / 'sample_data.json'}: names a sweep outside the data set, {outside}; download it again"
+        )
+    wanted = {one["ego_pose_token"].encode() for one in sweeps}
+    ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, _POSE)
+    T_world_ego = _poses(version, list(ego_poses), [one["ego_pose_token"] for one in sweeps])
+    sensors = _table(version / "calibrated_sensor.json", _POSES)
+    T_ego_lidar = _poses(version, sensors, [one["calibrated_sensor_token"] for one in sweeps])
+    stamps = np.array([one["timestamp"] for one in sweeps]) * _MICROSECOND
+    return Sweeps([one["filename"] for one in sweeps], stamps, T_world_ego @ T_ego_lidar)
+
+
+def _poses(version: Path, records: list[_Pose], tokens: list[str]) -> FloatArray:
+    """Transforms (N, 4, 4) of N tokens."""
+    by_token = {one["token"]: one for one in records}
+    if missing := next((token for token in tokens if token not in by_token), None):
+        raise InputError(f"{version}: has no pose {missing!r}; download the tables again")
+    found = [by_token[token] for token in tokens]
+    try:
+        return poses_wxyz([one["translation"] for one in found], [one["rotation"] for one in found])
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{version}: a pose is damaged ({error}); download the tables again") from error
+
+
+def _table(path: Path, shape: TypeAdapter[list[T]]) -> list[T]:
+    try:
+        return read_json(path, shape)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
+
+
+def _select(
+    path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], shape: TypeAdapter[T]
+) -> Iterator[T]:
+    """The records of a large table in which a pattern is found, as far as the match is wanted."""
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            if not text[-_TAIL:].rstrip().endswith(b"]"):
+                raise ValueError("its end is missing")
+            for match in pattern.finditer(text):
+                if wanted(match):
+                    start = text.rfind(b"{", max(0, match.start() - _LONGEST_RECORD), match.start())
+                    end = text.find(b"}", match.end(), match.end() + _LONGEST_RECORD) + 1
+                    if start < 0 or end == 0:
+                        raise ValueError(f"a record has no end within {_LONGEST_RECORD:,} bytes")
+                    yield parse_json(text[start:end], shape)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
+
 
 _FIELDS = ("x", "y", "z", "intensity", "ring")
 _LISTED = 8

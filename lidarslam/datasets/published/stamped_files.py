@@ -1,11 +1,13 @@
-"""Files that the data sets of cars and robots have in common: scans named by their stamps, and CSV tables."""
+"""Files that the data sets of cars and robots have in common: scans named by their stamps, tables, and poses."""
 
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
 
@@ -40,3 +42,15 @@ def increasing(stamps: FloatArray, T_world_lidar: FloatArray) -> Trajectory | No
     """The poses (N, 4, 4) whose stamps (N,) increase; None if there is none."""
     kept = increasing_rows(stamps)
     return Trajectory(stamps[kept], T_world_lidar[kept]) if kept.any() else None
+
+
+def poses_wxyz(positions: ArrayLike, quaternions: ArrayLike) -> FloatArray:
+    """Transforms (..., 4, 4) of positions (..., 3) and quaternions (..., 4) with the scalar first.
+
+    Raises:
+        ValueError: a number is not finite, or a quaternion is zero.
+    """
+    t, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+    if not (np.isfinite(t).all() and np.isfinite(q).all()):
+        raise ValueError("expected finite positions and quaternions")
+    return make_transform(Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix(), t)

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
 
-from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
+from lidarslam.datasets.ros.driver_messages import CUSTOM_MESSAGE_TYPES, decode_custom_message
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, decode_point_cloud2
 
 POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -78,7 +78,7 @@ def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCl
     if message.message_type in CUSTOM_MESSAGE_TYPES:
         return decode_custom_message(message.raw, ros2)
     if message.message_type == VELODYNE_SCAN_TYPE:
-        from lidarslam.datasets.ros.velodyne_scan import decode_scan_message
+        from lidarslam.datasets.ros.driver_messages import decode_scan_message
 
         return decode_scan_message(message.raw, ros2)
     cloud = cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE, ros2))

@@ -9,6 +9,7 @@ from typing import Any
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import (
     OusterRecording,
     find_metadata,
@@ -24,6 +25,8 @@ _STRING_TYPE = "std_msgs/msg/String"
 
 class OusterBag(OusterRecording):
     """The packets of one `lidar_packets` topic."""
+
+    reader = "rosbag"
 
     def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
         super().__init__(source, config)
@@ -53,8 +56,7 @@ class OusterBag(OusterRecording):
             f" beside the bag as {self.name}.json"
         )
 
-    def frames(self, wanted: range) -> Iterator[Any]:
-        """See `OusterRecording`."""
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
         contents = self._contents(self._topic.name.rpartition("/")[2], self._topic.message_type)
         return islice(frames_of_packets(self.sensor, contents), wanted.start, wanted.stop, wanted.step)
 
@@ -64,7 +66,7 @@ class OusterBag(OusterRecording):
     @cached_property
     def _extent(self) -> tuple[int, float]:
         count, last = 0, 0.0
-        for scan in self._sweeps(range(1 << 62)):
+        for scan in self.scans(faults=Faults()):
             count, last = count + 1, scan.stamp
         return count, last
 

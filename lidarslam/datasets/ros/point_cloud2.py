@@ -10,14 +10,18 @@ from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointField as Po
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.point_table import (
+    coordinates,
     find_colour_fields,
     find_intensity_field,
     read_colours,
     read_intensities,
 )
 from lidarslam.datasets.recording import PointField
-from lidarslam.datasets.times.point_time import find_ring_field, find_time_field
+from lidarslam.datasets.times.azimuth import Sweep
+from lidarslam.datasets.times.point_time import PointTimeModel, TimedCloud, find_ring_field, find_time_field, is_return
 
 # sensor_msgs/PointField, constants INT8 to FLOAT64.
 _TYPES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32", 7: "float32", 8: "float64"}
@@ -34,6 +38,27 @@ class DecodedCloud:
     fields: tuple[PointField, ...]  # all fields of the message
     intensities: NDArray[np.float32] | None = None  # (N,) as stored, None when the points have none
     colours: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue, None when the points have none
+
+    @property
+    def sweep(self) -> Sweep:
+        """The points with their lasers."""
+        return Sweep(self.points, self.rings)
+
+    def timed(self, stamp: float) -> TimedCloud:
+        """The times of the returns."""
+        times = None if self.times is None else self.times[is_return(self.points)]
+        return TimedCloud(self.time_field, times, stamp)
+
+    def offsets(self, model: PointTimeModel, stamp: float) -> FloatArray | None:
+        """Seconds (N,) from the stamp by the time field of the model; None where this cloud lacks it."""
+        return None if self.times is None or self.time_field != model.field else model.offsets(self.times, stamp)
+
+    def scan(self, stamp: float, offsets: FloatArray | None, expects_times: bool, faults: Faults) -> Scan:
+        """The valid points; a scan without usable point times, where others have them, is counted."""
+        scan = Scan.from_raw(self.points, stamp, offsets, self.rings, self.intensities, self.colours)
+        if expects_times and scan.time_offsets is None and len(scan):
+            faults.note(NO_POINT_TIME, f"{stamp:.9f}")
+        return scan
 
 
 def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> DecodedCloud:
@@ -68,15 +93,6 @@ def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> 
 def _attribute_fields(names: Sequence[str]) -> list[str]:
     intensity = find_intensity_field(names)
     return [*([] if intensity is None else [intensity]), *find_colour_fields(names)]
-
-
-def coordinates(cloud: NDArray[np.void]) -> FloatArray:
-    """The fields x, y and z of records as (N, 3) float64."""
-    points = np.empty((*cloud.shape, 3))
-    with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN
-        for column, axis in enumerate("xyz"):
-            points[..., column] = cloud[axis]
-    return points.reshape(-1, 3)
 
 
 def _view(message: PointCloud2, wanted: Sequence[PointFieldMessage]) -> NDArray[np.void]:

@@ -1,41 +1,43 @@
-"""Point clouds of a rosbag: rosbag1, rosbag2 (SQLite or MCAP), as PointCloud2 or Livox CustomMsg."""
+"""Point clouds of a rosbag: rosbag1, rosbag2 (SQLite or MCAP), as PointCloud2, Livox CustomMsg or packets."""
 
-import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults, first_readable, readable_scans
-from lidarslam.datasets.folders.layout import find_truth_file
-from lidarslam.datasets.folders.scan_files import scan_indices
-from lidarslam.datasets.packets.libraries import require
-from lidarslam.datasets.recording import Recording, RecordingInfo, Topic
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.packets.packet_recording import require
+from lidarslam.datasets.recording import ImuSummary, PointField, Recording, SeveralTopicsError, Topic
+from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
 from lidarslam.datasets.ros.bag_message import (
+    CLOUD_TYPES,
     OUSTER_PACKET_TYPES,
     VELODYNE_SCAN_TYPE,
     BagMessage,
     StampSource,
     find_stamp_source,
 )
-from lidarslam.datasets.ros.bag_point_time import BagPointTime
-from lidarslam.datasets.ros.bag_topics import choose_topic, one_part, others_left_out
 from lidarslam.datasets.ros.ouster_bag import OusterBag
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.ros.timed_scan import timed_scan
+from lidarslam.datasets.stored_recording import StoredRecording, truth_beside
+from lidarslam.datasets.times.azimuth import PointTiming, Sweep, point_timing
+from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, TimedCloud, learn_point_time
 from lidarslam.datasets.times.stamps import in_stamp_order
 
-logger = logging.getLogger(__name__)
-
+_PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
+_TOPICS_LISTED = 20
+# Of the messages of one topic, what all others together have at most where they are no recordings: a map now and then.
+_NEGLIGIBLE = 0.05
+# So many pairs of messages, spread over the first so many, are compared at their seams.
+_PAIRS, _LOOKED_AT = 40, 600
 _FRAMES_LOOKED_AT = 10
 
 _DAMAGED = "damaged places in the bag were passed over"
@@ -60,36 +62,25 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     return BagRecording(source, config, bag, topic)
 
 
-class BagRecording:
-    """The messages of one point cloud topic; implements `Recording`.
+class BagRecording(StoredRecording):
+    """The messages of one point cloud topic.
 
-    Stamps are those of the message headers, or, where no header has one, the times of recording.
+    Stamps are those of the message headers, or, where no header has one, the times of recording. A message of another
+    sensor, or one whose stamp is not after those before it, keeps its index but makes no scan; such are counted.
     """
 
-    T_cam_lidar: FloatArray | None = None  # no camera
+    reader = "rosbag"
 
     def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
-        self._source = source
-        self._config = config
+        super().__init__(source, config)
         self._bag = bag
         self._topic = topic
-        folders = [source, source.resolve().parent] if source.is_dir() else [source.parent]
-        self._truth_file = find_truth_file(folders, self.name)
-
-    @property
-    def name(self) -> str:
-        """The folder's name, or the file's without its suffix."""
-        return self._source.resolve().name if self._source.is_dir() else self._source.stem
+        self.topic, self.topics = topic.name, bag.topics
 
     @property
     def frames(self) -> tuple[BagFile, str]:
         """The bag, and the frame of its clouds."""
         return self._bag, self._frame_id
-
-    @cached_property
-    def ground_truth(self) -> Trajectory | None:
-        """The TUM file beside the bag, or inside its folder, named like the bag or ground_truth.tum."""
-        return None if self._truth_file is None else read_tum(self._truth_file)
 
     def __len__(self) -> int:
         return self._topic.messages
@@ -103,35 +94,27 @@ class BagRecording:
     def _imu(self) -> BagImu:
         return BagImu(self._bag, CloudTopic(self._topic, self._frame_id, self._stamps), self._config.imu_topic)
 
+    def _imu_summary(self) -> ImuSummary | None:
+        return self._imu.summary()
+
+    def _truth_path(self) -> Path | None:
+        return truth_beside(self._source, self.name)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """Other topics, a lost index, headers without stamps, and what is wrong with the times of the points."""
-        others = others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
+        others = _others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (others, self._bag.damage, unset, one_part(self._source), *self._point_time.warnings)
+        found = (others, self._bag.damage, unset, _one_part(self._source), *self._point_time.warnings)
         return tuple(warning for warning in found if warning is not None)
 
-    def scans(
-        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
-    ) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)`; only they are decoded.
+    def _notes(self) -> Iterator[str]:
+        return iter(self._point_time.notes)
 
-        A message of another sensor, or one whose stamp is not after those before it, keeps its index but makes no
-        scan; such messages are counted, in a warning where nobody counts.
-        """
-        return self._scans(scan_indices(len(self), start, stop, step), faults)
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
+        return in_stamp_order(self._wanted(wanted, faults, strict), self._stamps.stamp, faults)
 
-    def _scans(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
-        counted = Faults() if faults is None else faults
-        try:
-            messages = in_stamp_order(self._wanted(wanted, counted, faults is None), self._stamps.stamp, counted)
-            yield from readable_scans(messages, lambda message: self._scan(message, counted), faults)
-        finally:
-            if faults is None:
-                for warning in counted.warnings():
-                    logger.warning("%s: %s", self._source, warning)
-
-    def _wanted(self, wanted: range, faults: Faults, strict: bool = False) -> Iterator[BagMessage]:
+    def _wanted(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
         other_sensor = (
             f"scans were left out: they come from another sensor than {self._frame_id!r}; for that one set"
             " reader.frame_id"
@@ -185,56 +168,126 @@ class BagRecording:
             )
         return wanted
 
-    def _scan(self, message: BagMessage, faults: Faults) -> Scan:
-        cloud, stamp = self._decode(message), self._stamps.stamp(message)
-        offsets = self._point_time.offsets(cloud, stamp)
-        return timed_scan(cloud, offsets, stamp, self._point_time.model is not None, faults)
+    def _read(self, item: BagMessage, faults: Faults) -> Scan:
+        cloud, stamp = self._decode(item), self._stamps.stamp(item)
+        model, azimuth = self._point_time.learned.model, self._point_time.azimuth
+        offsets = azimuth.offsets(cloud.sweep) if model is None else cloud.offsets(model, stamp)
+        return cloud.scan(stamp, offsets, self._point_time.model is not None, faults)
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         return self._bag.decode(message, self._config.time_field)
+
+    def _fields(self, item: BagMessage) -> tuple[PointField, ...]:
+        return self._decode(item).fields
 
     @cached_property
     def _stamps(self) -> StampSource:
         return find_stamp_source(self._sound())
 
+    def _last_stamp(self, first: Scan) -> float:
+        return self._last_recorded_stamp or first.stamp
+
     @cached_property
-    def _last_stamp(self) -> float | None:
+    def _last_recorded_stamp(self) -> float | None:
         last = self._bag.last_message(self._topic)
         return None if last is None else self._stamps.stamp(last)
 
     @cached_property
-    def _point_time(self) -> BagPointTime:
+    def _point_time(self) -> PointTiming:
         first, period_s = next(self._sound(), None), None
-        if first is not None and self._last_stamp is not None and len(self) > 1:
-            period_s = (self._last_stamp - self._stamps.stamp(first)) / (len(self) - 1)
-        return BagPointTime(self._bag, self._topic, self._config, self._stamps, period_s)
+        if first is not None and self._last_recorded_stamp is not None and len(self) > 1:
+            period_s = (self._last_recorded_stamp - self._stamps.stamp(first)) / (len(self) - 1)
+        return point_timing(self._learned_time(period_s), self._pairs(), period_s, self._config.time_reference)
 
-    def describe(self) -> RecordingInfo:
-        """Of the first readable scan; see `Recording`."""
-        faults = Faults()
-        messages = in_stamp_order(self._wanted(range(len(self)), faults), self._stamps.stamp, faults)
-        try:
-            message, first, unreadable = first_readable(self._source, messages, lambda item: self._scan(item, faults))
-        except InputError as error:
-            if not faults.left_out:
-                raise
-            raise InputError(f"{error}; {'; '.join(faults.warnings())}") from error
-        cloud = self._decode(message)
-        return RecordingInfo(
-            reader="rosbag",
-            scans=len(self),
-            first=first,
-            last_stamp=self._last_stamp or first.stamp,
-            ground_truth=self._truth_file,
-            point_time=self._point_time.model,
-            topic=self._topic.name,
-            topics=self._bag.topics,
-            fields=cloud.fields,
-            notes=(
-                *self.warnings,
-                *faults.warnings(),
-                *unreadable.warnings(),
-                *self._point_time.notes,
-            ),
-            imu=self._imu.summary(),
-        )
+    def _point_time_model(self) -> PointTimeModel | None:
+        return self._point_time.model
+
+    def _learned_time(self, period_s: float | None) -> LearnedTime:
+        unit, reference = self._config.time_unit, self._config.time_reference
+        if reference == "none":
+            return LearnedTime()
+        if self._topic.message_type == VELODYNE_SCAN_TYPE:
+            unit, reference = "ns", "absolute"  # as they are decoded
+        elif self._topic.message_type in driver_messages.CUSTOM_MESSAGE_TYPES:
+            return learn_point_time(self._timed_clouds(), unit, "absolute", period_s, driver_messages.TIME_UNIT)
+        return learn_point_time(self._timed_clouds(), unit, reference, period_s)
+
+    def _timed_clouds(self) -> Iterator[TimedCloud]:
+        for message in self._sound():
+            with suppress(InputError):  # damaged, which is counted when it is its turn
+                yield self._decode(message).timed(self._stamps.stamp(message))
+
+    def _pairs(self) -> Iterator[list[Sweep]]:
+        apart = max(2, min(self._topic.messages, _LOOKED_AT) // _PAIRS)
+        pair: list[Sweep] = []
+        for number, message in enumerate(islice(self._sound(), _LOOKED_AT)):
+            if number % apart < 2:
+                with suppress(InputError):
+                    pair.append(self._decode(message).sweep)
+            if number % apart == 1:
+                yield pair
+                pair = []
+
+
+def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
+    """The wanted point cloud topic, or the only one with many messages; without clouds, the only one of packets.
+
+    Raises:
+        SeveralTopicsError: there is more than one to choose from.
+        InputError: there is no such topic, or none to choose from; the message lists them.
+    """
+    clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES and topic.messages]
+    packets = [topic for topic in topics if _has_packets(topic) and topic.messages]
+    if wanted is not None:
+        named = [topic for topic in topics if topic.name.lstrip("/") == wanted.lstrip("/")]
+        if chosen := next((topic for topic in named if topic in clouds + packets), None):
+            return chosen
+        found = f"holds {_listing(named)}, which is no point cloud" if named else f"has no topic {wanted!r}"
+        raise InputError(f"{source}: {found}; its point cloud topics: {_listing(clouds)}")
+    clouds = clouds or packets
+    most = max(clouds, key=lambda topic: topic.messages, default=None)
+    if most is not None and sum(topic.messages for topic in clouds) <= (1.0 + _NEGLIGIBLE) * most.messages:
+        return most
+    if clouds:
+        message = f"{source}: several point cloud topics, choose one with --topic: {_listing(clouds)}"
+        raise SeveralTopicsError(message, clouds, topics)
+    if not any(topic.messages for topic in topics):
+        raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
+    others = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
+    hint = (
+        " {} holds raw packets of a sensor whose packets are not decoded: play it through the sensor's driver and"
+        " record the point clouds."
+    )
+    raise InputError(
+        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages."
+        f"{hint.format(others[0].name) if others else ''} Its topics: {_listing(topics)}"
+    )
+
+
+def _others_left_out(topics: Sequence[Topic], chosen: Topic) -> str | None:
+    """A sentence where a bag has point clouds on other topics than the chosen one."""
+    others = [t for t in topics if t.message_type in CLOUD_TYPES and t.messages and t.name != chosen.name]
+    named = ", ".join(f"{topic.name} ({topic.messages})" for topic in others[:_TOPICS_LISTED])
+    return f"{chosen.name} is read; {named} with few messages left out: choose with --topic." if others else None
+
+
+def _has_packets(topic: Topic) -> bool:
+    """Whether a topic holds a sensor's packets that can be decoded."""
+    is_lidar = "lidar" in topic.name.rpartition("/")[2]  # packets of the IMU have the same type
+    return topic.message_type == VELODYNE_SCAN_TYPE or (topic.message_type in OUSTER_PACKET_TYPES and is_lidar)
+
+
+def _one_part(source: Path) -> str | None:
+    """A sentence where a file is one of several of a rosbag2."""
+    folder = source.absolute().parent
+    if source.is_dir() or not (folder / "metadata.yaml").is_file():
+        return None
+    parts = len(list(folder.glob(f"*{source.suffix}")))
+    return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
+
+
+def _listing(topics: Sequence[Topic]) -> str:
+    words = [f"{topic.name} ({topic.message_type}, {topic.messages} messages)" for topic in topics[:_TOPICS_LISTED]]
+    if len(topics) > _TOPICS_LISTED:
+        words.append(f"and {len(topics) - _TOPICS_LISTED} more")
+    return ", ".join(words) or "none"

@@ -230,18 +230,44 @@ class AzimuthTiming:
         return None if self.period_s is None else offsets_from_order(sweep.points, sweep.rings, self.period_s)
 
 
-def time_warnings(learned: LearnedTime, azimuth: AzimuthTiming) -> tuple[str, ...]:
-    """A line on the time field that was not as it should be, with what became of the times, and one on the azimuth."""
-    fault = learned.warning
-    if fault is not None and learned.model is None:
-        without = "." if azimuth.warning is not None else _NO_TIMES
-        fault += without if azimuth.period_s is None else "; the times follow from the azimuth instead."
-    return tuple(warning for warning in (fault, azimuth.warning) if warning is not None)
+@dataclass(frozen=True)
+class PointTiming:
+    """Where the times of a recording's points come from; inferred once, so that all scans are read alike."""
+
+    learned: LearnedTime
+    azimuth: AzimuthTiming
+
+    @property
+    def model(self) -> PointTimeModel | None:
+        """What the offsets come from; None where points have no times."""
+        return self.learned.model if self.azimuth.period_s is None else AZIMUTH_TIME
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Facts for the user."""
+        return () if self.azimuth.note is None else (self.azimuth.note,)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with the time field and what became of the times; times that the azimuth could give."""
+        fault = self.learned.warning
+        if fault is not None and self.learned.model is None:
+            without = "." if self.azimuth.warning is not None else _NO_TIMES
+            fault += without if self.azimuth.period_s is None else "; the times follow from the azimuth instead."
+        return tuple(warning for warning in (fault, self.azimuth.warning) if warning is not None)
 
 
 def pair_starts(scans: int) -> list[int]:
     """Indices, spread over a recording of so many scans, of the first scan of each pair that is compared."""
     return sorted({int(index) for index in np.linspace(0, max(0, scans - 2), _PAIRS)})
+
+
+def point_timing(
+    learned: LearnedTime, runs: Iterable[Iterable[Sweep]], period_s: float | None, reference: TimeReference
+) -> PointTiming:
+    """By a time field, or where that gives no times by the azimuth; arguments as of `infer_azimuth_timing`."""
+    has_field = learned.model is not None
+    return PointTiming(learned, AzimuthTiming() if has_field else infer_azimuth_timing(runs, period_s, reference))
 
 
 def infer_azimuth_timing(

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.published.fetched import cache_folder, fetch, fetched, is_url, url_of
+from lidarslam.datasets.fetched import cache_folder, fetch, fetched, is_url, url_of
 from lidarslam.datasets.registry import open_recording
 
 pytest.importorskip("fsspec")
@@ -174,7 +174,7 @@ def test_a_download_that_broke_off_is_continued(
     breaking_server: str, changes: bool, has_ranges: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Ranged, "has_ranges", has_ranges)
-    monkeypatch.setattr("lidarslam.datasets.published.fetched._BLOCK_BYTES", 10_000)
+    monkeypatch.setattr("lidarslam.datasets.fetched._BLOCK_BYTES", 10_000)
     with pytest.raises(InputError, match="cannot be fetched"):
         fetched(breaking_server)
     if changes:
@@ -188,7 +188,7 @@ def test_a_download_that_broke_off_is_continued(
 
 
 def test_a_source_without_an_end_is_given_up(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidarslam.datasets.published.fetched._MOST_BYTES", 10_000)
+    monkeypatch.setattr("lidarslam.datasets.fetched._MOST_BYTES", 10_000)
     with pytest.raises(InputError, match="are fetched from no source"):
         fetched(f"{server}/walk/")
 

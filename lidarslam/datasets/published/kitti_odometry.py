@@ -18,10 +18,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
-from lidarslam.datasets.kitti.calibration import read_tr
+from lidarslam.datasets.published.kitti_files import read_tr
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
 
 
@@ -76,7 +76,7 @@ class KittiOdometryRecording(FileRecording):
         self.stamps = self._stamps_of(self._numbers)
 
     def _read_times(self) -> FloatArray | None:
-        path = self._folder / "times.txt"
+        path = self._source / "times.txt"
         if not path.is_file():
             return None
         times = read_stamps(path)
@@ -99,12 +99,12 @@ class KittiOdometryRecording(FileRecording):
     @property
     def name(self) -> str:
         """Such as kitti_04."""
-        return f"kitti_{self._folder.resolve().name}"
+        return f"kitti_{self._source.resolve().name}"
 
     @cached_property
     def T_cam_lidar(self) -> FloatArray | None:
         """The extrinsic calibration `Tr`, (4, 4); None without calib.txt."""
-        path = self._folder / "calib.txt"
+        path = self._source / "calib.txt"
         return read_tr(path) if path.is_file() else None
 
     @cached_property
@@ -122,7 +122,7 @@ class KittiOdometryRecording(FileRecording):
 
     @property
     def _pose_file(self) -> Path | None:
-        folder = self._folder.resolve()
+        folder = self._source.resolve()
         candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
         return next((path for path in candidates if path.is_file()), None)
 
@@ -131,7 +131,7 @@ class KittiOdometryRecording(FileRecording):
         return Scan.from_raw(rows[:, :3], self.stamps[index], intensities=rows[:, 3])
 
     def _truth_path(self) -> Path | None:
-        return self._pose_file if (self._folder / "calib.txt").is_file() else None
+        return self._pose_file if (self._source / "calib.txt").is_file() else None
 
     @property
     def _rate_is_assumed(self) -> bool:

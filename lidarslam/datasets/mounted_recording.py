@@ -13,8 +13,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounting.guess import UPRIGHT, Guess, guess_mounting
-from lidarslam.datasets.mounting.rotation import corrected, transform_of, written
+from lidarslam.datasets.mounting import UPRIGHT, Guess, corrected, guess_mounting, transform_of, written
 from lidarslam.datasets.recording import Recording, RecordingInfo
 
 # Scans from one that a guess looks at to the next.

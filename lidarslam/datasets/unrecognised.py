@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from lidarslam.core.text import count
-from lidarslam.datasets.published import evalio_names
+from lidarslam.datasets.published import evalio
 
 ReaderOf = Callable[[Path], str | None]
 """The name of the reader that recognises a path; None where none does."""
@@ -48,7 +48,7 @@ def absent(source: Path) -> str:
     """Why a path does not exist, with the names that are like it."""
     if _URL.match(str(source)):
         return f"{source}: is an address; download the recording and name the file"
-    if (missing_data_set := evalio_names.absent(source)) is not None:
+    if (missing_data_set := evalio.absent(source)) is not None:
         return missing_data_set
     parent = source.parent
     while not parent.is_dir() and parent != parent.parent:

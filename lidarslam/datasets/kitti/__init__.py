@@ -1,1 +1,0 @@
-"""KITTI odometry and raw data."""

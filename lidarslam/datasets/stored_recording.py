@@ -1,0 +1,201 @@
+"""The common part of the readers: a recording on disk, whose scans are read one at a time."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory, read_tum
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.imu_samples import summarise
+from lidarslam.datasets.recording import ImuSummary, PointField, RecordingInfo, Topic
+from lidarslam.datasets.times.point_time import PointTimeModel
+
+logger = logging.getLogger(__name__)
+
+_TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
+
+
+class StoredRecording:
+    """A file or folder; implements `Recording`.
+
+    A reader adds `__len__`, `_items`, `_read`, `_fields` and `_last_stamp`, and what there is of truth, IMU and notes.
+    """
+
+    reader: str
+    imu_name: str = "imu"
+    topic: str | None = None
+    topics: tuple[Topic, ...] = ()
+
+    def __init__(self, source: Path, config: ReaderConfig) -> None:
+        self._source = source
+        self._config = config
+
+    @property
+    def name(self) -> str:
+        """The folder's name, or the file's without its suffix."""
+        return self._source.resolve().name if self._source.is_dir() else self._source.stem
+
+    @property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """No camera."""
+        return None
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at the truth's own stamps."""
+        path = self._truth_path()
+        return None if path is None else read_tum(path)
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU beside the LiDAR."""
+        return None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Faults of the recording as a whole."""
+        return ()
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`; faults are logged where nobody counts them."""
+        return self._scans(scan_indices(len(self), start, stop, step), faults)
+
+    def _scans(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
+        counted = Faults() if faults is None else faults
+        try:
+            for item in self._items(wanted, counted, faults is None):
+                try:
+                    scan = self._read(item, counted)
+                except InputError as error:
+                    if faults is None:
+                        raise
+                    faults.unreadable(error)
+                    continue
+                yield scan
+        finally:
+            if faults is None:
+                for warning in counted.warnings():
+                    logger.warning("%s: %s", self._source, warning)
+
+    def describe(self) -> RecordingInfo:
+        """By the first readable scan; see `Recording`."""
+        faults = Faults()
+        item, first = self._first(faults)
+        return RecordingInfo(
+            reader=self.reader,
+            scans=len(self),
+            first=first,
+            last_stamp=self._last_stamp(first),
+            ground_truth=self._truth_path(),
+            point_time=self._point_time_model(),
+            topic=self.topic,
+            topics=self.topics,
+            fields=self._fields(item),
+            notes=(*self._notes(), *self.warnings, *faults.warnings()),
+            rate_is_assumed=self._rate_is_assumed,
+            imu=self._imu_summary(),
+        )
+
+    def _first(self, faults: Faults) -> tuple[Any, Scan]:
+        """The first readable scan, and what it is read from; the error of the first one where none can be read."""
+        first_error = None
+        for item in self._items(range(len(self)), faults, False):
+            try:
+                return item, self._read(item, faults)
+            except InputError as error:
+                first_error = first_error or error
+                faults.unreadable(error)
+        left_out = "".join(f"; {warning}" for warning in faults.warnings())
+        raise first_error or InputError(f"{self._source}: holds no scan that could be used; record it again{left_out}")
+
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:
+        """What each of the wanted scans is read from; others are counted, or, where it is strict, an error."""
+        raise NotImplementedError
+
+    def _read(self, item: Any, faults: Faults) -> Scan:
+        """The scan; an InputError where it cannot be read."""
+        raise NotImplementedError
+
+    def _fields(self, item: Any) -> tuple[PointField, ...]:
+        """The fields of its points as stored."""
+        raise NotImplementedError
+
+    def _last_stamp(self, first: Scan) -> float:
+        raise NotImplementedError
+
+    @property
+    def _rate_is_assumed(self) -> bool:
+        """Whether the stamps follow from the rate of the settings."""
+        return False
+
+    def _truth_path(self) -> Path | None:
+        return None
+
+    def _point_time_model(self) -> PointTimeModel | None:
+        return None
+
+    def _imu_summary(self) -> ImuSummary | None:
+        return summarise(self.imu_name, self.imu)
+
+    def _notes(self) -> Iterator[str]:
+        return iter(())
+
+
+class FileRecording(StoredRecording):
+    """A folder with a file for each scan. A reader adds `_read`, by the index of a scan, and the stamps."""
+
+    stamps: FloatArray
+    """(N,) seconds."""
+
+    def __init__(self, folder: Path, config: ReaderConfig, files: Sequence[Path]) -> None:
+        super().__init__(folder, config)
+        self._files = files
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[int]:  # noqa: ARG002
+        return iter(wanted)
+
+    def _fields(self, item: int) -> tuple[PointField, ...]:  # noqa: ARG002
+        return tuple(PointField(name, "float32") for name in ("x", "y", "z", "intensity"))
+
+    def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
+        return float(self.stamps[-1])
+
+
+def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
+    """The indices `range(start, stop, step)` of a recording of `count` scans, a stop past the end being the end.
+
+    Raises:
+        InputError: a negative start or stop, or a step below one.
+    """
+    if start < 0 or step < 1 or (stop is not None and stop < 0):
+        raise InputError(
+            f"expected start >= 0, stop >= 0 and step >= 1, got start {start}, stop {stop} and step {step}"
+        )
+    return range(start, count if stop is None else min(stop, count), step)
+
+
+def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | None:
+    """The true trajectory in the first folder that has one; `<stem>.tum` in any of them goes before general names."""
+    own = [folder / f"{stem}.tum" for folder in folders] if stem else []
+    general = [folder / name for folder in folders for name in _TRUTH_NAMES]
+    return next((path for path in own + general if path.is_file()), None)
+
+
+def truth_beside(source: Path, name: str) -> Path | None:
+    """The true trajectory in a recording's folder, or in the one that its file or folder lies in."""
+    return find_truth_file([source, source.resolve().parent] if source.is_dir() else [source.parent], name)
