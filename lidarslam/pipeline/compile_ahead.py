@@ -151,7 +151,7 @@ PARTS = {
     ),
     "alignment": Part(_alignment, tuple(f"odometry.alignment.{kind}" for kind in ("point_to_plane", "steps"))),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
-    "reading": Part(_reading, ("core.scan", "datasets.mounting.rotation")),
+    "reading": Part(_reading, ("core.scan", "datasets.mounting")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),
     "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.consistency"), is_late=True),
 }
