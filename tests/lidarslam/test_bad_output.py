@@ -21,7 +21,7 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import read_tum
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.directory import FILES, RunDirectory
 from lidarslam.viewer.rerun_recording import IncompleteRecordingError, require_complete

@@ -16,7 +16,7 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform, write_tum
-from lidarslam.datasets.folders.formats import read_ply
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 # Where the run's world lies in the recording's.
