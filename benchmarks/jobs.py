@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.compare.comparison import Narrator, compare
-from lidarslam.compare.methods.names import parse_methods
-from lidarslam.compare.request import CompareRequest, RecordingEntry
+from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.core.tasks import Where
 from lidarslam.simulation.record import RecordRequest, record
 
@@ -38,7 +38,7 @@ import json, os, sys
 from pathlib import Path
 out = Path(json.loads(sys.argv[-1])["out"])
 with open(sys.argv[1], "a") as file: file.write(f"{out.parent.name}/{out.name}\\n")
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.methods.process", *sys.argv[2:]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", *sys.argv[2:]])
 """
 
 

@@ -38,7 +38,7 @@ class KissIcpEstimator:
         """It uses no IMU."""
 
     def load(self, sweep: Sweep) -> Callable[[], None]:
-        """The registration, still to be called; see `lidarslam.compare.peers.kiss_slam` on instants."""
+        """The registration, still to be called; see `lidarslam.compare.peers.libraries` on instants."""
         self._instants.append(sweep.end if len(self._instants) >= 2 else sweep.middle)
 
         def register() -> None:

@@ -1,4 +1,4 @@
-"""The command line; each command has a file in `lidarslam.commands`."""
+"""The command line; its commands are in `lidarslam.commands`."""
 
 import contextlib
 import errno
@@ -13,25 +13,17 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.compare import compare
+from lidarslam.commands.compare import compare, demo
 from lidarslam.commands.config import config
-from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
-from lidarslam.commands.exports.bag import export_bag
-from lidarslam.commands.exports.geo import export_geo
-from lidarslam.commands.exports.grid import export_grid
-from lidarslam.commands.exports.map import edit
-from lidarslam.commands.exports.mesh import export_mesh
+from lidarslam.commands.exports import edit, export_bag, export_geo, export_grid, export_mesh
 from lidarslam.commands.live import live
 from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
-from lidarslam.commands.network.export import export
-from lidarslam.commands.network.train import train
-from lidarslam.commands.recordings.datasets import datasets
-from lidarslam.commands.recordings.info import info
-from lidarslam.commands.recordings.simulate import simulate
+from lidarslam.commands.network import export, train
+from lidarslam.commands.recordings import datasets, info, simulate
 from lidarslam.commands.run import run
-from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
+from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.run.interruption import ended_like_interrupted
@@ -150,27 +142,14 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (
-    demo,
-    datasets,
-    info,
-    run,
-    live,
-    localise,
-    merge,
-    simulate,
-    train,
-    export,
-    evaluate,
-    view,
-    compare,
-    edit,
-    export_bag,
-    export_grid,
-    export_mesh,
-    export_geo,
-    config,
-):
+_COMMANDS = (
+    *(demo, datasets, info, simulate),
+    *(run, live, localise, merge),
+    *(train, export),
+    *(evaluate, view, compare, config),
+    *(edit, export_bag, export_grid, export_mesh, export_geo),
+)
+for _command in _COMMANDS:
     main.add_command(_command)
 
 

@@ -179,7 +179,7 @@ def execute(
             phase("writing the results")
             outcome = _write(request, directory, tracked, localiser)
         if run.report and outcome.localisation.found is not None:
-            from lidarslam.viewer.page.run_report import Accuracy, leave_report
+            from lidarslam.viewer.run_report import Accuracy, leave_report
 
             phase("drawing the report")
             leave_report(run.out, Accuracy(outcome.run.metrics))

@@ -24,6 +24,19 @@ WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 """Statuses of a run that came to the recording's end; of any other, the figures are of a part."""
 
 
+_TIMES = (
+    "elapsed_ms_per_scan",
+    "latency_ms_median",
+    "latency_ms_p99",
+    "times_cover",
+    "ms_per_scan_median",
+    "ms_per_scan_p95",
+    "ms_per_scan_p99",
+)
+# Runs of lost scans with a shorter tracked gap between them are one interval.
+_MERGED_GAP_S = 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class MapErrors:
     """Distances of a method's map points from the reference map, thinned for drawing."""
@@ -83,17 +96,12 @@ class MethodResult:
 
     def to_json(self) -> dict[str, object]:
         """The method's entry in comparison.json."""
+        measured = self.metrics is not None or self.map_metrics is not None
         return {
             "status": self.status,
             "message": self.message,
-            "metrics": self._metrics_json(),
-            "elapsed_ms_per_scan": self.elapsed_ms_per_scan,
-            "latency_ms_median": self.latency_ms_median,
-            "latency_ms_p99": self.latency_ms_p99,
-            "times_cover": self.times_cover,
-            "ms_per_scan_median": self.ms_per_scan_median,
-            "ms_per_scan_p95": self.ms_per_scan_p95,
-            "ms_per_scan_p99": self.ms_per_scan_p99,
+            "metrics": metrics_json(self.metrics, self.map_metrics) if measured else None,
+            **{name: getattr(self, name) for name in _TIMES},
             "stage_ms": dict(self.stage_ms),
             "scans": self.scans,
             "lost_scans": self.lost_scans,
@@ -101,12 +109,6 @@ class MethodResult:
             "wall_s": self.wall_s,
             "run": self.run or None,
         }
-
-    def _metrics_json(self) -> dict[str, object] | None:
-        """As metrics.json; None without any reference."""
-        if self.metrics is None and self.map_metrics is None:
-            return None
-        return metrics_json(self.metrics, self.map_metrics)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,3 +184,45 @@ class Comparison:
             "missing": [vars(recording) for recording in self.missing],
             "tables": [table.to_json() for table in self.tables],
         }
+
+
+@dataclass(frozen=True)
+class LostInterval:
+    """Lost scans with no tracked gap of a second or more between them."""
+
+    # first, last: rows of the method's trajectory, both inclusive
+    first: int
+    last: int
+    # begin_s, end_s: their times since the method's first scan
+    begin_s: float
+    end_s: float
+    scans: int  # number of lost scans among them
+    reason: str  # of the first loss, and the number of others
+
+
+def lost_intervals(method: MethodResult) -> list[LostInterval]:
+    """The intervals in order of time; none without a trajectory."""
+    if method.lost is None or method.trajectory is None:
+        return []
+    times_s = method.trajectory.stamps - method.trajectory.stamps[:1]
+    edges = np.flatnonzero(np.diff(np.r_[False, method.lost, False]))
+    runs = list(zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True))
+    reasons = method.lost_reasons if len(method.lost_reasons) == len(runs) else [method.message] * len(runs)
+    merged: list[tuple[int, int, list[str]]] = []
+    for (first, last), reason in zip(runs, reasons, strict=True):
+        if merged and times_s[first] - times_s[merged[-1][1]] < _MERGED_GAP_S:
+            begin, _, earlier = merged.pop()
+            merged.append((begin, last, [*earlier, reason]))
+        else:
+            merged.append((first, last, [reason]))
+    return [
+        LostInterval(
+            first,
+            last,
+            float(times_s[first]),
+            float(times_s[last]),
+            int(method.lost[first : last + 1].sum()),
+            why[0] if len(why) == 1 else f"{why[0]}, and {len(why) - 1} more",
+        )
+        for first, last, why in merged
+    ]

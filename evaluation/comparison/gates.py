@@ -142,12 +142,8 @@ def judge_comparison(
 ) -> list[JudgedGate]:
     """The gates, applied to each method of each recording.
 
-    The method that is the reference has no errors, which fails only gates that name it.
-
-    Args:
-        gates: of all methods or of named ones.
-        sequences: the comparison.
-        summaries: run directory as `MethodResult.run` names it -> content of its summary.json.
+    The method that is the reference has no errors, which fails only gates that name it. The summaries are the contents
+    of summary.json by run directory as `MethodResult.run` names it.
     """
     judged = []
     for sequence in sequences:

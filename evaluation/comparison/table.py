@@ -83,23 +83,17 @@ class Table:
 
     def to_json(self) -> dict[str, object]:
         """The table in comparison.json, each mean with the number of recordings it is taken over."""
-        keys = ("heading", "label", "unit", "digits", "lower_is_better")
-        return {
-            "title": self.title,
-            "note": self.note,
-            "columns": [
-                {**{key: getattr(column, key) for key in keys}, "sequences": list(column.sequences)}
-                for column in self.columns
-            ],
-            "rows": [
-                {
-                    "method": row.method,
-                    "source": row.source,
-                    "cells": [{"value": cell.value, "averaged": cell.averaged} for cell in row.cells],
-                }
-                for row in self.rows
-            ],
-        }
+        keys = ("heading", "label", "unit", "digits", "lower_is_better", "sequences")
+        columns = [{key: getattr(column, key) for key in keys} for column in self.columns]
+        rows = [
+            {
+                "method": row.method,
+                "source": row.source,
+                "cells": [{"value": cell.value, "averaged": cell.averaged} for cell in row.cells],
+            }
+            for row in self.rows
+        ]
+        return {"title": self.title, "note": self.note, "columns": columns, "rows": rows}
 
 
 def printable(text: str) -> str:

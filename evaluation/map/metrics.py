@@ -92,12 +92,8 @@ def compare_maps(
     deviation are of all points, as in the map analysis of the DARPA SubT Challenge, so that outliers beyond the box
     count.
 
-    Args:
-        map_points: in the reference's frame.
-        reference_points: the truth.
-        positions: (K, 3) of the sensor, in the reference's frame; None when unknown.
-        max_range_m: range of the sensor.
-        spacing_m: edge of the cells that both are thinned to.
+    All are in the reference's frame, the positions (K, 3) of the sensor too; both clouds are thinned to cells of
+    `spacing_m`.
     """
     origin = reference_points.mean(axis=0) if len(reference_points) else np.zeros(3)
     mapped, reference = thin(map_points - origin, spacing_m), thin(reference_points - origin, spacing_m)

@@ -20,12 +20,7 @@ def in_bulk(sizes: Sequence[float], most: float, usual: float | None = None) -> 
 
 
 def paths_in_bulk(paths: Sequence[FloatArray], reference: FloatArray | None = None) -> list[bool]:
-    """Which paths (N, 3) do not reach far beyond the reference (K, 3), or beyond the others without one.
-
-    Args:
-        paths: in one world, at least a pose each.
-        reference: the true path.
-    """
+    """Which paths (N, 3), N > 0, do not reach far beyond the true one (K, 3), or beyond the others without one."""
     if reference is None:
         starts = [path[:1] for path in paths]
         return in_bulk([_reach_m(path, start) for path, start in zip(paths, starts, strict=True)], WIDEST)

@@ -1,9 +1,9 @@
-"""The report of a comparison: one page that opens offline, and its tables as Markdown."""
+"""The report of a comparison and the page of one run: pages that open offline, and the tables as Markdown."""
 
 import re
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from hashlib import sha256
 from importlib.resources import files
 from itertools import groupby
@@ -13,14 +13,17 @@ from plotly.offline import get_plotlyjs
 
 from lidarslam.evaluation.comparison.comparison import Comparison, SequenceComparison
 from lidarslam.evaluation.comparison.table import Table, number_text, printable
-from lidarslam.evaluation.report.figures.drift import length_figure, speed_figure
-from lidarslam.evaluation.report.figures.errors import deviation_figure, error_figure
-from lidarslam.evaluation.report.figures.figure import Figure, Styles, method_styles
-from lidarslam.evaluation.report.figures.maps import entropy_figure, map_figure
-from lidarslam.evaluation.report.figures.resources import resources_figure
-from lidarslam.evaluation.report.figures.scans import scan_figure
-from lidarslam.evaluation.report.figures.tracking import tracking_figure
-from lidarslam.evaluation.report.figures.trajectories import trajectory_figure
+from lidarslam.evaluation.report.accuracy import (
+    deviation_figure,
+    entropy_figure,
+    error_figure,
+    length_figure,
+    map_figure,
+    speed_figure,
+    trajectory_figure,
+)
+from lidarslam.evaluation.report.execution import resources_figure, scan_figure, tracking_figure
+from lidarslam.evaluation.report.figure import Figure, Styles, method_styles
 from lidarslam.evaluation.report.tables import published_table, sequence_tables
 
 _TEMPLATES = "templates"
@@ -161,3 +164,25 @@ def _fence(text: str) -> str:
 
 def _file(name: str) -> str:
     return (files("lidarslam.evaluation.report") / _TEMPLATES / name).read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, eq=False)
+class RunPage:
+    """Everything the page of a run is made of."""
+
+    title: str
+    about: Sequence[str]  # lines below the title
+    sequence: SequenceComparison  # the recording with one method, the run
+    picture: str | None  # of map and trajectory, a PNG file in base64
+    caption: str = ""  # of the picture
+    warnings: Sequence[str] = ()
+    summary: Mapping[str, str] = field(default_factory=dict)  # quantity -> text
+    changed: Mapping[str, str] = field(default_factory=dict)  # settings that differ from the defaults
+    settings: str = ""  # all of them as YAML
+
+
+def render_run(page: RunPage) -> str:
+    """The page, which fetches nothing and runs no script but its own; see `render_page`."""
+    styles = method_styles(method.name for method in page.sequence.methods)
+    blocks = list(sequence_blocks(page.sequence, styles))
+    return render_page("run.html.j2", page.title, styles, blocks, page=page, content_blocks=blocks)

@@ -2,8 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
-from lidarslam.evaluation.comparison.lost import lost_intervals
+from lidarslam.evaluation.comparison.comparison import (
+    WHOLE,
+    Comparison,
+    MethodResult,
+    SequenceComparison,
+    lost_intervals,
+)
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, Quantity, times_note
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift

@@ -75,10 +75,7 @@ def align_poses(
     own alignment and a the RMS angle after that of the orientations, the rotation minimises
     sum |p_ref - R p_est|^2 / d^2 + sum angle(R_ref, R R_est)^2 / a^2, the angle by its chord.
 
-    Args:
-        estimate, reference: of the same instants.
-        T_reference_estimate: that of `align`.
-        method: of `align`; `first_pose` and `none` hold for the orientations too.
+    Both are of the same instants and aligned by `align`, whose `first_pose` and `none` hold for the orientations too.
     """
     if method != "se3":
         return T_reference_estimate

@@ -44,10 +44,6 @@ class TrajectoryErrors:
     # distance between the last positions after the first poses are made to coincide; no smaller for a closed loop
     end_error_m: float
 
-    def to_json(self) -> dict[str, float | None]:
-        """The errors, as metrics.json names them."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryMetrics:
@@ -65,17 +61,18 @@ class TrajectoryMetrics:
 
     def absolute_errors(self) -> tuple[FloatArray, FloatArray]:
         """Distance (M,) in metres and angle (M,) in radians of every pose, as in the ATE."""
-        return _by_both(absolute_errors, self.association, self.T_reference_estimate, self.T_reference_estimate_joint)
+        return absolute_errors(self.association, self.T_reference_estimate, self.T_reference_estimate_joint)
 
     def deviations(self) -> tuple[FloatArray, FloatArray]:
         """Translation (M, 3) and roll, pitch, yaw (M, 3) of every pose, see `deviations`."""
-        return _by_both(deviations, self.association, self.T_reference_estimate, self.T_reference_estimate_joint)
+        translations_m, _ = deviations(self.association, self.T_reference_estimate)
+        return translations_m, deviations(self.association, self.T_reference_estimate_joint)[1]
 
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json, with no map compared."""
         return {
             "association": self.association.to_json(),
-            "trajectory": self.errors.to_json(),
+            "trajectory": asdict(self.errors),
             "kitti": self.kitti and self.kitti.to_json(),
             "segments": {str(m): drift and drift.to_json(10) for m, drift in self.segments.items()},
             "map": None,
@@ -150,7 +147,7 @@ def trajectory_errors(
     association: Association, T_reference_estimate: FloatArray, T_reference_estimate_joint: FloatArray
 ) -> TrajectoryErrors:
     """The absolute errors after the given alignments (4, 4), and the relative ones, which need none."""
-    distances_m, angles_rad = _by_both(absolute_errors, association, T_reference_estimate, T_reference_estimate_joint)
+    distances_m, angles_rad = absolute_errors(association, T_reference_estimate, T_reference_estimate_joint)
     step_distances_m, step_angles_rad = relative_errors(association)
     at_start = align(association.estimate, association.reference, "first_pose")
     end = at_start @ association.estimate.T_world_lidar[-1]
@@ -164,13 +161,17 @@ def trajectory_errors(
     )
 
 
-def absolute_errors(association: Association, T_reference_estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
+def absolute_errors(
+    association: Association, T_reference_estimate: FloatArray, T_orientations: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Distance (M,) in metres and angle (M,) in radians between each aligned pose and its reference.
 
-    Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
+    Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. The orientations may have an
+    alignment (4, 4) of their own.
     """
-    aligned = T_reference_estimate @ association.estimate.T_world_lidar
-    return _differences(aligned, association.reference.T_world_lidar)
+    T, T_reference = association.estimate.T_world_lidar, association.reference.T_world_lidar
+    distances_m, angles_rad = _differences(T_reference_estimate @ T, T_reference)
+    return distances_m, angles_rad if T_orientations is None else _differences(T_orientations @ T, T_reference)[1]
 
 
 def relative_errors(association: Association) -> tuple[FloatArray, FloatArray]:
@@ -216,16 +217,6 @@ def disagreement(metrics: TrajectoryMetrics) -> str | None:
     if min(spread_m, own_spread_m) > 0.0 and max(spread_m / own_spread_m, own_spread_m / spread_m) > _OTHER_UNIT:
         return f"{message}; are both in metres?"
     return f"{message}; it drifts, tracking was lost, or the reference belongs to another recording or sensor"
-
-
-def _by_both(
-    errors: Callable[[Association, FloatArray], tuple[FloatArray, FloatArray]],
-    association: Association,
-    T_reference_estimate: FloatArray,
-    T_reference_estimate_joint: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Errors of the positions after the one alignment, and of the orientations after the other."""
-    return errors(association, T_reference_estimate)[0], errors(association, T_reference_estimate_joint)[1]
 
 
 def _spread_m(trajectory: Trajectory) -> float:

@@ -4,8 +4,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lidarslam.compare.assessment.evaluate import EvaluateRequest
-from lidarslam.compare.assessment.evaluate import evaluate as evaluate_request
+from lidarslam.assessment.evaluate import EvaluateRequest
+from lidarslam.assessment.evaluate import evaluate as evaluate_request
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import AlignmentMethod
 

@@ -1,31 +1,33 @@
-"""`lidarslam compare`: several methods in one table."""
+"""`lidarslam compare`: several methods in one table; `lidarslam demo`: on a simulated recording."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.shared.gates import gate_options
-from lidarslam.commands.shared.jobs import jobs_options, take_where
-from lidarslam.commands.shared.names import ShippedFile
-from lidarslam.commands.shared.options import (
+from lidarslam.commands.options import (
     FILE,
     PATH,
     POSITIVE,
-    CommandWithExample,
+    ShippedFile,
+    command,
     config_options,
     default_out,
+    gate_options,
+    jobs_options,
     out_option,
     reader_options,
     scan_options,
+    take_where,
 )
-from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, say
+from lidarslam.commands.terminal import EXIT_GATE, EXIT_MENDABLE, note, say
+from lidarslam.core.errors import ConfigError
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam compare office.mcap
+@command(
+    """lidarslam compare office.mcap
     lidarslam compare KITTI --sequence 04 -o compared/04 --methods learned,learned+map,kiss-icp
     lidarslam compare office.mcap --methods learned+map,learned+loam
     lidarslam compare drive_0005_sync --methods learned+map,learned+imu+map
@@ -33,7 +35,7 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
     lidarslam compare office.mcap --methods kiss-icp,prior --prior wheel_odometry.tum
     lidarslam compare office.mcap --max learned+map:ate=0.1 --max lost=0
     lidarslam compare --benchmark kitti --data KITTI
-    lidarslam compare --benchmark simulated --jobs 4""",
+    lidarslam compare --benchmark simulated --jobs 4"""
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
 @out_option("Folder for runs and report.", "compared/SOURCE_TIME, after the first, or the benchmark")
@@ -66,19 +68,26 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
 def compare(
     ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, out: Path | None, **options: Any
 ) -> None:
-    """Compare several methods on one or more recordings in one report.
+    """Compare several methods on recordings, in one report.
 
     Each method runs in a process of its own, one after another, or --jobs at a time. A method that crashes or gets
     lost is a row of the table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes
     the report so far; else 4 if a bound of --max or --min is not met.
     """
-    from lidarslam.compare.command import run_compare
+    from lidarslam.compare.comparison import run_compare
+    from lidarslam.compare.methods import DEFAULT_METHODS, parse_methods
+    from lidarslam.compare.plan import CompareRequest, RecordingEntry
+    from lidarslam.compare.supervised import Limits
+    from lidarslam.config.settings import reader_settings
+    from lidarslam.core.text import command_line
     from lidarslam.storage.default_places import source_name
 
     if (benchmark is None) == (not sources):
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
     if benchmark is None and options["data"] is not None:
         raise click.UsageError("--data goes with --benchmark")
+    if options["reuse"] and options["overwrite"]:
+        raise ConfigError("--reuse keeps what --overwrite replaces; choose one")
     single = ("prior", "reference_map", "sequence")
     of_sources = single if sources else (*single, "reference", "start", "stop", "step")
     for name in of_sources:
@@ -88,10 +97,38 @@ def compare(
     if out is None:
         name = source_name(sources[0], options["sequence"]) if benchmark is None else benchmark.stem
         out = default_out("compared", name)
-    where = take_where(options)
-    gates = (*options.pop("maxima"), *options.pop("minima"))
-    ending = run_compare(say, note, sources=sources, benchmark=benchmark, out=out, gates=gates, where=where, **options)
-    if not ending.has_results:
+    of_entry = {name: options[name] for name in ("start", "stop", "step", "prior", "reference", "reference_map")}
+    methods = options["methods"] or (DEFAULT_METHODS if benchmark is None else None)
+    of_reader = {"name": options["reader"], "topic": options["topic"], "sequence": options["sequence"]}
+    request = CompareRequest(
+        out=out,
+        recordings=tuple(RecordingEntry(source, **of_entry) for source in sources),
+        methods=() if methods is None else parse_methods(methods),
+        config_file=options["config_file"],
+        settings=(*options["settings"], *reader_settings(**of_reader)),
+        limits=Limits(options["memory_limit_mb"], options["timeout_s"]),
+        where=take_where(options),
+        overwrite=options["overwrite"],
+        reuse=options["reuse"],
+        command=command_line("lidarslam", *sys.argv[1:]),
+        benchmark=benchmark,
+        data=options["data"],
+        gates=(*options["maxima"], *options["minima"]),
+    )
+    outcome = run_compare(request, say, note)
+    if outcome.interrupted or outcome.is_empty:
         ctx.exit(EXIT_MENDABLE)
-    if not ending.gates_passed:
+    if not outcome.gates_passed:
         ctx.exit(EXIT_GATE)
+
+
+@command("lidarslam demo -o demo")
+@click.option(
+    "-o", "--out", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
+)
+@click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
+def demo(out: Path, scans: int) -> None:
+    """Simulate an office, map it, and compare with KISS-ICP."""
+    from lidarslam.compare.demo import format_demo, run_demo
+
+    say(format_demo(run_demo(out, scans, tell=note)))

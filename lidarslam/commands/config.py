@@ -5,15 +5,14 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.shared.options import CommandWithExample, config_options
-from lidarslam.commands.shared.terminal import say
+from lidarslam.commands.options import command, config_options
+from lidarslam.commands.terminal import say
 from lidarslam.core.text import printable
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam config --list
-    lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5""",
+@command(
+    """lidarslam config --list
+    lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5"""
 )
 @click.option("--list", "listing", is_flag=True, help="List the configurations and benchmarks that come along.")
 @config_options

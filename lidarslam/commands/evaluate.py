@@ -5,20 +5,18 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.shared.gates import gate_options
-from lidarslam.commands.shared.options import PATH, POSITIVE, CommandWithExample, latest_run
-from lidarslam.commands.shared.terminal import EXIT_GATE, say
+from lidarslam.commands.options import PATH, POSITIVE, command, gate_options, latest_run
+from lidarslam.commands.terminal import EXIT_GATE, say
 
 _SECONDS = click.FloatRange(min=0.0)
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam evaluate
+@command(
+    """lidarslam evaluate
     lidarslam evaluate runs/04
     lidarslam evaluate runs/04 --max ate=0.1 --max lost=0
     lidarslam evaluate runs/site --reference-map survey.laz --errors errors.ply
-    lidarslam evaluate kitti_00.txt --reference poses/00.txt""",
+    lidarslam evaluate kitti_00.txt --reference poses/00.txt"""
 )
 @click.argument("run", type=PATH, required=False)
 @click.option(
@@ -81,9 +79,9 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
 
     Exit status 4 if a bound of --max or --min is not met; everything is written then too.
     """
-    from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
-    from lidarslam.compare.assessment.map_evaluation import MapOptions
-    from lidarslam.compare.assessment.text import format_evaluation
+    from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
+    from lidarslam.assessment.map_evaluation import MapOptions
+    from lidarslam.assessment.text import format_evaluation
     from lidarslam.evaluation.comparison.gates import format_gates, judge
     from lidarslam.storage.finished_run import read_summary
 

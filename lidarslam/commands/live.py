@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.shared.options import (
+from lidarslam.commands.options import (
     OVERWRITE,
     POSE_GRAPH,
     POSITIVE,
     REPORT,
     RERUN,
-    CommandWithExample,
+    command,
     config_options,
     default_out,
     map_options,
@@ -22,15 +22,14 @@ from lidarslam.commands.shared.options import (
     take_config,
     take_map_formats,
 )
-from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam live
+@command(
+    """lidarslam live
     lidarslam live --topic /ouster/points -o runs/tour --rerun web
     ROS_DOMAIN_ID=7 lidarslam live --topic /points --base-frame base_link --pose-graph
-    lidarslam live --topic /points --duration 60 --odometry constant-velocity --no-tf""",
+    lidarslam live --topic /points --duration 60 --odometry constant-velocity --no-tf"""
 )
 @click.option("--topic", metavar="TOPIC", help="Topic of the clouds.  [default: the only one]")
 @click.option(

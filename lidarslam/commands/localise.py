@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.shared.options import (
+from lidarslam.commands.options import (
     OVERWRITE,
     PATH,
     REPORT,
     RERUN,
     SOURCE,
-    CommandWithExample,
+    command,
     config_options,
     default_out,
     odometry_options,
@@ -21,15 +21,14 @@ from lidarslam.commands.shared.options import (
     scan_options,
     take_config,
 )
-from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam localise tuesday.mcap --map runs/monday
+@command(
+    """lidarslam localise tuesday.mcap --map runs/monday
     lidarslam localise tuesday.mcap --map runs/monday -o runs/tuesday --rerun save
     lidarslam localise tuesday.mcap --map hall.ply --guess 12.5 -3 90
-    lidarslam view runs/monday runs/tuesday""",
+    lidarslam view runs/monday runs/tuesday"""
 )
 @SOURCE
 @click.option(
@@ -59,7 +58,7 @@ def localise(
     guess: tuple[float, float, float] | None,
     **options: Any,
 ) -> None:
-    """Find a recording in the map of an earlier run, and track it there.
+    """Find and track a recording in the map of an earlier run.
 
     The poses in DIR are in the frame of that map, which is not changed. Scans that are not sure to fit are lost, with
     the reason; the exit status is 3 if there are any, and 1 if the recording was not found at all.

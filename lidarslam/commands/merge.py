@@ -5,27 +5,27 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.shared.jobs import jobs_options, take_where
-from lidarslam.commands.shared.options import (
+from lidarslam.commands.options import (
     PATH,
-    CommandWithExample,
+    command,
     config_options,
     default_out,
+    jobs_options,
     map_options,
     odometry_options,
     out_option,
     reader_options,
     take_config,
     take_map_formats,
+    take_where,
 )
-from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam merge ground_floor.mcap stairs.mcap -o building
+@command(
+    """lidarslam merge ground_floor.mcap stairs.mcap -o building
     lidarslam merge ground_floor.mcap stairs.mcap -o building --resume
-    lidarslam merge *.mcap -o site --jobs 4""",
+    lidarslam merge *.mcap -o site --jobs 4"""
 )
 @click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
 @out_option("Directory of the merged map.", "merged/SOURCE_TIME, after the first")

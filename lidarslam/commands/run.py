@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.shared.options import (
+from lidarslam.commands.options import (
     FILE,
     GNSS,
     LOOPS,
@@ -15,7 +15,7 @@ from lidarslam.commands.shared.options import (
     REPORT,
     RERUN,
     SOURCE,
-    CommandWithExample,
+    command,
     config_options,
     default_out,
     map_options,
@@ -28,17 +28,16 @@ from lidarslam.commands.shared.options import (
     take_loops,
     take_map_formats,
 )
-from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam run office.mcap
+@command(
+    """lidarslam run office.mcap
     lidarslam run office.mcap --resume
     lidarslam run KITTI --sequence 04 -o runs/04
     lidarslam run office.mcap -o runs/loam --mapping loam --rerun save
     lidarslam run office.mcap -o runs/wheels --prior wheel_odometry.tum
-    lidarslam run office.mcap --odometry kiss-icp --no-mapping -c indoor""",
+    lidarslam run office.mcap --odometry kiss-icp --no-mapping -c indoor"""
 )
 @SOURCE
 @out_option("Run directory for the results.", "runs/SOURCE_TIME; with --resume, the unfinished run of SOURCE in runs")

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.shared.options import (
+from lidarslam.commands.options import (
     PATH,
-    CommandWithExample,
+    command,
     config_options,
     latest_run,
     reader_options,
     scan_options,
     take_config,
 )
-from lidarslam.commands.shared.terminal import note, say, serving, wait_for_interrupt
+from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
 from lidarslam.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,16 +26,15 @@ if TYPE_CHECKING:
 _RRD = ".rrd"
 
 
-@click.command(
-    cls=CommandWithExample,
-    epilog="""lidarslam view
+@command(
+    """lidarslam view
     lidarslam view runs/04 runs/wheels --web
     lidarslam view office.mcap --web
     lidarslam view compared/04 --web
     lidarslam view runs/04/recording.rrd
     lidarslam view runs/04 --picture map.png
     lidarslam view compared/04 --picture maps.png
-    lidarslam view runs/04 --video map.gif""",
+    lidarslam view runs/04 --video map.gif"""
 )
 @click.argument("places", type=PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
@@ -72,7 +71,7 @@ def view(
     oblique: bool,
     **options: Any,
 ) -> None:
-    """Show finished runs, the raw scans of a recording, or a Rerun recording.
+    """Show runs, the scans of a recording, or a Rerun recording.
 
     RUN is a run directory, or the folder of a comparison for its runs; several are shown in one space, aligned with the
     ground truth if there is one.  [default: the latest run in runs]  SOURCE is a recording; --start, --stop and --step
@@ -126,7 +125,7 @@ def _serve(show: "Callable[[WebPage], None]") -> None:
 
 def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, Any]) -> Any:
     """What is shown; its type is not named because that would import Rerun."""
-    from lidarslam.compare.assessment.inputs import truth_of_run
+    from lidarslam.assessment.inputs import truth_of_run
     from lidarslam.config.settings import load_config
     from lidarslam.datasets.registry import is_recording
     from lidarslam.storage.comparison_folder import run_directories
@@ -159,9 +158,9 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
 
 def _drawn(places: tuple[Path, ...], colour: Any, apart: bool) -> list[Any]:
     """The runs that are drawn; their type is not named because that would import scipy."""
-    from lidarslam.compare.assessment.inputs import truth_of_run
+    from lidarslam.assessment.inputs import truth_of_run
     from lidarslam.storage.comparison_folder import run_directories
-    from lidarslam.viewer.drawn_runs import load_drawn_runs, require_quantity
+    from lidarslam.viewer.picture import load_drawn_runs, require_quantity
 
     first = run_directories(places[0])[0]
     runs = load_drawn_runs(places, truth_of_run(first) if colour == "error" and first.is_dir() else None)

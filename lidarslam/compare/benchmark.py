@@ -8,16 +8,15 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from lidarslam.compare.methods.names import Method, parse_method
-from lidarslam.compare.request import CompareRequest, RecordingEntry
+from lidarslam.compare.methods import Method, parse_method
+from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import require_no_link
 from lidarslam.core.tasks import open_tasks
 from lidarslam.datasets.fetched import fetched, is_url
 from lidarslam.datasets.published.evalio import located
-from lidarslam.evaluation.comparison.mean_table import TablePlan
-from lidarslam.evaluation.comparison.quantities import find_quantity
+from lidarslam.evaluation.comparison.quantities import TablePlan, find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
 from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
 from lidarslam.storage.comparison_folder import RECORDINGS
@@ -125,21 +124,18 @@ def load_benchmark(path: Path) -> Benchmark:
         raise ConfigError(f"{path}: {'; '.join(faults)}") from None
 
 
-def fill_request(request: CompareRequest, benchmark: Benchmark, data: Path | None) -> CompareRequest:
+def fill_request(request: CompareRequest, benchmark: Benchmark) -> CompareRequest:
     """The comparison of a benchmark; methods that the request names already replace its own.
 
-    Args:
-        request: where it goes, limits, settings.
-        benchmark: the file's content.
-        data: the folder that the benchmark's paths are relative to; None: the current one, and for the recordings
-            that are simulated one in `request.out`.
+    The benchmark's paths are relative to `request.data`; without it, to the current folder, and those of the
+    recordings that are simulated to one in `request.out`.
 
     Raises:
         ConfigError: a method does not exist, or not in this version.
     """
     return replace(
         request,
-        recordings=tuple(_located(entry, benchmark, data, request.out) for entry in benchmark.recordings),
+        recordings=tuple(_located(entry, benchmark, request.data, request.out) for entry in benchmark.recordings),
         methods=request.methods or tuple(_method(method) for method in benchmark.methods),
         settings=(*benchmark.set, *request.settings),
         skip_missing=True,
@@ -148,7 +144,7 @@ def fill_request(request: CompareRequest, benchmark: Benchmark, data: Path | Non
     )
 
 
-def require_data(request: CompareRequest, benchmark: Benchmark, data: Path | None) -> None:
+def require_data(request: CompareRequest, benchmark: Benchmark) -> None:
     """Refuse a benchmark none of whose recordings is there or can be simulated.
 
     Raises:
@@ -156,7 +152,7 @@ def require_data(request: CompareRequest, benchmark: Benchmark, data: Path | Non
     """
     if any(entry.simulate or (entry.source and entry.source.exists()) for entry in request.recordings):
         return
-    place = "the current folder" if data is None else str(data)
+    place = "the current folder" if request.data is None else str(request.data)
     needed = "name their folder with --data" if benchmark.data is None else f"--data is {benchmark.data}"
     raise InputError(f"{benchmark.title}: none of its recordings is in {place}; {needed}")
 

@@ -1,25 +1,35 @@
 """A comparison: every method on every recording, each in its own process; one result for all."""
 
+import contextlib
+import tarfile
+import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 
-from lidarslam.compare.methods.process import MethodRun
-from lidarslam.compare.methods.run import COMMAND, finished_before, obstacle, run_method
+from lidarslam.compare.benchmark import fill_request, load_benchmark, make_recordings, require_data
+from lidarslam.compare.method_process import MethodRun
+from lidarslam.compare.method_run import COMMAND, PROCESS, clear, finished_before, obstacle, run_method
 from lidarslam.compare.metrics import measure
-from lidarslam.compare.plan import PlannedRecording, make_plan
-from lidarslam.compare.request import CompareRequest
-from lidarslam.compare.side_by_side import run_side_by_side
-from lidarslam.compare.text import format_result
+from lidarslam.compare.plan import CompareRequest, PlannedRecording, make_plan
+from lidarslam.compare.supervised import Limits
+from lidarslam.compare.text import format_comparison, format_result
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
+from lidarslam.core.tasks import Where, open_tasks
 from lidarslam.core.text import count
+from lidarslam.datasets.fetched import fetch, url_of
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
-from lidarslam.evaluation.comparison.mean_table import mean_table
+from lidarslam.evaluation.comparison.gates import format_gates, judge_comparison, require_methods
+from lidarslam.evaluation.comparison.quantities import mean_table
+from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.machine import machine, versions
+from lidarslam.run.progress import show_count
 from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
 from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.finished_run import read_summary
 
 _INTERRUPTED = "the comparison was interrupted before its turn"
 
@@ -37,10 +47,11 @@ class Narrator:
 
 @dataclass(frozen=True)
 class CompareOutcome:
-    """A comparison, and whether Ctrl-C ended it early."""
+    """A comparison, and how it ended."""
 
     comparison: Comparison
-    interrupted: bool
+    interrupted: bool  # whether Ctrl-C ended it early
+    gates_passed: bool = True  # whether every bound of the request was met
 
     @property
     def is_empty(self) -> bool:
@@ -49,15 +60,33 @@ class CompareOutcome:
         return all(result.trajectory is None for result in results)
 
 
+def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Callable[[str], None]) -> CompareOutcome:
+    """Compare, and print the tables and the gates: `say` prints the result, `tell` the progress."""
+    with ended_like_interrupted():  # or the methods would outlive a request to end
+        if request.benchmark is not None:
+            benchmark = load_benchmark(request.benchmark)
+            request = fill_request(request, benchmark)
+            require_data(request, benchmark)
+        require_methods(request.gates, [method.name for method in request.methods])
+        make_recordings(request, show_count)
+        outcome = compare(request, Narrator(show_count, tell))
+    say(format_comparison(outcome.comparison, request.out))
+    if outcome.is_empty:
+        tell("no method came to a result; the table says why")
+    if not request.gates:
+        return outcome
+    sequences = outcome.comparison.sequences
+    runs = [result.run for sequence in sequences for result in sequence.methods if result.run]
+    judged = judge_comparison(request.gates, sequences, {run: read_summary(request.out / run) for run in runs})
+    say(f"\n{format_gates(judged)}")
+    return replace(outcome, gates_passed=all(gate.passed for gate in judged))
+
+
 def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = COMMAND) -> CompareOutcome:
     """Run, evaluate, and write comparison.json and the report.
 
-    A method that fails is a row; Ctrl-C ends the method at work, and the results so far are written.
-
-    Args:
-        request: recordings, methods, limits.
-        narrator: of the progress.
-        command: the process of each method, see `run_method`.
+    A method that fails is a row; Ctrl-C ends the method at work, and the results so far are written. The command is the
+    process of each method, see `run_method`.
 
     Raises:
         LidarSlamError: the sources, the configuration or the output directory are not usable.
@@ -77,6 +106,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
         for planned in recordings:
             sequences.append(turns.measured(planned))
             if len(recordings) > 1:
+                (request.out / planned.name).mkdir(exist_ok=True)  # not made where no method had its turn
                 RunDirectory(request.out / planned.name).write_json(COMPARISON, sequences[-1].to_json())
         names = [sequence.sequence for sequence in sequences]
         comparison = Comparison(
@@ -158,3 +188,82 @@ class _Turns:
             self.interrupted = True
             return MethodResult(run.name, "not run", _INTERRUPTED)
         return result
+
+
+@dataclass(frozen=True)
+class MethodTask:
+    """One method on one recording, as a task."""
+
+    run: MethodRun
+    limits: Limits
+    command: Sequence[str] | None  # the process; None: that of the machine at work
+    folder: str  # that relative paths are relative to
+    url: str | None  # of the source, where it was fetched
+    is_remote: bool  # whether the run directory comes back with the result: the machine may have other disks
+
+
+@dataclass(frozen=True, eq=False)
+class MethodDone:
+    """The result of a task."""
+
+    result: MethodResult
+    packed: bytes | None  # the run directory of a machine with other disks
+
+
+def run_side_by_side(
+    runs: Sequence[MethodRun],
+    limits: Limits,
+    command: Sequence[str],
+    where: Where,
+    on_done: Callable[[int, MethodResult], None],
+) -> bool:
+    """Run methods to any end, as `run_method`; whether Ctrl-C ended that early.
+
+    `on_done` is called with the index of a run and its result, as they end.
+
+    Raises:
+        LidarSlamError: the tasks cannot be carried out.
+    """
+    is_remote, own = where.cluster is not None, None if command == COMMAND else command
+    items = [MethodTask(run, limits, own, str(Path.cwd()), url_of(run.request.source), is_remote) for run in runs]
+
+    def take(index: int, done: MethodDone) -> None:
+        if done.packed is not None:
+            clear(runs[index].request.out)
+            with tarfile.open(fileobj=BytesIO(done.packed)) as archive:
+                archive.extractall(runs[index].request.out, filter="data")
+        on_done(index, done.result)
+
+    try:
+        with open_tasks(where) as tasks:
+            for _ in tasks.run(run_task, items, take):
+                pass
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def run_task(task: MethodTask) -> MethodDone:
+    """Run the method of a task; the run directory is packed where it has to be brought back."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a machine without that folder has no file there either
+            stack.enter_context(contextlib.chdir(task.folder))
+        request = task.run.request
+        if task.url is not None:
+            fetch(task.url, request.source)
+        if task.is_remote:
+            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarslam-")))
+            # The last two parts stand in the result.
+            request = replace(request, out=place / request.out.parent.name / request.out.name)
+        run = replace(task.run, request=request)
+        result, _ = run_method(run, task.limits, lambda *_: None, task.command or COMMAND)
+        return MethodDone(result, _packed(request.out) if task.is_remote else None)
+
+
+def _packed(folder: Path) -> bytes:
+    """The files of a run directory; last the one that says how the process ended, which marks a whole one."""
+    packed = BytesIO()
+    with tarfile.open(fileobj=packed, mode="w") as archive:
+        for path in sorted(folder.iterdir(), key=lambda path: (path.name == PROCESS, path)):
+            archive.add(path, path.name)
+    return packed.getvalue()

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidarslam.compare.assessment.inputs import truth_of_run
+from lidarslam.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
-from lidarslam.compare.methods.names import parse_methods
-from lidarslam.compare.request import CompareRequest, RecordingEntry
+from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text import as_typed, command_line
@@ -20,8 +20,7 @@ from lidarslam.run.progress import show_count
 from lidarslam.simulation.record import RecordRequest, record
 from lidarslam.storage.comparison_folder import REPORT_HTML
 from lidarslam.storage.finished_run import load_run
-from lidarslam.viewer.drawn_runs import load_drawn_runs
-from lidarslam.viewer.picture import draw_apart, fit_frame
+from lidarslam.viewer.picture import draw_apart, fit_frame, load_drawn_runs
 
 RECORDING, REPLAY = "recording", "demo.rrd"
 METHODS = "learned+map+graph,kiss-icp,kiss-icp@scene"
@@ -37,13 +36,9 @@ class Demo:
 
 
 def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], None] = lambda _: None) -> Demo:
-    """Record, run the methods, compare them, draw the maps.
+    """Record so many sweeps, run the methods, compare them, draw the maps; an earlier demonstration is replaced.
 
-    Args:
-        out: the folder everything goes to; an earlier demonstration in it is replaced.
-        scans: how many sweeps are recorded, ten a second.
-        seed: of the office, the drive and the noise.
-        tell: called with a line for each finished method.
+    `tell` is called with a line for each finished method.
     """
     source = out / RECORDING
     with show_count("recording") as counted:

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarslam.compare.assessment.inputs import read_estimate
-from lidarslam.compare.assessment.map_evaluation import evaluate_map
-from lidarslam.compare.assessment.reference_map import ReferenceMap, find_reference_map, load_reference_map
+from lidarslam.assessment.inputs import ReferenceMap, find_reference_map, load_reference_map, read_estimate
+from lidarslam.assessment.map_evaluation import evaluate_map
 from lidarslam.compare.peers.scene import scene_note
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
@@ -18,13 +17,7 @@ GROUND_TRUTH = "ground truth"
 
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
-    """The results on one recording, with their errors.
-
-    Args:
-        planned: the recording.
-        results: one a method.
-        with_maps: whether maps are compared with the reference map, if there is one.
-    """
+    """The results on one recording, one a method, with the errors of trajectories and, if asked for, of maps."""
     notes = [] if planned.range_m is None else [scene_note(planned.range_m)]
     reference = _find_reference(planned, results, notes)
     measured = [_measure_trajectory(result, reference) for result in results]

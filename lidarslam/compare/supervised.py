@@ -50,12 +50,7 @@ def supervise(
 
     On Ctrl-C the command is interrupted too and given a minute to write its results; a second Ctrl-C ends that.
 
-    Args:
-        command: program and arguments.
-        log: file for its standard error.
-        limits: of memory and time.
-        on_line: called with every line of its standard output, from another thread.
-        cwd: where it runs.
+    Its standard error goes to a log; `on_line` is called with every line of its standard output, from another thread.
     """
     started = time.monotonic()
     with (

@@ -15,9 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.bounds import bounds_text
 from lidarslam.config.shipped import CONFIGS, shipped_files
-from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
+from lidarslam.config.yaml_text import YamlError, bounds_text, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig

@@ -1,14 +1,15 @@
-"""YAML in and out: plain values only, never tags that make objects; settings with a comment each."""
+"""YAML in and out: plain values only, never tags that make objects; settings with a comment and their bounds each."""
 
 import re
 from collections.abc import Hashable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import yaml
+from annotated_types import Ge, Le
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
-from lidarslam.config.bounds import bounds_text
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.text import one_line
 
@@ -18,6 +19,10 @@ _MERGE_TAG = "tag:yaml.org,2002:merge"
 # Comments begin at this column at the latest, unless the setting is longer.
 _LAST_COLUMN = 48
 _FIRST_CLAUSE = re.compile(r"[.;\n]")
+# Numbers as YAML 1.2 has them; in 1.1, which PyYAML reads, 010 is eight and 1:30 is ninety.
+_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+_FLOAT = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan")
+_NUMBERS = {"tag:yaml.org,2002:int": _INT, "tag:yaml.org,2002:float": _FLOAT}
 
 
 class YamlError(ConfigError):
@@ -30,12 +35,6 @@ class YamlError(ConfigError):
     def __init__(self, message: str, is_syntax: bool = False) -> None:
         super().__init__(message)
         self.is_syntax = is_syntax
-
-
-# Numbers as YAML 1.2 has them; in 1.1, which PyYAML reads, 010 is eight and 1:30 is ninety.
-_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
-_FLOAT = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan")
-_NUMBERS = {"tag:yaml.org,2002:int": _INT, "tag:yaml.org,2002:float": _FLOAT}
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -136,3 +135,32 @@ def _flow(value: Any) -> str:
     """A value on one line."""
     text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=float("inf"))
     return text.removesuffix("\n").removesuffix("\n...")
+
+
+def bounds_of(field: FieldInfo) -> tuple[float, float] | None:
+    """The least and the largest value of a number, also where it may be null or lies in a tuple; None of no number."""
+    marks = list(_marks(field.metadata, field.annotation))
+    low = next((mark.ge for mark in marks if isinstance(mark, Ge)), None)
+    high = next((mark.le for mark in marks if isinstance(mark, Le)), None)
+    return None if low is None or high is None else (low, high)  # type: ignore[return-value] # they are numbers
+
+
+def bounds_text(field: FieldInfo) -> str | None:
+    """The bounds in words, such as `0.01 to 10` or `[3 numbers, 0 to 1]`, with the words that may stand instead.
+
+    None of no number.
+    """
+    bounds = bounds_of(field)
+    if bounds is None:
+        return None
+    words = [word for kind in get_args(field.annotation) if get_origin(kind) is Literal for word in get_args(kind)]
+    numbers = " to ".join(f"{b:,.0f}" if b == int(b) else f"{b:g}" for b in bounds)
+    length = next((len(get_args(kind)) for kind in get_args(field.annotation) if get_origin(kind) is tuple), None)
+    return " or ".join([numbers if length is None else f"[{length} numbers, {numbers}]", *words])
+
+
+def _marks(metadata: list[Any], annotation: Any) -> Iterator[Any]:
+    for mark in metadata:
+        yield from mark.metadata if isinstance(mark, FieldInfo) else (mark,)
+    for part in get_args(annotation):
+        yield from _marks(list(getattr(part, "__metadata__", ())), part)

@@ -19,14 +19,15 @@ from rosbags.interfaces import (
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.files import cannot_write, make_directory
-from lidarslam.core.geometry import inverse
-from lidarslam.core.scan import PointAttributes, Scan
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.scan import PointAttributes
+from lidarslam.datasets.ros import made_messages as made
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import write_chunk_checksums
-from lidarslam.exports import ros_messages as ros
-from lidarslam.exports.run_scans import RunScans
-from lidarslam.mapping.global_map.point_cloud import PointCloud
+from lidarslam.exports.source import RunScans
 from lidarslam.storage.finished_run import load_map
 
 # REP 105.
@@ -58,14 +59,10 @@ class WrittenBag:
 def export_bag(
     run: RunScans, out: Path, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
 ) -> WrittenBag:
-    """Write odometry, tf, path and map of a run, and its deskewed clouds.
+    """Write odometry, tf, path and map of a run, and its deskewed clouds, for which the recording is read again.
 
-    Args:
-        run: the scans.
-        out: the file; its suffix is one of `SUFFIXES`, and none gives a folder.
-        lidar_frame: name of the frame of the LiDAR.
-        with_clouds: whether the recording is read again for the clouds.
-        count: called with the number of scans done, and of all.
+    The file has one of `SUFFIXES`, of which none gives a folder; `count` is called with the number of scans done, and
+    of all.
 
     Raises:
         InputError: the map or the recording cannot be read.
@@ -104,14 +101,16 @@ def _write(
     topics.write(_PATH_TOPIC, first, messages.path(trajectory.stamps, _MAP_FRAME, trajectory.T_world_lidar))
     cloud = load_map(run.run)
     if len(cloud):
-        topics.write(_MAP_TOPIC, first, _map_message(messages, first, cloud))
+        attributes = cloud.attributes.only(("intensity", "rgb"))
+        topics.write(_MAP_TOPIC, first, messages.cloud(first, _MAP_FRAME, cloud.points, attributes))
     written = 0
     if with_clouds:
         for index, scan in run.deskewed():
             for number in range(written, index + 1):
                 _write_pose(topics, run, number, lidar_frame)
             written = index + 1
-            topics.write(_CLOUD_TOPIC, scan.stamp, _scan_message(messages, scan, lidar_frame))
+            attributes = PointAttributes(intensity=scan.intensities, rgb=scan.colours, ring=scan.rings)
+            topics.write(_CLOUD_TOPIC, scan.stamp, messages.cloud(scan.stamp, lidar_frame, scan.points, attributes))
             count(written, len(trajectory))
     for number in range(written, len(trajectory)):
         _write_pose(topics, run, number, lidar_frame)
@@ -134,21 +133,12 @@ def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str)
     topics.write(_ODOMETRY_TOPIC, stamp, message)
 
 
-def _scan_message(messages: ros.RosMessages, scan: Scan, lidar_frame: str) -> Any:
-    attributes = PointAttributes(intensity=scan.intensities, rgb=scan.colours, ring=scan.rings)
-    return messages.cloud(scan.stamp, lidar_frame, scan.points, attributes)
-
-
-def _map_message(messages: ros.RosMessages, stamp: float, cloud: PointCloud) -> Any:
-    return messages.cloud(stamp, _MAP_FRAME, cloud.points, cloud.attributes.only(("intensity", "rgb")))
-
-
 class _Topics:
     """The topics of a bag, opened with their first message."""
 
     def __init__(self, bag: Rosbag1Writer | Rosbag2Writer) -> None:
         self._bag = bag
-        self.messages = ros.RosMessages(ros2=isinstance(bag, Rosbag2Writer))
+        self.messages = RosMessages(ros2=isinstance(bag, Rosbag2Writer))
         self._connections: dict[str, Any] = {}
         self.counts: dict[str, int] = {}
 
@@ -157,7 +147,7 @@ class _Topics:
         if topic not in self._connections:
             self._connections[topic] = self._open(topic, message.__msgtype__)
         data = self.messages.serialize(message)
-        self._bag.write(self._connections[topic], ros.nanoseconds(stamp), data)
+        self._bag.write(self._connections[topic], nanoseconds(stamp), data)
         self.counts[topic] = self.counts.get(topic, 0) + 1
 
     def _open(self, topic: str, message_type: str) -> Any:
@@ -182,3 +172,67 @@ def _qos(latched: bool) -> Qos:
         liveliness_lease_duration=_LONGEST,
         avoid_ros_namespace_conventions=False,
     )
+
+
+def nanoseconds(stamp: float) -> int:
+    """A stamp in whole nanoseconds; `nanoseconds(stamp) / 10**9` is the stamp again."""
+    return round(stamp * 10**9)
+
+
+class RosMessages:
+    """Makes and serialises messages: for ROS 2 as CDR, for ROS 1 packed."""
+
+    def __init__(self, ros2: bool) -> None:
+        self._ros2 = ros2
+        self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+        if not ros2:  # ROS 2's store has it
+            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+        self._sequence = 0
+
+    def serialize(self, message: Any) -> bytes:
+        """The bytes of a message."""
+        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
+        return bytes(serialize(message, message.__msgtype__))
+
+    def odometry(
+        self, stamp: float, frames: tuple[str, str], T: FloatArray, sigmas: FloatArray, velocity: FloatArray
+    ) -> Any:
+        """A pose (4, 4) of the second frame in the first, with standard deviations (6,) and body velocity (6,).
+
+        Both have the rotation first and the axes of the second frame; standard deviations that are not finite are
+        unknown.
+        """
+        covariance = np.diag(sigmas**2) if np.isfinite(sigmas).all() else None
+        return made.odometry(self.store, self._header(stamp, frames[0]), frames[1], T, covariance, velocity)
+
+    def transforms(self, stamp: float, *poses: tuple[str, str, FloatArray]) -> Any:
+        """Parent frame, child frame and pose (4, 4) of the child in the parent, of each transform."""
+        return made.transforms(self.store, *((self._header(stamp, parent), child, T) for parent, child, T in poses))
+
+    def path(self, stamps: FloatArray, frame: str, T: FloatArray) -> Any:
+        """Poses (N, 4, 4) in a frame; the header has the last stamp."""
+        types, store = self.store.types, self.store
+        poses = [
+            types["geometry_msgs/msg/PoseStamped"](self._header(float(stamp), frame), made.pose(store, each))
+            for stamp, each in zip(stamps, T, strict=True)
+        ]
+        return types["nav_msgs/msg/Path"](self._header(float(stamps[-1]), frame), poses)
+
+    def cloud(self, stamp: float, frame: str, points: FloatArray, attributes: PointAttributes) -> Any:
+        """Points (N, 3) with intensity, ring and colour as far as there are any."""
+        columns: dict[str, Any] = {axis: points[:, n].astype(np.float32) for n, axis in enumerate("xyz")}
+        if attributes.intensity is not None:
+            columns["intensity"] = attributes.intensity.astype(np.float32)
+        if attributes.rgb is not None:  # packed into the bits of a float, as the Point Cloud Library does
+            red, green, blue = attributes.rgb.T.astype(np.uint32)
+            columns["rgb"] = (red << 16 | green << 8 | blue).view(np.float32)
+        if attributes.ring is not None:
+            columns["ring"] = np.clip(attributes.ring, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+        records = np.empty(len(points), np.dtype([(name, values.dtype) for name, values in columns.items()]))
+        for name, values in columns.items():
+            records[name] = values
+        return made.point_cloud(self.store, self._header(stamp, frame), records)
+
+    def _header(self, stamp: float, frame: str) -> Any:
+        self._sequence += 1
+        return made.header(self.store, nanoseconds(stamp), frame, self._sequence - 1)

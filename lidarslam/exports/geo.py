@@ -2,21 +2,28 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.exports.gnss import read_gnss
-from lidarslam.exports.new_file import require_new
-from lidarslam.exports.projection import Utm, utm_around
-from lidarslam.exports.source import read_source
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.mounted_recording import recorded_axes
+from lidarslam.datasets.published.kitti_raw import KittiRawRecording
+from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_imu import static_transform
+from lidarslam.datasets.ros.bag_message import deserialize
+from lidarslam.datasets.ros.rosbag import BagRecording
+from lidarslam.exports.source import read_source, require_new
 from lidarslam.mapping.global_map.point_cloud import write_laz
 from lidarslam.mapping.global_map.products.georeference import (
     Georeference,
@@ -31,6 +38,57 @@ ABOUT = "georeference.json"
 _FILES = (MAP, TRAJECTORY, GEOJSON, KML, ABOUT)
 # A heading that is off by more displaces the end of 100 m by 5 m.
 _LARGEST_HEADING_SIGMA_DEG = 3.0
+_FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+_NO_FIX = -1
+_SAME_PLACE = "where the antenna is on the sensor is unknown, so it is taken to be at the LiDAR"
+_NORTH, _SOUTH = 32600, 32700  # EPSG codes of the zones of WGS 84
+
+
+@dataclass(frozen=True, eq=False)
+class Utm:
+    """The UTM zone of a place."""
+
+    epsg: int  # code of the coordinate system
+    name: str  # such as WGS 84 / UTM zone 32N
+    wkt: str  # its definition, in the first version of the language, which LAS has
+    scale: float  # of the projection at the place
+    convergence_deg: float  # of the meridians there: grid north is this far east of true north
+    _forward: Any  # pyproj's transformer
+
+    def project(self, geodetic: FloatArray) -> FloatArray:
+        """East, north and height (N, 3) of latitude, longitude and height."""
+        east, north = self._forward.transform(geodetic[:, 1], geodetic[:, 0])
+        return np.column_stack([east, north, geodetic[:, 2]])
+
+    def geodetic(self, projected: FloatArray) -> FloatArray:
+        """Latitude, longitude and height (N, 3) of east, north and height."""
+        longitude, latitude = self._forward.transform(projected[:, 0], projected[:, 1], direction="INVERSE")
+        return np.column_stack([latitude, longitude, projected[:, 2]])
+
+
+def utm_around(geodetic: FloatArray) -> Utm:
+    """The zone of most positions (N, 3): latitude and longitude in degrees, height.
+
+    Raises:
+        ConfigError: pyproj is not installed.
+    """
+    try:
+        pyproj: Any = import_module("pyproj")
+    except ModuleNotFoundError as error:
+        raise ConfigError("georeferenced output needs pyproj; pip install 'lidarslam[geo]'") from error
+    latitude_deg, longitude_deg = np.median(geodetic[:, :2], axis=0).tolist()
+    zone = int((longitude_deg + 180.0) // 6.0) % 60 + 1
+    epsg = (_NORTH if latitude_deg >= 0.0 else _SOUTH) + zone
+    crs = pyproj.CRS.from_epsg(epsg)
+    factors = pyproj.Proj(crs).get_factors(longitude_deg, latitude_deg)
+    return Utm(
+        epsg=epsg,
+        name=str(crs.name),
+        wkt=str(crs.to_wkt("WKT1_GDAL")),
+        scale=float(factors.meridional_scale),
+        convergence_deg=float(factors.meridian_convergence),
+        _forward=pyproj.Transformer.from_crs(4326, crs, always_xy=True),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +196,60 @@ def _kml(name: str, geodetic: FloatArray) -> str:
         f"<name>{escape(name)}</name><LineString><tessellate>1</tessellate><coordinates>{points}</coordinates>"
         "</LineString></Placemark></kml>"
     )
+
+
+def read_gnss(source: Path, config: ReaderConfig) -> GnssTrack:
+    """Read the GNSS track of a recording.
+
+    Raises:
+        InputError: the recording cannot be read, or has none.
+    """
+    recording, T_upright_recorded = recorded_axes(open_recording(source, config))
+    track = None
+    if isinstance(recording, KittiRawRecording):
+        track = _of_drive(recording)
+    elif isinstance(recording, BagRecording):
+        track = _of_bag(*recording.frames)
+    if track is None:
+        readable = "KITTI raw drives with oxts, and bags with sensor_msgs/NavSatFix"
+        raise InputError(f"{source}: has no GNSS positions; it is read from {readable}")
+    return replace(track, lidar_antenna=T_upright_recorded[:3, :3] @ track.lidar_antenna)
+
+
+def _of_drive(drive: KittiRawRecording) -> GnssTrack | None:
+    if drive.oxts is None:
+        return None
+    rows, stamps = drive.oxts
+    T_lidar_imu = None if drive.imu is None else drive.imu.T_lidar_imu
+    timed = np.isfinite(stamps)
+    place = np.zeros(3) if T_lidar_imu is None else T_lidar_imu[:3, 3]
+    notes = (_SAME_PLACE,) if T_lidar_imu is None else ()
+    return GnssTrack(stamps[timed], rows.geodetic[timed], rows.accuracy_m[timed], place, notes)
+
+
+def _of_bag(bag: BagFile, lidar_frame: str) -> GnssTrack | None:
+    """Of the topic with the most fixes; those that state no fix are left out."""
+    topics = [topic for topic in bag.topics if topic.message_type == _FIX_TYPE]
+    if not topics:
+        return None
+    stamps, geodetic, sigmas, frame_id = [], [], [], ""
+    for message in bag.messages(max(topics, key=lambda topic: topic.messages)):
+        if message.damage is not None:
+            continue
+        with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
+            fix = deserialize(message.raw, _FIX_TYPE, bag.ros2)
+            if fix.status.status == _NO_FIX or not np.isfinite([fix.latitude, fix.longitude, fix.altitude]).all():
+                continue
+            horizontal = fix.position_covariance.reshape(3, 3)[:2, :2]
+            variance = 0.5 * horizontal.trace() if fix.position_covariance_type else np.nan
+            stamps.append((message.header_ns or message.record_ns) / 10**9)
+            geodetic.append([fix.latitude, fix.longitude, fix.altitude])
+            sigmas.append(float(np.sqrt(variance)))
+            frame_id = message.frame_id
+    if not stamps:
+        return None
+    T_lidar_antenna = static_transform(bag, lidar_frame, frame_id)
+    place = np.zeros(3) if T_lidar_antenna is None else T_lidar_antenna[:3, 3]
+    order = np.argsort(stamps, kind="stable")
+    notes = (_SAME_PLACE,) if T_lidar_antenna is None else ()
+    return GnssTrack(np.array(stamps)[order], np.array(geodetic)[order], np.array(sigmas)[order], place, notes)

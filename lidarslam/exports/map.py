@@ -7,19 +7,26 @@ from typing import Literal
 
 import numpy as np
 
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import make_directory, replacing
 from lidarslam.core.geometry import FloatArray, make_transform, transform_points
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import read_transform
+from lidarslam.datasets.mounted_recording import recorded_axes
+from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
-from lidarslam.exports.gravity import upwards
-from lidarslam.exports.redrawn import redrawn
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.exports.source import read_run_scans, read_source
+from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
+from lidarslam.mapping.global_map.moved_points import Views, seen_through
+from lidarslam.mapping.global_map.point_cloud import write_cloud
 from lidarslam.mapping.global_map.products import edits
+from lidarslam.pipeline.map_building import MapBuilder
+from lidarslam.storage.directory import CONFIG
 from lidarslam.storage.finished_run import is_run, load_map, read_summary, read_trajectory
 
 SUFFIXES = (".ply", ".pcd", ".laz", ".e57")
+_FEWEST_SAMPLES = 10
 
 
 @dataclass(frozen=True)
@@ -49,12 +56,7 @@ class _Map:
 
 
 def edit_map(sources: Sequence[Path], out: Path, asked: MapEdits) -> Iterator[str]:
-    """Write the edited map; lines about it.
-
-    Args:
-        sources: run directories and clouds; the first one's frame is that of all.
-        out: the file, with one of `SUFFIXES`.
-        asked: the edits.
+    """Write the edited map of run directories and clouds, in the frame of the first; lines about it.
 
     Raises:
         InputError: a source cannot be read, or an edit is not possible with it.
@@ -153,3 +155,60 @@ def _cropped(whole: _Map, asked: MapEdits) -> Generator[str, None, PointCloud]:
     if not kept.all():
         yield f"cropped: {kept.sum():,} of {count(len(cloud), 'point')} kept"
     return cloud.select(kept)
+
+
+def upwards(run: Path) -> FloatArray:
+    """Unit vector (3,) upwards: the mean specific force in the world, without the change of the velocity.
+
+    Raises:
+        InputError: the recording has no IMU whose rotation is known, or is not there any more.
+    """
+    source = read_source(run, "is needed for the direction of gravity; level by the ground instead")
+    recording, trajectory = open_recording(source.path, source.reader), read_trajectory(run)
+    samples, instead = recording.imu, "level by the ground instead, with --level ground"
+    if samples is None:
+        raise InputError(f"{source.path}: has no IMU; {instead}")
+    T_lidar_imu, T_recorded_imu = samples.T_lidar_imu, load_config(run / CONFIG).odometry.T_recorded_imu
+    if T_recorded_imu is not None:
+        T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
+    if T_lidar_imu is None:
+        raise InputError(f"{source.path}: the rotation of its IMU is not known; {instead}")
+    stamps = trajectory.stamps
+    during = (samples.stamps >= stamps[0]) & (samples.stamps <= stamps[-1])
+    if during.sum() < _FEWEST_SAMPLES or len(trajectory) < 3:
+        raise InputError(f"{source.path}: its IMU has too few samples during the run; {instead}")
+    R_world_imu = trajectory.at(samples.stamps[during])[:, :3, :3] @ T_lidar_imu[:3, :3]
+    force = np.einsum("nij,nj->ni", R_world_imu, samples.accelerations[during]).mean(axis=0)
+    velocities = np.diff(trajectory.positions, axis=0) / np.diff(stamps)[:, None]
+    force = force - (velocities[-1] - velocities[0]) / trajectory.duration_s
+    return np.asarray(force / np.linalg.norm(force))
+
+
+def redrawn(run: Path, least_through: int) -> tuple[PointCloud, int]:
+    """The map, in one piece, and how many points were left out: those that so many range images see through, 0: none.
+
+    Scans are deskewed along the final trajectory; those on which tracking was lost are left out.
+
+    Raises:
+        InputError: there is no run, or its recording is not there any more or cannot be read.
+    """
+    scans, summary = read_run_scans(run), read_summary(run)
+    voxel_size_m = (summary.get("map_tiles") or {}).get("voxel_size_m") or summary.get("map_voxel_size_m")
+    config = load_config(run / CONFIG).global_map.model_copy(update={"voxel_size_m": voxel_size_m, "most_points": None})
+    builder, views, drawn = MapBuilder(config), Views(), None
+    poses = scans.trajectory.T_world_lidar
+    for index, scan in scans.deskewed():
+        if scans.lost[index]:
+            continue
+        thinned = builder.thin(scan)
+        if builder.voxel_size_m is not None:
+            drawn = drawn or GlobalMap(builder.voxel_size_m)
+            drawn.add(thinned.points, poses[index], thinned.attributes(config.fields))
+            views.add(thinned.points, index)
+    if drawn is None:
+        raise InputError(f"{run}: no scan of its recording has points")
+    moved = np.zeros(len(drawn.points(config.min_hits)), dtype=np.bool_)
+    if least_through:
+        moved = seen_through(drawn.points(config.min_hits), views.placed(poses), drawn.voxel_size_m, least_through)
+    cloud = drawn.cloud(config.min_hits, moved)
+    return PointCloud(cloud.points, cloud.normals, cloud.attributes.only(config.fields)), int(moved.sum())

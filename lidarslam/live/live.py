@@ -104,7 +104,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
             described = _describe(request, topic.name)
             outcome = write_results(directory, config, described, tracked, closed, drawn, request.map_formats)
         if request.report:
-            from lidarslam.viewer.page.run_report import Accuracy, leave_report
+            from lidarslam.viewer.run_report import Accuracy, leave_report
 
             show("drawing the report")
             leave_report(request.out, Accuracy(outcome.metrics))

@@ -53,8 +53,7 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
     """
     if not (request.config.pose_graph.enabled and request.config.pose_graph.gnss):
         return None
-    from lidarslam.exports.gnss import read_gnss
-    from lidarslam.exports.projection import utm_around
+    from lidarslam.exports.geo import read_gnss, utm_around
     from lidarslam.mapping.pose_graph.edges import ProjectedTrack
 
     track = read_gnss(request.source, request.config.reader)
@@ -153,7 +152,7 @@ def execute(
 
 
 def _draw_report(request: RunRequest, outcome: RunOutcome, phase: Callable[[str], None]) -> None:
-    from lidarslam.viewer.page.run_report import Accuracy, leave_report
+    from lidarslam.viewer.run_report import Accuracy, leave_report
 
     phase("drawing the report")
     leave_report(request.out, Accuracy(outcome.metrics))

@@ -1,4 +1,4 @@
-"""Maps and trajectories of runs as a picture, drawn without a window or a graphics card."""
+"""Maps and trajectories of runs, comparisons and clouds as a picture, drawn without a window or a graphics card."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,14 +12,20 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
-from lidarslam.evaluation.report.error_colours import viridis
-from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.viewer.drawing import annotations as notes
-from lidarslam.viewer.drawing.annotations import Colour, Entry
-from lidarslam.viewer.drawing.colouring import UNKNOWN, ColourScale, Quantity, fit_scale
-from lidarslam.viewer.drawing.shading import draw_layer
-from lidarslam.viewer.drawing.view import WIDTH, View, fit_view
+from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD
+from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.metrics import absolute_errors
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.storage.comparison_folder import run_directories
+from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
+from lidarslam.storage.finished_run import read_statuses, read_trajectory, shown_map
+from lidarslam.viewer import annotations as notes
+from lidarslam.viewer.annotations import UNKNOWN, Colour, ColourScale, Entry, Quantity, fit_scale
+from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view
 
 TOP, OBLIQUE = 90.0, 35.0
 # Drawn on so many times more pixels along each side, and averaged.
@@ -41,6 +47,14 @@ _REFERENCE: Colour = (150, 150, 150)
 _REFERENCE_WIDER = 2.0
 _MAP_TINT = 0.55  # the share of a run's colour in that of its map; the rest is white
 _RAMP_LENGTH = 0.08
+_NOT_IN_MAP = "the map has none; its recording has none, or global_map.fields leaves it out"
+_LACKS: dict[Quantity, str] = {
+    "height": "there is no map",
+    "intensity": _NOT_IN_MAP,
+    "rgb": _NOT_IN_MAP,
+    "error": "its recording has no ground truth, or is not there any more; a map with its distances to a reference map"
+    " is made by `lidarslam evaluate RUN --reference-map MAP --errors errors.ply`",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +196,6 @@ def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
         raise cannot_write(path, error) from error
 
 
-def height_colours(points: FloatArray) -> NDArray[np.uint8]:
-    """Colours (N, 3) by the height of points (N, 3), the lowest and highest 2 % clipped."""
-    if not len(points):
-        return np.empty((0, 3), dtype=np.uint8)
-    low, high = np.percentile(points[:, 2], [2.0, 98.0])
-    return viridis(np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0))
-
-
 def _fit_scale(runs: Sequence[DrawnRun], quantity: Quantity) -> ColourScale | None:
     found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
     return fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
@@ -291,3 +297,57 @@ def _entries(
 
 def _named(run: DrawnRun, runs: Sequence[DrawnRun]) -> str:
     return "path" if len(runs) == 1 else run.name
+
+
+def load_drawn_runs(paths: Sequence[Path], truth: Trajectory | None = None) -> list[DrawnRun]:
+    """Runs, the runs of a comparison, and .ply or .pcd files; the truth of the recording gives the runs' errors.
+
+    Raises:
+        InputError: a path is none of these, or has neither a map nor a trajectory.
+    """
+    return [_load(path, truth) for given in paths for path in run_directories(given)]
+
+
+def require_quantity(run: DrawnRun, quantity: Quantity) -> None:
+    """Refuse to colour a run by what is not known of it.
+
+    Raises:
+        InputError: it has no such attribute, or there is nothing to compare with.
+    """
+    known = run.cloud.attributes.rgb if quantity == "rgb" else run.point_values(quantity)
+    if known is None:
+        known = run.pose_values(quantity)
+    if known is None or not np.isfinite(known).any():
+        raise InputError(f"{run.name}: cannot be coloured by {quantity}: {_LACKS[quantity]}")
+
+
+def _load(path: Path, truth: Trajectory | None) -> DrawnRun:
+    name, cloud = path.resolve().name, shown_map(path)
+    has_trajectory = (path / TRAJECTORY_TUM).is_file()
+    if path.is_file() or ((path / MAP_PLY).is_file() and not has_trajectory):
+        if not len(cloud):
+            raise InputError(f"{path}: holds no map to draw")
+        return DrawnRun(name, cloud, distances_m=_distances_m(path, len(cloud)))
+    trajectory = read_trajectory(path)
+    errors_m = None if truth is None else _errors_m(trajectory, truth)
+    return DrawnRun(name, cloud, trajectory.positions, read_statuses(path, len(trajectory)), errors_m)
+
+
+def _errors_m(trajectory: Trajectory, truth: Trajectory) -> FloatArray | None:
+    """Distances (N,) of the poses to the truth, aligned as for the ATE; None where they share no instants."""
+    try:
+        association = associate(trajectory, truth)
+    except InputError:
+        return None
+    errors_m = np.full(len(trajectory), np.nan)
+    errors_m[association.rows] = absolute_errors(association, align(association.estimate, association.reference))[0]
+    return errors_m
+
+
+def _distances_m(path: Path, points: int) -> FloatArray | None:
+    """The distances to a reference map in a file of `evaluate --errors`; None in any other."""
+    if path.suffix.lower() != ".ply":
+        return None
+    table = read_ply(path)
+    found = DISTANCE_FIELD in (table.dtype.names or ()) and len(table) == points
+    return table[DISTANCE_FIELD].astype(np.float64) if found else None

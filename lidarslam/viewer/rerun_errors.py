@@ -23,11 +23,8 @@ from lidarslam.viewer.rerun_recording import (
 def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | None, clip_m: float) -> None:
     """Write a .rrd file of a map coloured by its distance to the reference, and of the reference by that to the map.
 
-    Args:
-        path: the file.
-        comparison: shown about its middle, because the viewer counts in single precision.
-        positions: (K, 3) where the sensor was, in the reference's frame.
-        clip_m: the distance of the brightest colour.
+    The clouds are shown about their middle, because the viewer counts in single precision, with the path (K, 3) of the
+    sensor in the reference's frame; `clip_m` is the distance of the brightest colour.
 
     Raises:
         OutputError: the file cannot be written.

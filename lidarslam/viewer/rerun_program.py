@@ -40,10 +40,7 @@ def is_taken(port: int) -> bool:
 
 
 def require_window(instead: str) -> None:
-    """Check that a window can be opened, before anything is computed for it.
-
-    Args:
-        instead: what to do where there is no display.
+    """Check that a window can be opened, before anything is computed for it; `instead` is what else to do.
 
     Raises:
         OutputError: there is no display.
@@ -54,11 +51,7 @@ def require_window(instead: str) -> None:
 
 
 def open_window(port: int, recording: Path | None = None) -> None:
-    """Open the viewer, which takes recordings at a port, unless it is open already.
-
-    Args:
-        port: of the viewer.
-        recording: a file to show.
+    """Open the viewer, which takes recordings at a port, unless it is open already, and show a file.
 
     Raises:
         OutputError: it cannot be opened.
@@ -76,10 +69,7 @@ def open_window(port: int, recording: Path | None = None) -> None:
 
 @contextlib.contextmanager
 def served_page(announce: Callable[[str], None]) -> Iterator[WebPage]:
-    """A page for browsers on this machine, for the time of the block.
-
-    Args:
-        announce: called with its address when there is something to show.
+    """A page for browsers on this machine, for the time of the block; its address is announced with the first content.
 
     Raises:
         OutputError: it cannot be served.

@@ -21,8 +21,9 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
+from lidarslam.evaluation.report.error_colours import viridis
 from lidarslam.viewer import rerun_environment
-from lidarslam.viewer.picture import height_colours
+from lidarslam.viewer.annotations import levels
 
 _log = logging.getLogger(__name__)
 
@@ -57,13 +58,7 @@ class IncompleteRecordingError(OutputError):
 def rerun_recording(
     name: str, path: Path | None, window: rr.GrpcSink | None = None, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A recording that goes to a file, to a window or both; it is written when the block ends.
-
-    Args:
-        name: as the viewer lists it.
-        path: the file.
-        window: the viewer.
-        blueprint: the layout of the viewer.
+    """A recording that goes to a file, to a window or both, with a name and layout; written when the block ends.
 
     Raises:
         IncompleteRecordingError: it was not written to its end.
@@ -125,18 +120,10 @@ def log_map(
     With a colour, the height is its brightness.
     """
     points = every_nth(points, count)
-    colours = height_colours(points) if colour is None else _shades(points, colour)
-    cloud = rr.Points3D(points, colors=colours, radii=MAP_RADIUS)
-    recording.log(entity, cloud, static=static)
-
-
-def _shades(points: FloatArray, colour: tuple[int, int, int]) -> NDArray[np.uint8]:
-    if not len(points):
-        return np.empty((0, 3), dtype=np.uint8)
-    low, high = np.percentile(points[:, 2], [2.0, 98.0])
-    brightness = np.interp(points[:, 2], [low, max(high, low + 1e-6)], _DARK_TO_BRIGHT)
-    shades: NDArray[np.uint8] = (brightness[:, None] * np.array(colour)).astype(np.uint8)
-    return shades
+    height = levels(points[:, 2])
+    shades = np.interp(height, [0.0, 1.0], _DARK_TO_BRIGHT)[:, None] * np.array(colour or (0, 0, 0))
+    colours = viridis(height) if colour is None else shades.astype(np.uint8)
+    recording.log(entity, rr.Points3D(points, colors=colours, radii=MAP_RADIUS), static=static)
 
 
 def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3D:

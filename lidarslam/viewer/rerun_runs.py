@@ -50,13 +50,10 @@ class _Shown:
 
 
 def show_runs(runs: Sequence[FinishedRun], reference: Trajectory | None, config: ViewerConfig) -> Show:
-    """Trajectories in time, lost scans, loops, maps, and errors of runs.
+    """Trajectories in time, lost scans, loops, maps, and errors of one run or more.
 
-    Args:
-        runs: at least one.
-        reference: the true trajectory; the runs are aligned with it if they share instants with it, and are otherwise
-            shown each in its own world, which begins at its first scan.
-        config: how many points are shown.
+    Runs that share instants with the reference, the true trajectory, are aligned with it; others are shown each in its
+    own world, which begins at its first scan.
     """
     if reference is not None and len(reference):
         reference = reference.transformed(inverse(reference.T_world_lidar[0]))  # the viewer counts in single precision

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.errors import InputError
@@ -18,7 +17,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.report.error_colours import viridis
-from lidarslam.viewer.picture import height_colours
+from lidarslam.viewer.annotations import levels
 from lidarslam.viewer.rerun_output import Show
 from lidarslam.viewer.rerun_recording import (
     BACKGROUND,
@@ -45,13 +44,8 @@ def show_scans(
 ) -> Show:
     """Scans about the sensor, by intensity or else by height; where there is a true path, the scans on it too.
 
-    Args:
-        recording: its scans are read while they are logged.
-        source: where it lies.
-        chosen: the indices of the scans.
-        config: how many points are shown.
-        bar: makes a progress bar of this name, to be called with the number of scans done, and of all.
-        tell: called with what is wrong with the recording, a line each.
+    The scans are read while they are logged; `bar` makes a progress bar of a name, to be called with the number of
+    scans done, and of all, and `tell` is called with what is wrong with the recording, a line each.
     """
     truth = recording.ground_truth
     if truth is not None:  # the viewer counts in single precision
@@ -84,17 +78,10 @@ def _log_scan(recording: rr.RecordingStream, index: int, scan: Scan, truth: Traj
         T_world_lidar = truth.at(np.array([stamp]))[0]
         recording.log(_LIDAR, rr.Transform3D(translation=T_world_lidar[:3, 3], mat3x3=T_world_lidar[:3, :3]))
     shown = every_nth(scan.points, points)
-    colours = height_colours(shown) if scan.intensities is None else _by_level(every_nth(scan.intensities, points))
-    recording.log(f"{_LIDAR}/scan", rr.Points3D(shown, colors=colours, radii=SCAN_RADIUS))
-
-
-def _by_level(intensities: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours (N, 3) by intensity (N,), the lowest and highest 2 % clipped; the darkest where there is none."""
-    known = np.nan_to_num(intensities.astype(np.float64))
-    if not len(known):
-        return np.empty((0, 3), dtype=np.uint8)
-    low, high = np.percentile(known, [2.0, 98.0])
-    return viridis(np.clip((known - low) / max(high - low, 1e-6), 0.0, 1.0))
+    values = shown[:, 2]
+    if scan.intensities is not None:  # the darkest where there is none
+        values = np.nan_to_num(every_nth(scan.intensities, points).astype(np.float64))
+    recording.log(f"{_LIDAR}/scan", rr.Points3D(shown, colors=viridis(levels(values)), radii=SCAN_RADIUS))
 
 
 def _blueprint(has_truth: bool) -> rrb.Blueprint:

@@ -13,9 +13,9 @@ from PIL import Image
 
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import cannot_write, replacing
-from lidarslam.viewer.drawing.colouring import Quantity
-from lidarslam.viewer.drawing.view import turning_views
+from lidarslam.viewer.annotations import Quantity
 from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, fit_frame, framed
+from lidarslam.viewer.view import turning_views
 
 _FRAMES = 72
 _PER_SECOND = 12
@@ -42,13 +42,9 @@ def turn_runs(
     count: Callable[[int, int], None] = lambda *_: None,
     frames: int = _FRAMES,
 ) -> Iterator[NDArray[np.uint8]]:
-    """Frames (height, width, 3) of one turn, all of one size and scale.
+    """Frames (height, width, 3) of one turn of runs in one world, all of one size and scale.
 
-    Args:
-        runs: in one world.
-        quantity: that a single run is coloured by.
-        count: called with the number of each drawn frame, from 1, and their total.
-        frames: number of them.
+    `count` is called with the number of each drawn frame, from 1, and their total.
     """
     frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
     turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)

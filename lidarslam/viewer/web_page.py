@@ -39,11 +39,7 @@ class WebPage:
     """The page and the recording on it."""
 
     def __init__(self, files: Mapping[str, bytes], announce: Callable[[str], None] = lambda _: None) -> None:
-        """Begin to serve.
-
-        Args:
-            files: of the viewer by their paths; "/" is the page.
-            announce: called with the address when there is a recording to show.
+        """Begin to serve files by their paths, "/" is the page; the address is announced with a recording to show.
 
         Raises:
             OutputError: no port is free.

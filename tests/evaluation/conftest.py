@@ -18,6 +18,8 @@ from lidarslam.evaluation.comparison.comparison import (
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
+HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \x00"
+
 
 @pytest.fixture
 def random_drive() -> Callable[..., Trajectory]:
@@ -81,9 +83,6 @@ def finished(noisy) -> Callable[..., MethodResult]:
         return MethodResult(name, **{**given, **others})
 
     return result
-
-
-HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \x00"
 
 
 @pytest.fixture

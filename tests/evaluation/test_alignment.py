@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.geometry import exp, inverse, is_rigid, rotation_angle
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import align, align_se3
-from lidarslam.evaluation.trajectory.metrics import absolute_errors, evaluate_trajectory
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 MOTIONS = [(0.0,) * 6, (0.3, -0.2, 2.5, 10.0, -4.0, 1.0), (3.1, 0.1, 0.2, -500.0, 20.0, 3.0)]
 
@@ -64,31 +64,11 @@ def test_a_mirrored_estimate_is_not_answered_with_a_reflection(random_drive):
     assert is_rigid(align_se3(poses, reference.T_world_lidar), 1e-9)
 
 
-def test_no_other_rigid_motion_is_better(random_drive, noisy, rng):
-    reference = random_drive(5)
-    estimate = noisy(reference, 6, sigma=0.05)
-
-    def error(T_reference_estimate: np.ndarray) -> float:
-        return float(np.sum((estimate.transformed(T_reference_estimate).positions - reference.positions) ** 2))
-
-    best = align(estimate, reference)
-    others = [error(exp(xi) @ best) for xi in rng.normal(0.0, 1e-3, (100, 6))]
-    assert error(best) < min(others)
-
-
 def test_first_pose_and_none(random_drive):
     estimate, reference = random_drive(7), random_drive(8).transformed(exp(MOTIONS[1]))
     T_reference_estimate = align(estimate, reference, "first_pose")
     assert_same(T_reference_estimate @ estimate.T_world_lidar[0], reference.T_world_lidar[0], 1e-12)
     assert np.array_equal(align(estimate, reference, "none"), np.eye(4))
-
-
-def test_the_result_maps_the_estimate_to_the_reference_and_not_back(random_drive):
-    estimate = random_drive(9)
-    reference = estimate.transformed(exp(MOTIONS[1]))
-    T_reference_estimate = align(estimate, reference)
-    assert_same(T_reference_estimate @ estimate.T_world_lidar, reference.T_world_lidar)
-    assert_same(inverse(T_reference_estimate) @ reference.T_world_lidar, estimate.T_world_lidar)
 
 
 def test_misuse_is_refused(random_drive):
@@ -125,13 +105,6 @@ def test_a_sensor_that_is_mounted_askew_is_seen_where_positions_are_certain(axis
     skew[axis] = np.deg2rad(3.0)
     estimate = Trajectory(reference.stamps, exp(MOTIONS[1]) @ reference.T_world_lidar @ exp(skew))
     assert rotation_error_deg(estimate, reference) == pytest.approx(3.0, abs=1e-3)
-
-
-def test_the_rotations_do_not_change_the_distances(random_drive, noisy):
-    reference = random_drive(12)
-    metrics = evaluate_trajectory(noisy(reference, 13, sigma=0.05), reference)
-    distances_m, _ = absolute_errors(metrics.association, metrics.T_reference_estimate)
-    assert metrics.errors.ate_rmse_m == np.sqrt(np.mean(distances_m**2))
 
 
 def test_trajectories_that_are_equal_have_no_error(random_drive, straight_drive):

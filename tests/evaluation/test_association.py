@@ -33,13 +33,6 @@ def test_reference_is_interpolated_at_the_stamps_of_the_estimate():
     np.testing.assert_allclose(found.reference.T_world_lidar, moving(stamps).T_world_lidar, atol=1e-12)
 
 
-def test_a_time_shift_is_seen_as_motion():
-    reference = moving(np.arange(0.0, 5.0, 0.1))
-    estimate = Trajectory(reference.stamps[:-1] + 0.05, reference.T_world_lidar[:-1])
-    found = associate(estimate, reference)
-    np.testing.assert_allclose(found.reference.T_world_lidar, moving(estimate.stamps).T_world_lidar, atol=1e-12)
-
-
 def test_a_long_gap_of_the_reference_is_not_bridged():
     reference = moving(np.concatenate([np.arange(0.0, 2.05, 0.1), np.arange(5.0, 7.05, 0.1)]))
     estimate = moving(np.arange(0.0, 7.0, 0.25))

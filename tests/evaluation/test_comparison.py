@@ -1,4 +1,4 @@
-"""What comparison.json holds, and means over recordings."""
+"""What comparison.json holds, means over recordings, and intervals of lost tracking."""
 
 import json
 from dataclasses import replace
@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import (
@@ -16,12 +15,21 @@ from lidarslam.evaluation.comparison.comparison import (
     MethodStatus,
     MissingRecording,
     SequenceComparison,
+    lost_intervals,
 )
-from lidarslam.evaluation.comparison.mean_table import TablePlan, mean_table
-from lidarslam.evaluation.comparison.quantities import QUANTITIES, find_quantity
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, TablePlan, find_quantity, mean_table
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
 from lidarslam.evaluation.report.tables import sequence_tables
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+
+LOST = MethodResult(
+    name="a",
+    status="lost",
+    message="first lost on scan 1",
+    trajectory=Trajectory(10.0 + np.arange(6.0), np.tile(np.eye(4), (6, 1, 1))),
+    lost=np.array([False, True, True, False, False, True]),
+    lost_reasons=("covered", "kidnapped"),
+)
 
 
 @pytest.fixture
@@ -99,11 +107,6 @@ def test_quantities_are_read_off_the_entry(result: MethodResult) -> None:
     assert all(quantity.of(MethodResult("m", "failed")) is None for quantity in QUANTITIES.values())
 
 
-def test_an_unknown_quantity_lists_the_choices() -> None:
-    with pytest.raises(ConfigError, match="no quantity is called 'ate'; there are: ate_rmse_m"):
-        find_quantity("ate")
-
-
 def _timed(name: str, ms: float | None, status: MethodStatus = "ok") -> MethodResult:
     return MethodResult(name, status, ms_per_scan_median=ms)
 
@@ -146,7 +149,23 @@ def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_c
     assert "registration alone" not in mean_table(TablePlan("T", {"all": ("00",)}, quantities[1:]), [sequence]).note
 
 
-def test_columns_stand_quantity_by_quantity_under_each_heading() -> None:
-    quantities = [find_quantity("ms_per_scan_median"), find_quantity("lost_scans")]
-    table = mean_table(TablePlan("T", {"x": ("00",), "y": ("00",)}, quantities), [_sequence("00", _timed("a", 1.0))])
-    assert [(c.heading, c.unit) for c in table.columns] == [("x", "ms/scan"), ("x", ""), ("y", "ms/scan"), ("y", "")]
+def test_every_interval_has_its_own_reason() -> None:
+    first, second = lost_intervals(LOST)
+    assert (first.first, first.last, first.scans, first.begin_s, first.end_s) == (1, 2, 2, 1.0, 2.0)
+    assert (first.reason, second.reason) == ("covered", "kidnapped")
+
+
+def test_without_reasons_the_message_has_to_do() -> None:
+    assert [interval.reason for interval in lost_intervals(replace(LOST, lost_reasons=()))] == [LOST.message] * 2
+
+
+def test_losses_less_than_a_second_apart_are_one_interval() -> None:
+    fast = Trajectory(0.1 * np.arange(6.0), np.tile(np.eye(4), (6, 1, 1)))
+    (interval,) = lost_intervals(replace(LOST, trajectory=fast))
+    assert (interval.first, interval.last, interval.scans) == (1, 5, 3)
+    assert interval.reason == "covered, and 1 more"
+
+
+def test_nothing_lost_is_no_interval() -> None:
+    assert lost_intervals(replace(LOST, lost=np.zeros(6, dtype=np.bool_))) == []
+    assert lost_intervals(replace(LOST, trajectory=None)) == []

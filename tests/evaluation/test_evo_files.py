@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
+from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain, write_tum

@@ -78,7 +78,7 @@ def test_a_misspelt_name_is_answered_with_the_names() -> None:
 def test_the_names_are_keys_of_the_written_files(run: Path) -> None:
     """Each figure is found in files as the program writes them."""
     map_json = {"accuracy_mean_m", "completeness_mean_m", "chamfer_m", "f_score_percent"}
-    from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
+    from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
 
     written = evaluate(EvaluateRequest(run, reference=run.parent / "truth.tum")).to_json()
     found = {name for name in (*FIGURES, *PATHS) if Gate("max", name, 0.0).of({"metrics": written}) is not None}

@@ -14,6 +14,14 @@ from lidarslam.evaluation.map.alignment import align_map
 from lidarslam.evaluation.map.voxel_thinning import thin
 
 UTM = np.array([5e5, 5e6, 300.0])
+THREADS = """
+import numpy as np
+from lidarslam.evaluation.map.alignment import align_map
+rng = np.random.default_rng(0)
+walls = np.concatenate([rng.uniform(-9.0, 9.0, (6000, 3)) * flat for flat in 1.0 - np.eye(3)])
+found = align_map(walls + rng.normal(0.05, 0.01, walls.shape), walls, {"guess": np.eye(4)})
+print(found.T_reference_map.tobytes().hex())
+"""
 
 
 def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 25.0) -> FloatArray:
@@ -111,21 +119,6 @@ def test_a_place_with_two_fitting_poses_is_refused() -> None:
     seen = transform_points(exp([0.0, 0.0, 1.2, 1.0, 2.0, 0.0]), box[::2])
     with pytest.raises(InputError, match="at more than one pose"):
         align_map(seen, box, {}, search=True)
-
-
-def test_nothing_cannot_be_aligned(building: FloatArray) -> None:
-    with pytest.raises(InputError, match="holds no point"):
-        align_map(np.empty((0, 3)), building, {"none": np.eye(4)})
-
-
-THREADS = """
-import numpy as np
-from lidarslam.evaluation.map.alignment import align_map
-rng = np.random.default_rng(0)
-walls = np.concatenate([rng.uniform(-9.0, 9.0, (6000, 3)) * flat for flat in 1.0 - np.eye(3)])
-found = align_map(walls + rng.normal(0.05, 0.01, walls.shape), walls, {"guess": np.eye(4)})
-print(found.T_reference_map.tobytes().hex())
-"""
 
 
 def test_the_pose_is_the_same_for_any_number_of_threads() -> None:

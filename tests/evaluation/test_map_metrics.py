@@ -1,4 +1,4 @@
-"""Map errors of clouds whose errors are known in closed form."""
+"""Errors of maps that are known, and the crispness of clouds whose covariance is known."""
 
 import json
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.map.metrics import MapMetrics, compare_maps
+from lidarslam.evaluation.map.entropy import map_entropy
+from lidarslam.evaluation.map.metrics import compare_maps
 from lidarslam.evaluation.map.voxel_thinning import thin
 from lidarslam.evaluation.report.error_colours import error_colours
 
@@ -80,18 +81,6 @@ def test_without_points_nothing_is_computed(plane: FloatArray, empty: str) -> No
     json.dumps(metrics.to_json(), allow_nan=False)
 
 
-def test_the_keys_of_the_file() -> None:
-    metrics = MapMetrics(0.1, 0.2, 0.15, {0.1: 1.0, 0.2: 2.0, 0.5: 5.0}, {1.0: 90.0}, {1.0: None})
-    assert metrics.to_json() == {
-        "accuracy_mean_m": 0.1,
-        "completeness_mean_m": 0.2,
-        "chamfer_m": 0.15,
-        "f_score_percent": {"0.1": 1.0, "0.2": 2.0, "0.5": 5.0},
-        "coverage_percent": {"1.0": 90.0},
-        "deviation_percent": {"1.0": None},
-    }
-
-
 def test_distances_belong_to_their_points(plane: FloatArray) -> None:
     compared = compare_maps(np.concatenate([plane, [[5.0, 5.0, 0.7]]]) + UTM, plane + UTM)
     worst = int(compared.map_errors.distances_m.argmax())
@@ -108,14 +97,48 @@ def test_thinning_keeps_one_actual_point_a_cell(rng: np.random.Generator) -> Non
     assert {tuple(p) for p in thinned} <= {tuple(p) for p in points}
 
 
-def test_a_stray_point_far_away_costs_nothing() -> None:
-    points = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [1.0, 0.0, 0.0], [1e14, 1e14, 1e14]])
-    assert len(thin(points, 0.05)) == 3
-
-
 def test_colours_run_from_dark_to_bright_and_stay_there() -> None:
     colours = error_colours(np.array([0.0, 0.25, 0.5, 3.0, np.inf])).astype(int)
     np.testing.assert_array_equal(colours[0], [68, 1, 84])
     np.testing.assert_array_equal(colours[2:], [[253, 231, 37]] * 3)
     lightness = error_colours(np.linspace(0.0, 0.5, 50)) @ [0.299, 0.587, 0.114]
     assert (np.diff(lightness) > 0.0).all()
+
+
+def _slab(rng: np.random.Generator, sigma_m: float) -> FloatArray:
+    points = rng.uniform(-2.0, 2.0, (40_000, 3))
+    points[:, 2] = rng.normal(0.0, sigma_m, len(points))
+    return points
+
+
+def test_the_entropy_of_a_known_neighbourhood(rng: np.random.Generator) -> None:
+    """In a filled ball of radius r, every coordinate has the variance r^2 / 5."""
+    points = rng.uniform(-1.0, 1.0, (60_000, 3))
+    inner = points[np.linalg.norm(points, axis=1) < 0.9]
+    entropy = map_entropy(inner, radius_m=0.3, spacing_m=0.001, most_samples=2_000)
+    assert entropy is not None
+    # Some samples are at the border, where the neighbourhood is part of a ball and smaller.
+    assert entropy.mean == pytest.approx(1.5 * np.log(2.0 * np.pi * np.e * 0.3**2 / 5.0), abs=0.3)
+
+
+def test_a_thicker_wall_has_more(rng: np.random.Generator) -> None:
+    crisp, thick = map_entropy(_slab(rng, 0.01)), map_entropy(_slab(rng, 0.04))
+    assert crisp is not None
+    assert thick is not None
+    # Only the third axis differs; thinning lets through more of the thicker wall's outer points.
+    assert thick.mean - crisp.mean == pytest.approx(np.log(4.0), abs=0.2)
+
+
+def test_a_flawless_plane_is_finite_and_the_place_does_not_matter(rng: np.random.Generator) -> None:
+    x, y = np.meshgrid(0.07 * np.arange(60), 0.07 * np.arange(60))
+    plane = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    here, there = map_entropy(plane), map_entropy(plane + np.array([5e5, 5e6, 100.0]))
+    assert here is not None
+    assert there is not None
+    assert np.isfinite(here.mean)
+    assert there.mean == pytest.approx(here.mean, abs=1e-3)
+
+
+def test_sparse_points_have_none() -> None:
+    assert map_entropy(10.0 * np.arange(60.0).reshape(-1, 3)) is None
+    assert map_entropy(np.empty((0, 3))) is None

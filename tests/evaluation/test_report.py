@@ -1,6 +1,7 @@
-"""The report as a page and as Markdown: its numbers, its marks, and that nothing in it can run or be fetched."""
+"""The report as a page and as Markdown: its numbers, marks and parts, and that nothing in it can run or be fetched."""
 
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
-from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.comparison import Comparison, MapErrors, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
+from lidarslam.evaluation.report.accuracy import raster
+from lidarslam.evaluation.report.figure import Panel, line_trace, method_styles, plot_text, thin_curve
 from lidarslam.evaluation.report.report import render_html, render_markdown
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \ufffd"
@@ -80,27 +84,6 @@ def test_what_users_wrote_is_shown_as_text(comparison):
     assert words.count(HOSTILE) > 10
     for place in ("Title ", "lidarslam compare 'a b' --methods ", "street ", "note ", "some ", "Means ", "no overlap "):
         assert place + HOSTILE in words
-
-
-def test_every_plot_is_named_and_has_data(comparison):
-    found = [div for div in page_of(comparison).iter("div") if div.get("class") == "plot"]
-    assert len(found) > 30
-    for div in found:
-        assert div.get("role") == "img"
-        assert div.get("aria-label")
-        assert "height:" in div.get("style")
-        figure = json.loads(div.find("script").text)
-        assert figure["data"]
-        assert "nan" not in json.dumps(figure, allow_nan=False)
-
-
-def test_figures_are_numbered_and_captioned(comparison):
-    figures = list(page_of(comparison).iter("figure"))
-    captions = [text_of(figure.find("figcaption")) for figure in figures]
-    assert [caption.split(".")[0] for caption in captions] == [f"Figure {n}" for n in range(1, len(figures) + 1)]
-    titles = ("Trajectories", "Absolute errors", "Error components", "Drift by segment length", "Drift by speed")
-    for title in (*titles, "Map errors", "Time and memory", "Tracking status"):
-        assert any(title in caption for caption in captions), title
 
 
 def test_the_numbers_are_those_of_the_metrics(comparison):
@@ -184,37 +167,6 @@ def test_a_method_keeps_its_colour_and_name_in_every_figure_and_recording(compar
     assert {key: {name} for key, name in entries.items()} == {key: names[key] for key in entries}
 
 
-def test_only_the_matched_part_of_the_reference_is_drawn(comparison):
-    sequence = comparison.sequences[1]
-    head = [
-        replace(m, trajectory=m.trajectory.select(slice(50, 150)), metrics=None, lost=None) for m in sequence.methods
-    ]
-    (plot,) = plots(page_of(replace(comparison, sequences=[replace(sequence, methods=head)])), "Top view: y over x [m]")
-    (drawn,) = (trace for trace in plot["data"] if trace.get("legendgroup") == "reference")
-    bytes_each, count = 4, len(drawn["x"]["bdata"]) * 3 // 4
-    assert 100 * bytes_each <= count <= 103 * bytes_each
-
-
-def test_a_stage_that_did_not_run_has_no_time_and_no_mark(comparison):
-    sequence = comparison.sequences[0]
-    first, second, _ = sequence.methods
-    idle = replace(first, stage_ms={"odometry": 0.0, "refinement": 3.0})
-    page = page_of(replace(comparison, sequences=[replace(sequence, methods=[idle, second])]))
-    rows = table_rows(page, "time and memory")
-    assert [text_of(cell) for cell in rows["learned"][-2:]] == ["3.0", "–"]
-    assert not any("★" in text_of(cell) for row in rows.values() for cell in row[-2:])
-
-
-def test_without_a_reference_the_map_entropy_is_shown(comparison):
-    sequence = comparison.sequences[1]
-    methods = [replace(m, metrics=None, map_entropy=-4.0 - i) for i, m in enumerate(sequence.methods)]
-    page = page_of(replace(comparison, sequences=[replace(sequence, reference=None, methods=methods)]))
-    (plot,) = plots(page, "Mean map entropy")
-    assert len(plot["data"]) == 3
-    rows = table_rows(page, "corridor: all methods")
-    assert "−6.00" in " ".join(text_of(cell) for cell in rows["unmeasured"])
-
-
 def test_an_empty_comparison_and_one_without_references_are_rendered(comparison, straight_drive):
     empty = Comparison("Nothing", "", [])
     assert "Nothing" in text_of(page_of(empty))
@@ -249,26 +201,6 @@ def test_a_runaway_leaves_the_pictures_instead_of_flattening_them(comparison, fi
     assert "kiss-icp leaves the picture" not in text_of(page)
 
 
-def test_methods_of_several_sizes_of_error_are_drawn_whole_on_a_logarithmic_axis(comparison, finished):
-    sequence = comparison.sequences[0]
-    methods = [finished(str(n), sequence.reference, n, sigma) for n, sigma in enumerate((0.001, 0.03, 0.1))]
-    page = page_of(replace(comparison, sequences=[replace(sequence, methods=methods)]))
-    (plot,) = plots(page, "Position error [m]")
-    assert plot["layout"]["yaxis"]["type"] == "log"
-    assert "range" not in plot["layout"]["yaxis"]
-    assert next(button.get("aria-pressed") for button in page.iter("button") if button.get("class") == "log") == "true"
-    (caption,) = (text_of(f.find("figcaption")) for f in page.iter("figure") if "Absolute errors" in text_of(f))
-    assert "leaves the picture" not in caption
-
-
-def test_ten_methods_on_five_long_recordings_stay_small(finished, random_drive):
-    reference = random_drive(8, scans=4600)
-    methods = [finished(f"method {number}", reference, number, 0.003 * (number + 1)) for number in range(10)]
-    sequence = SequenceComparison("long", "x", reference, "ground truth", methods)
-    html = render_html(Comparison("Large", "", [sequence]))
-    assert 5 * (len(html) - len(get_plotlyjs())) < 15e6
-
-
 def test_markdown_has_the_tables_and_nothing_that_github_would_run(comparison):
     markdown = render_markdown(comparison)
     assert "<script>" not in re.sub(r"^(`{3,})\n.*?^\1$", "", markdown, flags=re.MULTILINE | re.DOTALL)
@@ -278,3 +210,57 @@ def test_markdown_has_the_tables_and_nothing_that_github_would_run(comparison):
     for table in tables:
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1
     assert "nan" not in markdown.lower().replace("nant", "")
+
+
+def test_a_thinned_curve_keeps_its_peaks_and_ends(rng):
+    y = rng.normal(0.0, 1.0, 20_000)
+    y[12_345], y[777] = 50.0, -40.0
+    rows = thin_curve(y)
+    assert len(rows) <= 2000
+    assert {0, 777, 12_345, 19_999} <= set(rows.tolist())
+    assert (np.diff(rows) > 0).all()
+    assert np.array_equal(thin_curve(y[:100]), np.arange(100))
+
+
+def test_a_cell_shows_the_median_of_its_points():
+    points = np.array([[0.5, 0.5, 0.0]] * 3 + [[2.5, 1.5, 0.0], [9.0, 9.0, 0.0]])
+    errors = MapErrors(points, np.array([0.0, 0.5, 9.0, 2.0, 0.1]))
+    cells = raster(errors, np.linspace(0.0, 3.0, 4), np.linspace(0.0, 2.0, 3))
+    np.testing.assert_array_equal(cells, [[0.5, np.nan, np.nan], [np.nan, np.nan, 2.0]])
+
+
+@pytest.mark.parametrize("ground", ["#ffffff", "#15171a"])
+def test_colours_are_seen_on_both_grounds(ground):
+    def luminance(colour: str) -> float:
+        channels = np.array([int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])
+        linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    for style in method_styles(map(str, range(8))).values():
+        low, high = sorted([luminance(style.colour), luminance(ground)])
+        assert (high + 0.05) / (low + 0.05) > 2.9, style.colour
+
+
+def test_names_are_data_to_plotly_and_to_the_page():
+    name = "</script><b>x</b>\ud800"
+    (style,) = method_styles([name]).values()
+    text = Panel("t", [line_trace(name, style, np.arange(2.0), np.arange(2.0))], {}, 100).json
+    assert "<" not in text
+    assert json.loads(text)["data"][0]["name"] == "&lt;/script&gt;&lt;b&gt;x&lt;/b&gt;\ufffd"
+    assert len(plot_text("x" * 100)) == 40
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (math.nan, "–"), (math.inf, "–"), (1.23456, "1.235"), (-0.0001, "0.000"), (-2.0, "−2.000"),
+     ("NA", "NA"), (12345678.0, "1.23e+07"), (7, "7.000")],
+)  # fmt: skip
+def test_numbers_as_text(value, text):
+    assert number_text(value, 3) == text
+
+
+def test_equals_share_the_mark_and_a_column_of_equals_has_none():
+    columns = [TableColumn("", "q", "", 1, lower_is_better) for lower_is_better in (True, False, None, True)]
+    values = [(1.04, 3.0, 1.0, 5.0), (1.01, 9.0, 2.0, 5.0), (2.0, math.nan, 3.0, 5.0), (None, "NA", 4.0, 5.0)]
+    table = Table("t", columns, [TableRow("m", [TableCell(value) for value in row]) for row in values])
+    assert table.best() == {(0, 0), (1, 0), (1, 1)}

@@ -17,7 +17,6 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from lidarslam.cli import main
-from lidarslam.core.trajectory import format_kitti, read_tum
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
@@ -56,41 +55,19 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
         ),
         ("odometry: {kiss_icp: {voxel_size_m: .nan}}", "input should be a finite number"),
         ("odometry: 3", "odometry=3: expected a section"),
-        ("odometry: {method: kiss-icp}\nodometry: {method: learned}", "the key 'odometry' occurs twice"),
-        ("- 1\n- 2", "expected keys and values, got a list"),
-        ("hello", "expected keys and values, got a str"),
-        ("{{{:\n]", "not YAML"),
         (LAUGHS + "mapping: *i\n", "mapping=["),
         (LAUGHS + "odometry: {method: *i}\n", "and 5 more"),
         ("odometry: &a\n  kiss_icp: *a\n", "there is no odometry.kiss_icp.kiss_icp"),
-        ("x: " + "[" * 3_000, "nested too deeply"),
         ("odometry: {kiss_icp: {voxel_size_m: '" + "x" * 100_000 + "'}}", "xxx...xxx"),
         ('"odo\\e[31m\\nmetry": 1', "there is no odo\\x1b[31m\\nmetry"),
-        ("!!python/object/apply:os.system ['true']", "could not determine a constructor"),
     ],
-    ids=range(16),
+    ids=range(10),
 )
 def test_a_bad_configuration_file(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "config.yaml").write_text(text)
     said = one_line_of(lidarslam("config", "--config", tmp_path / "config.yaml"))
     assert message in said
     assert "config.yaml" in said
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("odometry.kiss_icp.voxel_size=1", "did you mean voxel_size_m?"),
-        ("odometry.kiss.voxel_size_m=1", "did you mean kiss_icp?"),
-        ("odometry.kiss_icp=null", "expected a section"),
-        ("odometry..x=1", "expected key.path=value"),
-        ("viewer.map_points=" + "[" * 3_000, "nested too deeply"),
-        ("x\ny=1", "there is no x\\ny"),
-    ],
-    ids=range(6),
-)
-def test_a_bad_setting(setting: str, message: str) -> None:
-    assert message in one_line_of(lidarslam("config", "--set", setting))
 
 
 class Bomb:
@@ -177,15 +154,6 @@ def test_weights_that_are_cut_off_or_lie_about_their_header(
     one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors"))
 
 
-def test_a_header_that_is_nested_without_end(tmp_path: Path, small_recording: Path) -> None:
-    header = {"program": "lidarslam", "kind": "weights", "version": "1", "content": "[" * 100_000}
-    save_file({"a": torch.zeros(1)}, tmp_path / "w.safetensors", metadata=header)
-    said = one_line_of(
-        lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
-    )
-    assert "its description is damaged" in said
-
-
 def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(
     tmp_path: Path, small_recording: Path, small_weights: Path
 ) -> None:
@@ -240,25 +208,6 @@ def test_a_trajectory_that_is_none(
         said = one_line_of(lidarslam("evaluate", finished_run, "--reference", bad))
         assert (finished_run / "metrics.json").read_text() == (tmp_path / "before.json").read_text()
     assert any(message in said for message in BAD_TRAJECTORIES[name].split("|"))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"), [(b"", "holds no pose"), (b"a b c d e f g h", "expected 8 numbers"), (b"\xff\xfe", "text")]
-)
-@pytest.mark.parametrize("role", ["--prior", "--reference"])
-def test_a_file_that_is_no_trajectory(
-    tmp_path: Path, small_recording: Path, finished_run: Path, content: bytes, message: str, role: str
-) -> None:
-    (tmp_path / "bad.tum").write_bytes(content)
-    command = ["run", small_recording, "--out", tmp_path / "new"] if role == "--prior" else ["evaluate", finished_run]
-    assert message in one_line_of(lidarslam(*command, role, tmp_path / "bad.tum"))
-
-
-def test_a_prior_in_kittis_format_is_told_from_tum(tmp_path: Path, small_recording: Path) -> None:
-    poses = read_tum(small_recording / "ground_truth.tum").T_world_lidar
-    (tmp_path / "poses.txt").write_text(format_kitti(poses))
-    said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "new", "--prior", tmp_path / "poses.txt"))
-    assert "poses.txt:1: expected 8 numbers, got 12" in said
 
 
 def shifted_prior(folder: Path, recording: Path, offset_s: float) -> Path:

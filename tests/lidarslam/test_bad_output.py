@@ -24,7 +24,6 @@ from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.directory import FILES, RunDirectory
-from lidarslam.viewer.rerun_recording import IncompleteRecordingError, require_complete
 
 FAST = ("--odometry", "constant-velocity")
 
@@ -136,16 +135,6 @@ def test_a_map_is_whole_or_absent(tmp_path: Path) -> None:
     assert len(read_ply(tmp_path / "map.ply")) == 1_000
 
 
-def test_a_cut_recording_of_rerun_is_told_from_a_whole_one(tmp_path: Path, finished_run: Path) -> None:
-    assert lidarslam("view", finished_run, "--save", tmp_path / "whole.rrd").exit_code == 0
-    content = (tmp_path / "whole.rrd").read_bytes()
-    require_complete(tmp_path / "whole.rrd")
-    for kept in (0, 5, len(content) // 2, len(content) - 1):
-        (tmp_path / "cut.rrd").write_bytes(content[:kept])
-        with pytest.raises(IncompleteRecordingError):
-            require_complete(tmp_path / "cut.rrd")
-
-
 def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:
     out = tmp_path / "run"
     coarse = ("--set", "global_map.voxel_size_m=0.3", "--no-report")
@@ -161,15 +150,6 @@ def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Pa
     (warning,) = [one for one in warnings if one.startswith("no recording.rrd: ")]
     assert f"warning: {warning}" in result.stdout
     assert set(left_in(out)) == set(sizes)
-
-
-def test_a_view_that_finds_no_room_is_not_kept(tmp_path: Path, finished_run: Path) -> None:
-    with files_no_longer_than(5_000):
-        result = lidarslam("view", finished_run, "--save", tmp_path / "view.rrd")
-    assert result.exit_code == 1
-    assert result.stderr.count("lidarslam: ") == 1
-    assert f"{tmp_path}/view.rrd: cannot be written" in result.stderr
-    assert not [name for name in left_in(tmp_path) if "view.rrd" in name]
 
 
 def _evaluate(run: Path, out: Path) -> Sequence[object]:
@@ -199,33 +179,6 @@ def test_other_outputs_on_a_full_disk(
     assert set(left_in(out)) <= {"m.json"}, "the figures of the map fit, and are whole"
     if left_in(out):
         json.loads((out / "m.json").read_text())
-
-
-@pytest.mark.parametrize("form", ["kitti", "ply", "rosbag1", "rosbag2", "mcap"])
-def test_a_simulation_on_a_full_disk(tmp_path: Path, form: str) -> None:
-    with files_no_longer_than(20_000):
-        result = lidarslam("simulate", "--out", tmp_path / "made", "--scans", 2, "--format", form)
-    assert result.exit_code == 1
-    assert result.stderr.count("\n") == 1
-    assert left_in(tmp_path) == []
-
-
-@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="needs a file system of its own")
-def test_a_disk_that_is_really_full(tmp_path: Path, small_recording: Path) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(disk)], check=False)
-    if mounted.returncode:
-        pytest.skip("may not mount")
-    try:
-        result = lidarslam("run", small_recording, "--out", disk / "run", *FAST)
-        assert result.exit_code == 1
-        assert result.stderr.count("\n") == 1
-        assert "No space left on device" in result.stderr
-        assert "map.ply" not in left_in(disk / "run")
-        assert not [name for name in left_in(disk) if ".partial" in name]
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that not even root may write to")
@@ -276,13 +229,6 @@ def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, m
     assert lidarslam("evaluate", f"./{name}").exit_code == 0
 
 
-def test_a_name_that_is_too_long(tmp_path: Path, small_recording: Path) -> None:
-    result = lidarslam("run", small_recording, "--out", tmp_path / ("n" * 300), *FAST)
-    assert result.exit_code == 1
-    assert "File name too long" in result.stderr
-    assert left_in(tmp_path) == []
-
-
 def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_recording: Path) -> None:
     source = Path(shutil.copytree(small_recording, tmp_path / "room"))
     before = {path: path.read_bytes() for path in source.iterdir()}
@@ -309,15 +255,6 @@ def test_links_are_replaced_and_never_written_through(
     assert {(outside / name).read_text() for name in FILES} == {"precious"}
     assert not [name for name in FILES if (finished_run / name).is_symlink()]
     assert json.loads((finished_run / "summary.json").read_text())["scans"] == 6
-
-
-def test_a_device_is_not_replaced_by_a_file(tmp_path: Path, finished_run: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.rrd")
-    for command in (["view", finished_run, "--save"], ["evaluate", finished_run, "--out"]):
-        result = lidarslam(*command, tmp_path / "pipe.rrd")
-        assert result.exit_code == 1
-        assert "is no ordinary file" in result.stderr
-        assert (tmp_path / "pipe.rrd").is_fifo()
 
 
 def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(

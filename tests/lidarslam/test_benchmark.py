@@ -1,4 +1,4 @@
-"""Benchmark files: those that are shipped, and what a file can get wrong."""
+"""Methods as the command line names them, and benchmark files."""
 
 import json
 from pathlib import Path
@@ -8,19 +8,21 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.compare.benchmark import Benchmark, fill_request, load_benchmark
-from lidarslam.compare.methods.names import parse_methods
-from lidarslam.compare.request import CompareRequest
+from lidarslam.compare.methods import parse_method, parse_methods
+from lidarslam.compare.plan import CompareRequest
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "benchmarks").glob("*.yaml"))
+RECORDINGS = "title: t\nmethods: [kiss-icp]\nrecordings: [{name: a, source: a}]\n"
 
 
 def _filled(path: Path, data: Path | None = None) -> CompareRequest:
-    request = CompareRequest(Path("out"), (), parse_methods("kiss-icp"))
-    return fill_request(request, load_benchmark(path), data)
+    request = CompareRequest(Path("out"), (), parse_methods("kiss-icp"), data=data)
+    return fill_request(request, load_benchmark(path))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
@@ -30,21 +32,6 @@ def test_every_shipped_file_loads_and_fills_a_request(path: Path) -> None:
     assert request.tables
     assert all(entry.source.parent.parts[0] == "data" for entry in request.recordings)
     assert f"--benchmark {path.stem}" in path.read_text()
-
-
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
-def test_every_shipped_method_exists_or_is_still_to_come(path: Path) -> None:
-    names = [method if isinstance(method, str) else method.method for method in load_benchmark(path).methods]
-    refused = list(filter(None, map(_refusal, names)))
-    assert all("is not part of this version" in reason for reason in refused)
-
-
-def _refusal(name: str) -> str | None:
-    try:
-        parse_methods(name)
-    except ConfigError as error:
-        return str(error)
-    return None
 
 
 def test_shipped_simulations_name_what_there_is() -> None:
@@ -79,18 +66,15 @@ def test_paths_are_relative_to_the_data(tmp_path: Path) -> None:
             "set": ["reader.rate_hz=20"],
         }
     )
-    request = fill_request(CompareRequest(Path("out"), (), ()), benchmark, tmp_path)
+    request = fill_request(CompareRequest(Path("out"), (), (), data=tmp_path), benchmark)
     first, second = request.recordings
     assert (first.source, first.reference_map, first.prior) == tuple(tmp_path / n for n in ("a.bag", "a.pcd", "p.tum"))
     assert first.reference == str(tmp_path / "loam.tum")
     assert (second.source, second.reference) == (tmp_path / "b", "kiss-icp")
-    assert fill_request(request, benchmark, None).recordings[1].source == Path("out/recordings/b")
+    assert fill_request(CompareRequest(Path("out"), (), ()), benchmark).recordings[1].source == Path("out/recordings/b")
     assert [method.name for method in request.methods] == ["kiss-icp", "fine"]
     assert request.methods[1].settings[-1] == "global_map.voxel_size_m=0.1"
     assert request.settings == ("reader.rate_hz=20",)
-
-
-RECORDINGS = "title: t\nmethods: [kiss-icp]\nrecordings: [{name: a, source: a}]\n"
 
 
 @pytest.mark.parametrize(
@@ -119,14 +103,6 @@ def test_mistakes_are_named_with_the_file(tmp_path: Path, text: str, message: st
     assert message in str(error.value)
 
 
-def test_a_method_that_is_not_there_can_be_replaced(tmp_path: Path) -> None:
-    file = tmp_path / "benchmark.yaml"
-    file.write_text("title: t\nmethods: [loam]\nrecordings: [{name: a, source: a}]\n")
-    with pytest.raises(ConfigError, match="can be replaced with --methods"):
-        fill_request(CompareRequest(Path("out"), (), ()), load_benchmark(file), None)
-    assert _filled(file).methods == parse_methods("kiss-icp")
-
-
 def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
     file.write_text(
@@ -145,3 +121,72 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
     assert content["tables"][0]["rows"][0]["cells"][0]["averaged"] == 1
     assert content["sequences"][0]["methods"]["kiss-icp@0.5"]["metrics"]["map"]["chamfer_m"] > 0.0
     assert (tmp_path / "out" / "recordings" / "office" / "ground_truth.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "closes_loops"),
+    [
+        ("learned", "off", False),
+        ("learned+map", "surfels", False),
+        ("learned+loam", "loam", False),
+        ("prior+loam+graph", "loam", True),
+        ("kiss-icp@0.5+loam", "loam", False),
+        ("learned+graph", "off", True),
+    ],
+)
+@pytest.mark.parametrize("before", ["surfels", "loam", "off"])
+def test_the_name_decides_the_mapping(name: str, method: str, closes_loops: bool, before: str) -> None:
+    config = load_config(None, [f"mapping.method={before}", *parse_method(name).settings])
+    assert (config.mapping.method, config.pose_graph.enabled) == (method, closes_loops)
+
+
+@pytest.mark.parametrize(("name", "size_m"), [("kiss-icp@0.5", 0.5), ("kiss-icp@1", 1.0), ("kiss-icp@0.25+map", 0.25)])
+def test_a_voxel_size_stands_behind_the_at(name: str, size_m: float) -> None:
+    assert load_config(None, parse_method(name).settings).odometry.kiss_icp.voxel_size_m == size_m
+
+
+@pytest.mark.parametrize("name", ["kiss-icp@scene", "kiss-icp-no-deskew@scene", "kiss-icp@scene+map"])
+def test_scene_is_a_range_by_the_size_of_the_scene_and_voxels_of_a_hundredth(name: str) -> None:
+    method = parse_method(name)
+    before = ("odometry.kiss_icp.voxel_size_m=0.5", "odometry.kiss_icp.max_range_m=70")
+    kiss = load_config(None, [*before, *method.settings_at(13.5)]).odometry.kiss_icp
+    assert (method.by_scene, kiss.max_range_m, kiss.voxel_size_m) == (True, 13.5, None)
+    assert parse_method("kiss-icp").settings_at(13.5) == parse_method("kiss-icp").settings
+
+
+def test_prior_is_the_external_odometry() -> None:
+    method = parse_method("prior+map")
+    assert method.needs_prior
+    assert load_config(None, method.settings).odometry.method == "external"
+    assert not parse_method("kiss-icp").needs_prior
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "loam",
+            r"no method is called 'loam'; there are: learned, kiss-icp, kiss-icp-no-deskew, .*prior;",
+        ),
+        ("kiss-icp+graph+map", "no method is called"),
+        ("kiss-icp+map+loam", r"no method is called .* each with \+map or \+loam, with \+graph, or"),
+        ("", "no method is called ''"),
+        ("prior@0.5", "only kiss-icp takes a voxel size"),
+        ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
+        ("form@scene", "form has no voxel size"),
+        ("small-gicp@0.5", "no method is called"),
+        ("kiss-icp@nan", "expected a voxel size"),
+        ("imu", r"measures turns alone; compare imu\+map or imu\+loam"),
+        ("learned+imu", r"takes part in scan-to-map registration; compare learned\+imu\+map"),
+        ("constant-velocity", r"only predicts; compare constant-velocity\+map or constant-velocity\+loam"),
+    ],
+)
+def test_what_is_no_method_is_refused_in_words(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_method(name)
+
+
+@pytest.mark.parametrize(("names", "message"), [("kiss-icp,kiss-icp", "named twice"), (" , ", "no method is named")])
+def test_a_list_names_each_method_once(names: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_methods(names)

@@ -1,7 +1,7 @@
 """Shell completion of commands, options and names."""
 
 import pytest
-from click.shell_completion import BashComplete, FishComplete, ShellComplete, ZshComplete
+from click.shell_completion import BashComplete, ShellComplete
 
 from lidarslam.cli import main
 
@@ -23,27 +23,11 @@ def completed(line: str, shell: type[ShellComplete] = BashComplete) -> list[str]
         ("run --mapping ", ["plain surfels", "plain loam", "plain off"]),
         ("run x --reader kitti", ["plain kitti-odometry", "plain kitti-360", "plain kitti-raw"]),
         ("simulate --world t", ["plain tunnel", "plain terrace", "plain town"]),
-        ("simulate --sensor hdl-3", ["plain hdl-32e"]),
-        ("simulate --motion l", ["plain legged"]),
-        ("simulate --format r", ["plain rosbag1", "plain rosbag2"]),
         ("run -c ind", ["file ind", "plain indoor"]),
         ("compare --benchmark sim", ["file sim", "plain simulated"]),
         ("run -c ./x", ["file ./x"]),
-        ("info rec", ["file rec"]),
         ("run x -o r", ["file r"]),
-        ("evaluate r", ["file r"]),
     ],
 )
 def test_words_are_completed(line: str, expected: list[str]) -> None:
     assert completed(line) == expected
-
-
-def test_all_commands_are_offered() -> None:
-    assert set(completed("")) == {f"plain {name}" for name in main.commands}
-
-
-@pytest.mark.parametrize("shell", [BashComplete, ZshComplete, FishComplete])
-def test_the_script_of_every_shell_asks_the_program(shell: type[ShellComplete]) -> None:
-    script = shell(main, {}, "lidarslam", "_LIDARSLAM_COMPLETE")
-    assert f"_LIDARSLAM_COMPLETE={shell.name}_complete" in script.source_template % script.source_vars()
-    assert "plain simulated" in completed("compare --benchmark sim", shell)

@@ -9,11 +9,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
-from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import default_places
-from lidarslam.storage.default_places import latest_run, new_place, source_name, unfinished_run
+from lidarslam.storage.default_places import latest_run, source_name, unfinished_run
 from lidarslam.storage.unfinished import About, Unfinished
 
 TIME = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d"
@@ -61,19 +59,6 @@ def test_a_run_is_written_to_a_place_of_its_own_which_is_named_first_and_last(sm
     assert json.loads((out / "summary.json").read_text())["scans"] == 3
 
 
-def test_an_impossible_request_leaves_no_folder(small_recording: Path) -> None:
-    assert lidarslam("run", small_recording, "--start", 9).exit_code == 1
-    assert not list(Path("runs").glob("*"))
-
-
-def test_runs_in_the_same_second_do_not_meet() -> None:
-    places = []
-    for _ in range(3):
-        places.append(new_place(Path("runs"), "room"))
-        places[-1].mkdir(parents=True)
-    assert len(set(places)) == 3
-
-
 @pytest.mark.parametrize(
     ("source", "sequence", "name"),
     [
@@ -108,21 +93,6 @@ def test_the_other_commands_have_a_place_too(small_recording: Path) -> None:
     assert (only("compared") / "report.html").is_file()
     lidarslam("merge", small_recording, recording, "--odometry", "constant-velocity")
     assert re.fullmatch(f"room_{TIME}", only("merged").name)
-
-
-@pytest.mark.parametrize(
-    ("environment", "arguments", "message"),
-    [
-        ({}, ["--resume"], "--resume continues the training in --out; name it"),
-        ({"WORLD_SIZE": "2"}, [], "the processes of torchrun share a directory; name it with --out"),
-    ],
-)
-def test_a_training_is_named_where_its_place_must_be_known(
-    environment: dict[str, str], arguments: list[str], message: str
-) -> None:
-    ran = CliRunner(env=environment).invoke(main, ["train", *arguments])
-    assert (ran.exit_code, list(Path().iterdir())) == (2, [])
-    assert message in ran.stderr
 
 
 def test_a_killed_run_is_resumed_without_its_name(small_recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,20 +154,6 @@ def test_evaluate_and_view_take_the_latest_run(whole_run: Path) -> None:
     assert (viewed.exit_code, viewed.stderr) == (0, "lidarslam: taking the latest run, runs/whole\n")
 
 
-@pytest.mark.parametrize("name", ["run", "merge", "compare", "simulate", "train", "export", "demo", "evaluate"])
-def test_out_is_optional_and_short(name: str) -> None:
-    (out,) = [option for option in main.commands[name].params if "--out" in option.opts]
-    assert "-o" in out.opts
-    assert not out.required
-
-
-def test_config_is_short_everywhere() -> None:
-    options = [option for command in main.commands.values() for option in command.params]
-    configs = [option for option in options if "--config" in option.opts]
-    assert len(configs) >= 7
-    assert all("-c" in option.opts for option in configs)
-
-
 def test_results_are_named_after_sequence_and_data_set() -> None:
     Path("disk/nuscenes/v1.0-mini").mkdir(parents=True)
     Path("disk/nuscenes/v1.0-mini/scene.json").touch()
@@ -208,13 +164,3 @@ def test_results_are_named_after_sequence_and_data_set() -> None:
     assert source_name(Path("disk/area/MathildaAVE"), "MathildaAVE") == "MathildaAVE"
     assert source_name(Path("disk/site.bag"), "04") == "site"
     assert source_name(Path("evalio_data/hilti_2022/basement_2")) == "hilti_2022_basement_2"
-
-
-def test_a_link_to_a_sequence_of_evalio_keeps_its_name() -> None:
-    Path("disk/Hilti").mkdir(parents=True)
-    Path("evalio_data").mkdir()
-    link = Path("evalio_data/hilti_2022")
-    link.symlink_to(Path("disk/Hilti").absolute())
-    assert source_name(link / "basement_2") == "hilti_2022_basement_2"
-    described = describe_run(RunRequest(link / "basement_2", Path("run"), Config()))
-    assert described["source"] == str(Path("evalio_data/hilti_2022/basement_2").absolute())

@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
-from lidarslam.compare.assessment.inputs import read_estimate
-from lidarslam.compare.assessment.map_evaluation import MapOptions, evaluate_map
-from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
-from lidarslam.compare.assessment.text import format_evaluation
+from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
+from lidarslam.assessment.map_evaluation import MapOptions
+from lidarslam.assessment.text import format_evaluation
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
@@ -104,17 +102,6 @@ def test_every_alignment_is_told(run: Path, tmp_path: Path, alignment: str) -> N
         assert any("its alignment is wrong" in note for note in evaluation.notes)
     else:
         assert evaluation.map.json["accuracy_mean_m"] < 0.02  # type: ignore[operator]
-
-
-def test_the_figures_for_a_comparison(run: Path, recording: Path) -> None:
-    reference = find_reference_map(recording)
-    assert reference is not None
-    evaluation = evaluate_map(read_estimate(run), None, reference)
-    assert evaluation.alignment.method == "trajectory"
-    assert len(evaluation.errors.points) == len(evaluation.errors.distances_m) > 1_000
-    assert evaluation.errors.distances_m.max() < 0.2
-    assert find_reference_map(run) is None
-    assert load_reference_map(run / "map.ply").truth is None
 
 
 def test_the_map_alone_of_a_run_without_truth(run: Path, recording: Path, surfaces: FloatArray) -> None:

@@ -18,8 +18,9 @@ from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
-from lidarslam.exports.ros_messages import RosMessages, nanoseconds
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.exports.bag import RosMessages, nanoseconds
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import write_cloud
 
 from ..conftest import Room
 
@@ -141,20 +142,6 @@ def test_what_cannot_be_placed_is_refused(run: Path, tmp_path: Path, monkeypatch
     monkeypatch.setitem(sys.modules, "pyproj", None)
     absent = lidarslam("export-geo", run, "--out", tmp_path / "other")
     assert (absent.exit_code, "pip install 'lidarslam[geo]'" in absent.stderr) == (1, True)
-
-
-def test_a_recording_without_gnss(run: Path, tmp_path: Path) -> None:
-    scans = tmp_path / "scans"
-    scans.mkdir()
-    np.save(scans / "0.npy", np.ones((10, 3)))
-    (run / "config.yaml").rename(tmp_path / "config.yaml")
-    try:
-        (run / "config.yaml").write_text(dump_yaml(Config(), {"source": str(scans)}))
-        refused = lidarslam("export-geo", run, "--out", tmp_path / "utm")
-    finally:
-        (tmp_path / "config.yaml").rename(run / "config.yaml")
-    assert refused.exit_code == 1
-    assert "has no GNSS positions" in refused.stderr
 
 
 def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path: Path, room: Room) -> None:

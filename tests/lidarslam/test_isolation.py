@@ -23,8 +23,8 @@ NEVER = {
 NEVER_IMPORTED = {"pickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "requests", "urllib.request", "httpx"}
 ALLOWED = {
     ("lidarslam/config/yaml_text.py", "yaml.load"),
-    ("lidarslam/compare/assessment/evo_files.py", "zipfile.ZipFile"),  # writes alone
-    ("lidarslam/compare/side_by_side.py", "tarfile.open"),  # of our own tasks, and extracted with the filter of data
+    ("lidarslam/assessment/evaluate.py", "zipfile.ZipFile"),  # writes alone
+    ("lidarslam/compare/comparison.py", "tarfile.open"),  # of our own tasks, and extracted with the filter of data
 }
 
 

@@ -1,6 +1,5 @@
 """Links in a run's work folder lead nowhere: what lies behind them is neither written nor removed."""
 
-import contextlib
 import os
 import shutil
 from pathlib import Path
@@ -9,13 +8,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.compare.methods.run import LOG, clear
-from lidarslam.config.settings import load_config
-from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import make_own_folder, only_writer, open_own
-from lidarslam.merge.parts import PartTask, remove_part, track_part
-from lidarslam.run.request import RunRequest
-from lidarslam.storage.unfinished import About, Unfinished
+from lidarslam.compare.method_run import LOG, clear
+from lidarslam.core.errors import OutputError
+from lidarslam.core.files import make_own_folder, open_own
+from lidarslam.merge.parts import remove_part
+from lidarslam.storage.unfinished import Unfinished
 
 FAST = ("--odometry", "constant-velocity", "--no-report", "--pose-graph", "--set", "global_map.most_points=2000")
 
@@ -74,32 +71,6 @@ def test_the_work_folder_is_no_link(unfinished: Path, small_recording: Path, tmp
     assert not (unfinished / "unfinished").exists()
 
 
-@pytest.mark.parametrize("leads_to", ["a checkpoint", "an empty folder", "nothing"])
-def test_the_work_folder_of_a_part_is_no_link(
-    unfinished: Path, small_recording: Path, tmp_path: Path, leads_to: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A task of a merge may resume, and neither reads, locks nor replaces what it finds behind a link."""
-    monkeypatch.setattr("lidarslam.merge.parts._PATIENCE_S", 0.0)
-    outside, out = tmp_path / "precious", tmp_path / "merged" / "01_room"
-    if leads_to == "a checkpoint":
-        shutil.move(unfinished / "unfinished", outside)
-    elif leads_to == "an empty folder":
-        outside.mkdir()
-    before = content(outside) if outside.exists() else {}
-    out.mkdir(parents=True)
-    (out.parent / "unfinished").mkdir()
-    About({"merge": "all"}).write(out.parent)
-    (out / "unfinished").symlink_to(outside)
-    task = PartTask(RunRequest(small_recording, out, load_config(None, [])), "room", {}, str(tmp_path), None)
-    with contextlib.ExitStack() as stack:
-        if outside.exists():
-            stack.enter_context(only_writer(outside))  # who waited for this lock would say so
-        with pytest.raises(InputError, match="unfinished: is a link to another place; begin again with --overwrite"):
-            track_part(task)
-    assert (content(outside) if outside.exists() else {}) == before
-    assert (out / "unfinished").is_symlink()
-
-
 def test_a_merge_that_replaces_another_leaves_what_its_links_lead_to(
     unfinished: Path, small_recording: Path, tmp_path: Path
 ) -> None:
@@ -114,16 +85,6 @@ def test_a_merge_that_replaces_another_leaves_what_its_links_lead_to(
     assert content(unfinished / "unfinished") == before
     assert not (out / "01_room").is_symlink()
     assert not (out / "02_second" / "unfinished").is_symlink()
-
-
-def test_partial_files_are_no_links(unfinished: Path, small_recording: Path, tmp_path: Path) -> None:
-    outside = tmp_path / "precious"
-    outside.write_text("precious")
-    for name in ("state.npz", "run.json"):
-        (unfinished / "unfinished" / f".partial-{os.getpid()}-{name}").symlink_to(outside)
-        (unfinished / "unfinished" / f"{name}.partial").symlink_to(outside)
-    assert lidarslam("run", small_recording, "--out", unfinished, *FAST, "--resume").exit_code in (0, 3)
-    assert outside.read_text() == "precious"
 
 
 def test_a_file_is_opened_without_following_links(tmp_path: Path) -> None:

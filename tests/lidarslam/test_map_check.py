@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.compare.methods.ending import judge
+from lidarslam.compare.method_run import judge
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan

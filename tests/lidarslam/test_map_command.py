@@ -71,19 +71,6 @@ def test_a_tilted_map_is_levelled(run: Path, tmp_path: Path, by: str) -> None:
     np.testing.assert_allclose(cloud.normals, hall().normals, atol=2e-3)
 
 
-def test_a_cloud_without_normals_is_levelled_too(tmp_path: Path) -> None:
-    floor = hall().points[: len(hall()) // 3]
-    tilted = transform_points(TILT, floor)
-    np.savetxt(tmp_path / "points", tilted, fmt="%.4f")
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(tilted)}\n" + "".join(
-        f"property float {axis}\n" for axis in "xyz"
-    )
-    (tmp_path / "cloud.ply").write_text(header + "end_header\n" + (tmp_path / "points").read_text())
-    cloud, said = edited(tmp_path / "level.ply", tmp_path / "cloud.ply", "--level", "ground")
-    assert "levelled by 7.00 degrees" in said
-    assert np.ptp(cloud.points[:, 2]) < 0.02
-
-
 def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
     whole = load_map(run / "map.ply").points
     box = np.array([[-2.05, 3.0], [-1.0, 1.05], [-3.0, 0.0]])

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidarslam.compare.assessment.inputs import truth_of_run
+from lidarslam.assessment.inputs import truth_of_run
 from lidarslam.config.settings import load_config
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
-from lidarslam.exports.run_scans import read_run_scans
+from lidarslam.exports.source import read_run_scans
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.simulation.motion import mount_pose

@@ -14,9 +14,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
+from lidarslam.commands.options import take_config
 from lidarslam.commands.run import run
-from lidarslam.commands.shared.options import take_config
-from lidarslam.compare.methods.names import parse_methods
+from lidarslam.compare.methods import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.scan import Scan

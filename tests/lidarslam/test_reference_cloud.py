@@ -11,7 +11,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from lidarslam.compare.assessment.reference_cloud import read_cloud
+from lidarslam.assessment.reference_cloud import read_cloud
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 
@@ -117,19 +117,3 @@ def test_points_that_are_none_are_dropped(tmp_path: Path, survey: FloatArray) ->
     _write_pcd(tmp_path / "cloud.pcd", survey)
     with pytest.raises(InputError, match=r"cloud\.pcd: holds no point"):
         read_cloud(tmp_path / "cloud.pcd")
-
-
-@pytest.mark.parametrize(
-    ("name", "message"), [("none.ply", "no such file"), ("cloud.obj", "must end in .ply"), ("", "is a folder")]
-)
-def test_what_is_no_cloud(tmp_path: Path, name: str, message: str) -> None:
-    (tmp_path / "cloud.obj").write_text("v 0 0 0\n")
-    with pytest.raises(InputError, match=message):
-        read_cloud(tmp_path / name)
-
-
-def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "cloud.e57").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "pye57", None)
-    with pytest.raises(InputError, match="need pye57; type: pip install"):
-        read_cloud(tmp_path / "cloud.e57")

@@ -12,8 +12,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from lidarslam.cli import main
-from lidarslam.config.bounds import bounds_of, bounds_text
 from lidarslam.config.settings import Config, load_config
+from lidarslam.config.yaml_text import bounds_of, bounds_text
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan

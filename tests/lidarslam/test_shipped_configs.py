@@ -80,15 +80,3 @@ def test_a_benchmark_without_its_data_says_what_it_needs() -> None:
     )
     elsewhere = lidarslam("compare", "--benchmark", "kitti", "--data", "/nowhere")
     assert "none of its recordings is in /nowhere; --data is the root" in elsewhere.stderr
-
-
-def test_a_benchmark_of_ones_own_finds_its_recordings(empty_folder: Path, small_recording: Path) -> None:
-    (empty_folder / "mine.yaml").write_text(
-        "title: Mine\nrecordings: [{name: a, source: room}]\nmethods: [constant-velocity+map]\n"
-    )
-    compared = lidarslam("compare", "--benchmark", "mine.yaml", "--data", small_recording.parent)
-    assert compared.exit_code == 0
-    (out,) = (empty_folder / "compared").iterdir()
-    assert out.name.startswith("mine_")
-    refused = lidarslam("compare", "--benchmark", "mine.yaml")
-    assert "Mine: none of its recordings is in the current folder; name their folder with --data" in refused.stderr

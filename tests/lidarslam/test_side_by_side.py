@@ -17,8 +17,8 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.compare.comparison import CompareOutcome, Counter, Narrator, compare
-from lidarslam.compare.methods.names import parse_methods
-from lidarslam.compare.request import CompareRequest, RecordingEntry
+from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.core.tasks import SERIAL, Where
 
 pytest.importorskip("ray")
@@ -37,7 +37,7 @@ name = Path(request["out"]).name
 with log.open("a") as file: file.write(f"{name} {os.getppid()} {os.getpid()}\\n")
 starts = sum(line.startswith(f"{name} ") for line in log.read_text().splitlines())
 if name.startswith("learned") and starts == 1 and sys.argv[2] == "wait": time.sleep(120)
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.methods.process", *sys.argv[3:]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", *sys.argv[3:]])
 """
 
 
@@ -216,9 +216,3 @@ def _header_and_rest(path: Path) -> tuple[Any, int]:
     content = path.read_bytes()
     start = 8 + int.from_bytes(content[:8], "little")
     return json.loads(content[8:start]), hash(content[start:])
-
-
-def test_a_cluster_and_jobs_exclude_each_other(tmp_path: Path) -> None:
-    result = CliRunner().invoke(main, ["compare", str(tmp_path), "--jobs", "2", "--ray", "auto"])
-    assert result.exit_code == 2
-    assert "--jobs is of this machine" in result.output

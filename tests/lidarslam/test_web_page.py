@@ -96,11 +96,6 @@ def test_a_name_that_was_made_to_point_here_is_refused(page: WebPage) -> None:
     assert get(page, "/", "elsewhere.example").status == 403
 
 
-def test_there_is_nothing_else(page: WebPage) -> None:
-    assert get(page, "/../../etc/passwd").status == 404
-    assert get(page, "/nothing.js").status == 404
-
-
 def test_a_port_in_use_is_passed_over(page: WebPage, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = urlsplit(page.address).port
     other = WebPage({"/": INDEX})

@@ -1,19 +1,38 @@
-"""A recording through a peer: its trajectory at the scans' stamps, and the time of each scan."""
+"""A recording through a peer: its poses, a map of them, and its times, as of any other method."""
 
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.compare.peers.interface import Estimator, PeerError, Poses, Sweep
 from lidarslam.compare.peers.registry import Peer
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
+from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import choose_scans, take_in
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.threads import prefetch
+from lidarslam.run.interruption import Interruptions
+from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.results import RunOutcome, final_map, write_results
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.tracking import Tracked, unless_damaged
+from lidarslam.storage.directory import RunDirectory
 
+PEER_KEY = "peer"
 # Fewer points do not fix six degrees of freedom, and some libraries abort on a handful.
 _MIN_POINTS = 10
 # Poses are extrapolated to stamps so far outside their instants: the most of a sweep's duration.
@@ -30,6 +49,74 @@ class Estimate:
     register_ms: dict[float, float]  # stamp -> wall time of the registration of that scan
 
 
+def describe_peer(request: RunRequest, peer: Peer, range_m: float | None) -> dict[str, object]:
+    """The section of config.yaml about what was run."""
+    by_scene = {} if range_m is None else {"max_range_m": range_m}
+    return {**describe_run(request), PEER_KEY: peer.version, **by_scene}
+
+
+def execute_peer(
+    request: RunRequest, peer: Peer, progress: Callable[[int, int], None], range_m: float | None = None
+) -> RunOutcome:
+    """Run a peer, and write the run directory.
+
+    First the peer takes all scans; then they are read again, chained with its poses, checked and drawn into the map as
+    with an odometry of ours. A damaged recording ends both at the same scan. `progress` is called after every scan that
+    the peer has registered, with its number from 1 and how many there are; `range_m` is as of `estimate`.
+
+    Raises:
+        LidarSlamError: the source, the peer or the output directory is not usable.
+    """
+    recording = open_recording(request.source, request.config.reader)
+    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
+    errors: list[InputError] = []
+    scans = _until_damaged(take_in(recording, chosen, Faults()), errors)
+    samples = recording.imu if peer.needs_imu else None
+    estimated = estimate(peer, prefetch(scans), samples, lambda number: progress(number, len(chosen)), range_m)
+    with Interruptions() as interruptions, RunDirectory.create(request.out, request.overwrite) as directory:
+        interruptions.protect_results()
+        tracked = _track(request, recording, chosen, estimated)
+        if errors:
+            tracked = replace(tracked, error=errors[0])
+        drawn = final_map(tracked, None, request.config.global_map, directory)
+        return write_results(directory, request.config, describe_peer(request, peer, range_m), tracked, None, drawn)
+
+
+def _until_damaged(scans: Iterator[Scan], errors: list[InputError]) -> Iterator[Scan]:
+    try:
+        yield from scans
+    except InputError as error:
+        errors.append(error)
+
+
+def _track(request: RunRequest, recording: Recording, chosen: range, estimated: Estimate) -> Tracked:
+    """The scans that have a pose through the pipeline."""
+    config, faults, log = request.config, Faults(), ScanLog()
+    covered = set(estimated.trajectory.stamps.tolist())
+    unplaced = 0
+
+    def placed() -> Iterator[Scan]:
+        nonlocal unplaced
+        for scan in _until_damaged(take_in(recording, chosen, faults), []):
+            if scan.stamp in covered:
+                yield scan
+            else:
+                unplaced += 1
+
+    odometry, store = ExternalOdometry(estimated.trajectory), TileStore(request.out)
+    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, store=store)
+    with closing(pipeline.run(prefetch(placed()))) as results:
+        for result in results:
+            ms = estimated.register_ms.get(result.stamp, 0.0)
+            log.add(replace(result, stage_ms={"odometry": ms}), ms)
+    if unplaced:
+        log.warn(f"{count(unplaced, 'scan')} without a pose")
+    truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
+    built = pipeline.map
+    asked = len(chosen) - unplaced
+    return Tracked(recording, truth, log, asked, faults, built.global_map, built.views, built.slides.tests, None)
+
+
 def estimate(
     peer: Peer,
     scans: Iterable[Scan],
@@ -37,11 +124,9 @@ def estimate(
     progress: Callable[[int], None] = lambda _: None,
     range_m: float | None = None,
 ) -> Estimate:
-    """Register all scans.
+    """Register all scans, in the order of time; those without times are taken for motion compensated.
 
     Args:
-        peer: which one.
-        scans: in the order of time; those without times are taken for motion compensated, and then all have to be.
         imu: for the peers that need it.
         progress: called after every scan with its number from 1.
         range_m: maximum range by the size of the scene, for the peers with voxels; None: their defaults.

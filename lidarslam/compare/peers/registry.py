@@ -12,6 +12,9 @@ from lidarslam.core.plugins import PlugPoint
 
 EXTRA = "pip install 'lidarslam[peers]'"
 
+Make = Callable[[Sweep, ImuSamples | None, float | None], Estimator]
+"""From the first sweep with points, the IMU, and the maximum range by the size of the scene; None: its defaults."""
+
 
 @dataclass(frozen=True)
 class Peer:
@@ -20,8 +23,7 @@ class Peer:
     name: str  # in `--methods`
     library: str  # the module that it needs
     package: str  # that holds it
-    # from the first sweep with points, the IMU, and the maximum range by the size of the scene; None: its defaults
-    make: Callable[[Sweep, ImuSamples | None, float | None], Estimator]
+    make: Make
     needs_imu: bool = False
     has_voxels: bool = True  # whether it has settings that follow the size of the scene
 
@@ -48,7 +50,7 @@ class Peer:
             raise PeerError("needs an IMU, and the recording has none")
 
 
-def _evalio(name: str) -> Callable[[Sweep, ImuSamples | None, float | None], Estimator]:
+def _evalio(name: str) -> Make:
     def make(first: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
         from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
 
@@ -57,23 +59,14 @@ def _evalio(name: str) -> Callable[[Sweep, ImuSamples | None, float | None], Est
     return make
 
 
-def _small_gicp(_: Sweep, __: ImuSamples | None, range_m: float | None) -> Estimator:
-    from lidarslam.compare.peers.small_gicp import SmallGicpEstimator
+def _library(estimator: str) -> Make:
+    def make(_: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
+        from lidarslam.compare.peers import libraries
 
-    return SmallGicpEstimator(range_m or MAX_RANGE_M)
+        made: Estimator = getattr(libraries, estimator)(imu, range_m or MAX_RANGE_M)
+        return made
 
-
-def _kiss_slam(_: Sweep, __: ImuSamples | None, range_m: float | None) -> Estimator:
-    from lidarslam.compare.peers.kiss_slam import KissSlamEstimator
-
-    return KissSlamEstimator(range_m or MAX_RANGE_M)
-
-
-def _rko_lio(_: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
-    from lidarslam.compare.peers.rko_lio import RkoLioEstimator
-
-    assert imu is not None
-    return RkoLioEstimator(imu, range_m or MAX_RANGE_M)
+    return make
 
 
 _ALL = (
@@ -82,9 +75,9 @@ _ALL = (
         for name in ("kiss-icp-evalio", "genz-icp", "mad-icp", "ct-icp", "loam-evalio", "form")
     ),
     *(Peer(name, "evalio", "evalio", _evalio(name), needs_imu=True) for name in ("lio-sam", "dlio")),
-    Peer("kiss-slam", "kiss_slam", "kiss-slam", _kiss_slam),
-    Peer("small-gicp", "small_gicp", "small_gicp", _small_gicp),
-    Peer("rko-lio", "rko_lio", "rko_lio", _rko_lio, needs_imu=True),
+    Peer("kiss-slam", "kiss_slam", "kiss-slam", _library("KissSlamEstimator")),
+    Peer("small-gicp", "small_gicp", "small_gicp", _library("SmallGicpEstimator")),
+    Peer("rko-lio", "rko_lio", "rko_lio", _library("RkoLioEstimator"), needs_imu=True),
 )
 PEERS = {peer.name: peer for peer in _ALL}
 ALL_PEERS = PlugPoint("peer", tuple(PEERS))

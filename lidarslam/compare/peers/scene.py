@@ -21,11 +21,7 @@ _SHORTEST_M = 10.0
 
 
 def scene_range_m(recording: Recording, chosen: range) -> float:
-    """Twice the range of 99 % of the points of the first ten scans, within 10 and 100 m; no truth is used.
-
-    Args:
-        recording, chosen: the source, and the indices of its scans.
-    """
+    """Twice the range of 99 % of the points of the first ten chosen scans, within 10 and 100 m; no truth is used."""
     ranges = [np.empty(0)]
     with suppress(InputError):  # raised again when the methods read the scans
         for scan in recording.scans(chosen.start, chosen[:_SCANS].stop, chosen.step, Faults()):

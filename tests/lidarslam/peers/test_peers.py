@@ -11,7 +11,6 @@ import pytest
 from click.testing import CliRunner
 
 from lidarslam.cli import main
-from lidarslam.compare.methods.names import parse_method
 from lidarslam.compare.peers.estimation import estimate, is_covered
 from lidarslam.compare.peers.interface import PeerError, Poses, Sweep
 from lidarslam.compare.peers.registry import PEERS
@@ -126,14 +125,6 @@ def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: A
     assert error_m(0.0) < min(error_m(-0.5 * SWEEP_S), error_m(0.5 * SWEEP_S))
 
 
-def test_a_sweep_may_start_before_the_clock(room: Any) -> None:
-    pytest.importorskip("evalio", reason="needs the extra peers")
-    sweeps = [room.sweep(_swaying, SWEEP_S * number) for number in range(1, 7)]
-    earlier = [replace(sweep, stamp=sweep.stamp - 0.25) for sweep in sweeps]
-    found, shifted = (estimate(PEERS["kiss-icp-evalio"], scans).trajectory for scans in (sweeps, earlier))
-    np.testing.assert_allclose(shifted.T_world_lidar, found.T_world_lidar, atol=1e-6)
-
-
 @pytest.fixture
 def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
     folder = tmp_path / "room"
@@ -214,16 +205,3 @@ def test_every_peer_with_voxels_registers_a_small_scene_with_fine_ones(name: str
     coarse, fine = (estimate(PEERS[name], sweeps, range_m=range_m).trajectory for range_m in (None, 20.0))
     assert len(fine) == len(coarse)
     assert np.abs(fine.T_world_lidar - coarse.T_world_lidar).max() > 1e-6
-
-
-def test_what_is_not_installed_names_the_extra() -> None:
-    with pytest.raises(PeerError, match=r"pip install 'lidarslam\[peers\]'"):
-        estimate(replace(PEERS["small-gicp"], library="no_such_library"), _scans(3))
-
-
-def test_a_method_can_be_a_peer_but_takes_no_mapping() -> None:
-    assert parse_method("ct-icp").peer == "ct-icp"
-    assert not parse_method("ct-icp").needs_prior
-    assert "odometry.kiss_icp.deskew=false" in parse_method("kiss-icp-no-deskew").settings
-    with pytest.raises(Exception, match="no method is called"):
-        parse_method("ct-icp+map")

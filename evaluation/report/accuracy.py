@@ -1,0 +1,420 @@
+"""Figures of accuracy: trajectories, absolute errors, drift and map errors of each method."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.evaluation.comparison.comparison import MapErrors, MethodResult, SequenceComparison
+from lidarslam.evaluation.report.bulk import beyond_m, in_bulk, leaves, paths_in_bulk
+from lidarslam.evaluation.report.figure import (
+    EQUAL_AXES,
+    MOST_POINTS,
+    Figure,
+    Panel,
+    Styles,
+    line_trace,
+    plot_text,
+    thin_curve,
+)
+from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
+
+_NOMINAL_WIDTH, _LOWEST, _TALLEST, _SIDE_HEIGHT = 500.0, 240.0, 480.0, 210
+# A view that a path leaves ends at this share of its size beyond the others.
+_BEYOND_VIEW = 0.1
+_LEAST_HEIGHT_RANGE_M = 1.0
+# A straight road seen along its direction is a point.
+_LEAST_SIDE = 0.25
+_REFERENCE_LINE = {"color": "#9a9a9a", "width": 5}
+_ALIGNED = {
+    "se3": "after SE(3) alignment",
+    "first_pose": "after alignment of the first poses",
+    "none": "without alignment",
+}
+_COMPONENTS = ("x, forward [m]", "y, left [m]", "z, up [m]", "roll [°]", "pitch [°]", "yaw [°]")
+# Largest errors that differ by this factor cannot be read on one linear axis. A method whose errors are so much larger
+# than the others' leaves the picture, which ends at this multiple of the largest that stays.
+_LOG_RATIO = 10.0
+_BEYOND = 1.5
+_MAP_CELLS = 60_000
+
+Measured = Sequence[tuple[MethodResult, TrajectoryMetrics]]
+Parts = Sequence[tuple[str, Mapping[int, Drift | None]]]
+
+
+def trajectory_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
+    """All views; None when no method has a trajectory."""
+    paths = {method.name: path for method in sequence.methods if (path := _aligned(method, sequence)) is not None}
+    if not paths:
+        return None
+    reference = _matched_reference(sequence)
+    low, high = _view(list(paths.values()), reference)
+    extent = np.maximum(high - low, 1.0)
+    views = [(0, 1)] + [(axis, 2) for axis in (0, 1) if extent[axis] >= _LEAST_SIDE * extent[:2].max()]
+    panels = []
+    for across, up in views:
+        title = f"{'Top' if up == 1 else 'Side'} view: {'xyz'[up]} over {'xyz'[across]} [m]"
+        traces = _traces(sequence, paths, reference, styles, (across, up))
+        given = EQUAL_AXES if up == 1 else {"xaxis": {}, "yaxis": {}}
+        layout = {
+            **given,
+            "xaxis": {**given["xaxis"], "title": {"text": f"{'xyz'[across]} [m]"}, "range": _range(low, high, across)},
+            "yaxis": {**given["yaxis"], "range": _range(low, high, up)},
+            "hovermode": "closest",
+        }
+        panels.append(Panel(title, traces, layout, _height_from_above(extent) if up == 1 else _SIDE_HEIGHT))
+    name = "" if reference is None else sequence.reference_name
+    return Figure("Trajectories", _trajectory_caption(sequence, paths, low, high), panels, list(paths), name)
+
+
+def _aligned(method: MethodResult, sequence: SequenceComparison) -> FloatArray | None:
+    """Positions (N, 3) in the reference's world: aligned as for the ATE, else by the first pose, or relative to it."""
+    if method.trajectory is None or not len(method.trajectory):
+        return None
+    if method.metrics is not None:
+        T_reference_estimate = method.metrics.T_reference_estimate
+    elif sequence.reference is not None and len(sequence.reference):
+        first = slice(0, 1)
+        T_reference_estimate = align(method.trajectory.select(first), sequence.reference.select(first), "first_pose")
+    else:
+        T_reference_estimate = inverse(method.trajectory.T_world_lidar[0])
+    return method.trajectory.transformed(T_reference_estimate).positions
+
+
+def _matched_reference(sequence: SequenceComparison) -> FloatArray | None:
+    """Positions of the reference from the first to the last instant of any method's trajectory."""
+    if sequence.reference is None or not len(sequence.reference):
+        return None
+    stamps = sequence.reference.stamps
+    spans = [m.trajectory.stamps[[0, -1]] for m in sequence.methods if m.trajectory is not None and len(m.trajectory)]
+    first, last = np.searchsorted(stamps, [min(s[0] for s in spans), max(s[1] for s in spans)])
+    matched = sequence.reference.positions[max(first - 1, 0) : last + 1]
+    return matched if len(matched) > 1 else sequence.reference.positions
+
+
+def _traces(
+    sequence: SequenceComparison,
+    paths: dict[str, FloatArray],
+    reference: FloatArray | None,
+    styles: Styles,
+    axes: tuple[int, int],
+) -> list[Any]:
+    traces = []
+    if reference is not None:
+        rows = _thin(len(reference))
+        x, y = (np.float32(reference[rows, axis]) for axis in axes)
+        name, line = plot_text(sequence.reference_name), _REFERENCE_LINE
+        traces.append(go.Scatter(x=x, y=y, name=name, mode="lines", line=line, legendgroup="reference"))
+    for method in sequence.methods:
+        if method.name not in paths:
+            continue
+        style, path, rows = styles[method.name], paths[method.name], _thin(len(paths[method.name]))
+        x, y = path[rows, axes[0]], path[rows, axes[1]]
+        hover = f"scan %{{customdata}}<br>{'xyz'[axes[0]]} %{{x:.2f}} m, {'xyz'[axes[1]]} %{{y:.2f}} m"
+        traces.append(line_trace(method.name, style, x, y, customdata=rows, hovertemplate=hover))
+        if method.lost is not None and method.lost.any():
+            lost = np.flatnonzero(method.lost)
+            lost = lost[_thin(len(lost))]
+            cross = {"symbol": "x", "size": 6, "color": style.colour, "line": {"width": 0}}
+            more = {"mode": "markers", "marker": cross, "customdata": lost, "hovertemplate": "scan %{customdata}: lost"}
+            traces.append(line_trace(method.name, style, path[lost, axes[0]], path[lost, axes[1]], **more))
+    start = next(iter(paths.values())) if reference is None else reference
+    ring = {"symbol": "circle-open", "size": 11, "color": "#8a8a8a", "line": {"width": 2}}
+    first = [start[:1, axis] for axis in axes]
+    return [*traces, go.Scatter(x=first[0], y=first[1], mode="markers", marker=ring, name="start", hoverinfo="name")]
+
+
+def _thin(count: int) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
+    """Rows of evenly spaced poses."""
+    return np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int32)
+
+
+def _view(paths: Sequence[FloatArray], reference: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper corner of the first view: all paths but those that diverge."""
+    kept = [path for path, inside in zip(paths, paths_in_bulk(paths, reference), strict=True) if inside]
+    points = np.concatenate([*kept, *([] if reference is None else [reference])])
+    low, high = points.min(axis=0), points.max(axis=0)
+    short = np.maximum(_LEAST_HEIGHT_RANGE_M - (high - low), 0.0) / 2.0
+    beyond = _BEYOND_VIEW * (high - low) if len(kept) < len(paths) else 0.0
+    return low - short - beyond, high + short + beyond
+
+
+def _range(low: FloatArray, high: FloatArray, axis: int) -> list[float]:
+    margin = 0.05 * (high[axis] - low[axis])
+    return [float(low[axis] - margin), float(high[axis] + margin)]
+
+
+def _trajectory_caption(
+    sequence: SequenceComparison, paths: dict[str, FloatArray], low: FloatArray, high: FloatArray
+) -> str:
+    measured = measured_methods(sequence)
+    unmeasured = [m.name for m in sequence.methods if m.trajectory is not None and m.metrics is None]
+    if sequence.reference is None:
+        frame = f"{'each ' if len(paths) > 1 else ''}in the frame of its first pose, as there is no reference"
+    elif measured:
+        frame = aligned_how(measured)
+        frame += f"; aligned by the first pose only: {', '.join(unmeasured)}" if unmeasured else ""
+    else:
+        frame = "aligned with the reference by the first pose"
+    outside = {name: far for name, path in paths.items() if (far := beyond_m(path, low, high)) > 0.0}
+    cut = "".join(f" {leaves(name, {' m': far})} outside." for name, far in outside.items())
+    cut += " A double click shows all." if outside else ""
+    what = "Paths of all methods" if len(paths) > 1 else "Path"
+    return (
+        f"{what}, {frame}. The ring marks the start, crosses mark scans on which tracking was lost."
+        f" The axes of the top view have one scale, those of the side views have not.{cut}"
+    )
+
+
+def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
+    """Position and orientation error over the distance travelled; None without a reference."""
+    measured = measured_methods(sequence)
+    if not measured:
+        return None
+    errors = [metrics.absolute_errors() for _, metrics in measured]
+    curves = {
+        "Position error [m]": [metres for metres, _ in errors],
+        "Orientation error [°]": [np.rad2deg(rad) for _, rad in errors],
+    }
+    panels = [_error_panel(title, measured, of, styles, signed=False) for title, of in curves.items()]
+    caption = (
+        f"Absolute trajectory error, {aligned_how(measured)}: distance between the estimated and the reference position"
+        f" and angle between the orientations, over the distance travelled along the reference"
+        f" ({sequence.reference_name}). Crosses mark scans on which tracking was lost."
+        f"{_leaving(measured, curves, signed=False)}"
+    )
+    return Figure("Absolute errors", caption, panels, [method.name for method, _ in measured])
+
+
+def deviation_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
+    """Components of the error along and about the axes of the reference's LiDAR; None without a reference."""
+    measured = measured_methods(sequence)
+    if not measured:
+        return None
+    found = [np.hstack(metrics.deviations()) for _, metrics in measured]
+    curves = {title: [components[:, axis] for components in found] for axis, title in enumerate(_COMPONENTS)}
+    panels = [_error_panel(title, measured, of, styles, signed=True) for title, of in curves.items()]
+    caption = (
+        "Pose of the estimate in the frame of the reference's LiDAR (x forward, y left, z up),"
+        f" {aligned_how(measured)}, over the distance travelled along the reference."
+        f"{_leaving(measured, curves, signed=True)}"
+    )
+    return Figure("Error components", caption, panels, [method.name for method, _ in measured], columns=3)
+
+
+def measured_methods(sequence: SequenceComparison) -> list[tuple[MethodResult, TrajectoryMetrics]]:
+    """The methods that were compared with the reference."""
+    return [(method, method.metrics) for method in sequence.methods if method.metrics is not None]
+
+
+def aligned_how(measured: Measured) -> str:
+    """How the estimates were brought to the reference's world."""
+    return " or ".join(dict.fromkeys(_ALIGNED[metrics.alignment] for _, metrics in measured))
+
+
+def needs_log(curves: Sequence[FloatArray]) -> bool:
+    """Whether the largest values of positive curves differ so much that a linear axis would hide the smaller ones."""
+    largest = [float(np.nanmax(curve)) for curve in curves if np.isfinite(curve).any()]
+    return bool(largest) and max(largest) > _LOG_RATIO * max(min(largest), 1e-9)
+
+
+def _error_panel(title: str, measured: Measured, curves: Sequence[FloatArray], styles: Styles, signed: bool) -> Panel:
+    traces: list[Any] = []
+    for (method, metrics), curve in zip(measured, curves, strict=True):
+        travelled, rows, style = metrics.association.reference.distances, thin_curve(curve), styles[method.name]
+        hover = "%{y:.3f}"
+        traces.append(line_trace(method.name, style, travelled[rows], curve[rows], hovertemplate=hover))
+        lost = np.zeros(0, dtype=np.intp)
+        if method.lost is not None:
+            lost = np.flatnonzero(method.lost[metrics.association.rows])
+        if len(lost) and not signed:
+            lost = lost[thin_curve(curve[lost])]
+            cross = {"symbol": "x", "size": 5, "color": style.colour}
+            more = {"mode": "markers", "marker": cross, "hoverinfo": "skip"}
+            traces.append(line_trace(method.name, style, travelled[lost], curve[lost], **more))
+    layout: dict[str, Any] = {
+        "xaxis": {"title": {"text": "distance travelled [m]"}, "hoverformat": ".1f"},
+        "yaxis": {} if signed else {"rangemode": "tozero"},
+        "hovermode": "x unified",
+    }
+    kept, log = _kept(curves, signed)
+    if not all(kept):
+        end = _BEYOND * max(_largest(curve) for curve, is_kept in zip(curves, kept, strict=True) if is_kept)
+        layout["yaxis"]["range"] = [-end if signed else 0.0, end]
+    return Panel(title, traces, layout, 190 if signed else 270, None if signed else log)
+
+
+def _kept(curves: Sequence[FloatArray], signed: bool) -> tuple[list[bool], bool]:
+    """Which curves a panel holds, and whether its axis is logarithmic, which holds them all."""
+    largest = [_largest(curve) for curve in curves]
+    kept = in_bulk(largest, _LOG_RATIO)
+    log = not signed and needs_log([curve for curve, is_kept in zip(curves, kept, strict=True) if is_kept])
+    shows_all = log or not any(size for size, is_kept in zip(largest, kept, strict=True) if is_kept)
+    return [True] * len(kept) if shows_all else kept, log
+
+
+def _largest(curve: FloatArray) -> float:
+    return float(np.nanmax(np.abs(curve), initial=0.0))
+
+
+def _leaving(measured: Measured, panels: Mapping[str, Sequence[FloatArray]], signed: bool) -> str:
+    """The sentences about methods that leave a panel, by the panels' titles, which end with the unit."""
+    far: dict[str, dict[str, float]] = {}
+    for title, curves in panels.items():
+        unit = {"[m]": " m", "[°]": "°"}[title.split()[-1]]
+        for (method, _), curve, is_kept in zip(measured, curves, _kept(curves, signed)[0], strict=True):
+            if not is_kept:
+                of = far.setdefault(method.name, {})
+                of[unit] = max(of.get(unit, 0.0), _largest(curve))
+    notes = [f" {leaves(name, of)}." for name, of in far.items()]
+    return "".join([*notes, " A double click shows all."] if notes else notes)
+
+
+def length_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
+    """Drift by segment length, KITTI's and the short one; None when no trajectory is long enough for either."""
+    measured = measured_methods(sequence)
+    kitti = [(m.name, metrics.kitti.by_length) for m, metrics in measured if metrics.kitti is not None]
+    short = [(method.name, metrics.segments) for method, metrics in measured]
+    length = "segment length [m]"
+    panels = _drift_panels(kitti, KITTI_LENGTHS_M, length, 100, styles, ", 100 to 800 m")
+    panels += _drift_panels(short, SHORT_LENGTHS_M, length, 10, styles, ", 5 to 100 m")
+    if not panels:
+        return None
+    caption = (
+        "Mean translation error in percent of the segment length and mean rotation error per 100 m (segments of 100 to"
+        " 800 m, as the KITTI development kit computes it) or per 10 m (segments of 5 to 100 m)."
+    )
+    return Figure("Drift by segment length", caption, panels, [method.name for method, _ in measured])
+
+
+def speed_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
+    """KITTI's drift by the speed over the segment; None when no segment of 100 m exists."""
+    kitti = [(m.name, metrics.kitti.by_speed) for m, metrics in measured_methods(sequence) if metrics.kitti is not None]
+    speeds = sorted({mps for _, by_speed in kitti for mps, drift in by_speed.items() if drift is not None})
+    panels = _drift_panels(kitti, speeds, "speed over the segment [m/s]", 100, styles, "")
+    if not panels:
+        return None
+    caption = "Mean errors over all segments of 100 to 800 m that were driven within 2 m/s of the speed."
+    return Figure("Drift by speed", caption, panels, [name for name, _ in kitti])
+
+
+def _drift_panels(
+    parts: Parts, places: Sequence[int], x_label: str, per_m: int, styles: Styles, over: str
+) -> list[Panel]:
+    """Translation and rotation over the lengths or speeds at which any method has a drift."""
+    reached = [place for place in places if any(by_place.get(place) for _, by_place in parts)]
+    if not reached:
+        return []
+    translation, rotation = {}, {}
+    for name, by_place in parts:
+        drifts = [by_place.get(place) for place in reached]
+        translation[name] = np.array([drift.translation_percent if drift else np.nan for drift in drifts])
+        rotation[name] = np.array([drift.rotation_deg_per_m * per_m if drift else np.nan for drift in drifts])
+    layout = {
+        "xaxis": {"title": {"text": x_label}, "type": "category"},
+        "yaxis": {"rangemode": "tozero"},
+        "hovermode": "x unified",
+    }
+    panels = []
+    titles = (f"Translation drift{over} [%]", f"Rotation drift{over} [° per {per_m} m]")
+    for title, curves in zip(titles, (translation, rotation), strict=True):
+        traces = [
+            line_trace(
+                name, styles[name], [*map(str, reached)], curve,
+                mode="lines+markers", marker=styles[name].marker, hovertemplate="%{y:.3f}",
+            )
+            for name, curve in curves.items()
+        ]  # fmt: skip
+        panels.append(Panel(title, traces, layout, 250, needs_log(list(curves.values()))))
+    return panels
+
+
+def map_figure(sequence: SequenceComparison) -> Figure | None:
+    """Each map's errors from above; None without a reference map."""
+    maps = {m.name: m.map_errors for m in sequence.methods if m.map_errors is not None and len(m.map_errors.points)}
+    if not maps:
+        return None
+    worst_m = _colour_range([errors.distances_m for errors in maps.values()])
+    low, high = _box(list(maps.values()))
+    return Figure(
+        "Map errors",
+        f"Maps from above. The colour of a cell is the median distance of its points from the reference map; the scale"
+        f" ends at {worst_m:g} m.",
+        [_map_panel(name, errors, low, high, worst_m) for name, errors in maps.items()],
+    )
+
+
+def entropy_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
+    """Mean map entropy, which needs no reference; None where there is a reference map, or no map."""
+    entropies = {m.name: m.map_entropy for m in sequence.methods if m.map_entropy is not None}
+    if not entropies or any(method.map_metrics is not None for method in sequence.methods):
+        return None
+    points = [
+        line_trace(
+            name, styles[name], np.array([entropy]), [plot_text(name)],
+            mode="markers", marker={**styles[name].marker, "size": 12}, hovertemplate="%{x:.3f}",
+        )
+        for name, entropy in entropies.items()
+    ]  # fmt: skip
+    layout = {"xaxis": {"zeroline": False}, "yaxis": {"autorange": "reversed"}, "hovermode": "closest"}
+    panel = Panel("Mean map entropy", points, layout, 70 + 30 * len(points))
+    caption = (
+        "Mean entropy of the points within 0.3 m of each map point (Droeschel et al., ICRA 2014); lower is crisper."
+        " It needs no reference; a method that lost tracking may have a crisp map of a part."
+    )
+    return Figure("Map quality without a reference", caption, [panel], list(entropies))
+
+
+def raster(errors: MapErrors, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
+    """Median distance (rows, columns) of the points in each cell; NaN where there is none."""
+    from scipy.stats import binned_statistic_2d  # takes longer to load than the rest of a page
+
+    x, y = errors.points[:, 0], errors.points[:, 1]
+    finite = np.isfinite(errors.distances_m)
+    bins = [y_edges, x_edges]
+    median = binned_statistic_2d(y[finite], x[finite], errors.distances_m[finite], "median", bins).statistic
+    return np.asarray(median, dtype=np.float64)
+
+
+def _map_panel(name: str, errors: MapErrors, low: FloatArray, high: FloatArray, worst_m: float) -> Panel:
+    size = high - low
+    cell_m = float(np.sqrt(size.prod() / _MAP_CELLS))
+    x_edges, y_edges = (np.linspace(low[a], high[a], max(2, int(size[a] / cell_m) + 1)) for a in (0, 1))
+    heat = go.Heatmap(
+        z=np.float32(raster(errors, x_edges, y_edges)),
+        x0=0.5 * (x_edges[0] + x_edges[1]), dx=x_edges[1] - x_edges[0],
+        y0=0.5 * (y_edges[0] + y_edges[1]), dy=y_edges[1] - y_edges[0],
+        coloraxis="coloraxis", hoverongaps=False, name="",
+        hovertemplate="x %{x:.1f} m, y %{y:.1f} m<br>%{z:.3f} m from the reference",
+    )  # fmt: skip
+    layout = {
+        **EQUAL_AXES,
+        "xaxis": {**EQUAL_AXES["xaxis"], "title": {"text": "x [m]"}, "showgrid": False, "zeroline": False},
+        "yaxis": {**EQUAL_AXES["yaxis"], "title": {"text": "y [m]"}, "showgrid": False, "zeroline": False},
+        "hovermode": "closest",
+        "coloraxis": {"cmin": 0.0, "cmax": worst_m, "colorbar": {"thickness": 10, "title": {"text": "[m]"}}},
+    }
+    return Panel(name, [heat], layout, _height_from_above(size))
+
+
+def _height_from_above(size: FloatArray) -> int:
+    """Pixels of a panel that shows a scene of this size along x and y in one scale."""
+    return int(np.clip(_NOMINAL_WIDTH * size[1] / size[0], _LOWEST, _TALLEST))
+
+
+def _colour_range(distances_m: list[FloatArray]) -> float:
+    """End of the colour scale: the 95th percentile in the median map, with one digit."""
+    ends = [np.percentile(of[np.isfinite(of)], 95.0) for of in distances_m if np.isfinite(of).any()]
+    return max(float(f"{np.median(ends):.1g}"), 1e-3) if ends else 1.0
+
+
+def _box(maps: list[MapErrors]) -> tuple[FloatArray, FloatArray]:
+    """Corners (2,) of the view, the same for all maps; a few stray points do not stretch it."""
+    corners = [np.percentile(errors.points[:, :2], (0.2, 99.8), axis=0) for errors in maps]
+    low, high = np.median(corners, axis=0)
+    margin = 0.03 * (high - low) + 0.5
+    return low - margin, high + margin

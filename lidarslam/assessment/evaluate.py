@@ -1,0 +1,300 @@
+"""Evaluation of a run directory or a trajectory file: metrics.json, and files of the errors."""
+
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lidarslam.assessment.inputs import (
+    Estimate,
+    Poses,
+    find_reference_map,
+    load_reference_map,
+    pair,
+    read_estimate,
+    read_reference,
+    recording_truth,
+)
+from lidarslam.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.files import replacing
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
+from lidarslam.evaluation.map.metrics import MapComparison
+from lidarslam.evaluation.report.error_colours import DEFAULT_CLIP_M, DISTANCE_FIELD, error_colours
+from lidarslam.evaluation.trajectory.alignment import AlignmentMethod
+from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S
+from lidarslam.evaluation.trajectory.metrics import (
+    TrajectoryMetrics,
+    absolute_errors,
+    disagreement,
+    evaluate_trajectory,
+    metrics_json,
+    relative_errors,
+)
+from lidarslam.simulation.writers import write_ply
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
+
+_SUFFIXES = (".ply", ".rrd")
+_FIELDS = [
+    *((axis, "<f8") for axis in "xyz"),
+    *((colour, "|u1") for colour in ("red", "green", "blue")),
+    (DISTANCE_FIELD, "<f4"),
+]
+APE, RPE = "ape.zip", "rpe.zip"
+
+
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """Estimate, references and outputs."""
+
+    run: Path | Trajectory  # a run directory, or a trajectory, in memory or in TUM or KITTI text
+    # a trajectory likewise, a run directory or a recording; None: the truth that came with the run's source
+    reference: Path | Trajectory | None = None
+    reference_map: Path | None = None  # a cloud; None: the exact map of a simulated source, else none
+    map_file: Path | None = None  # the map of a bare trajectory, or another one than the run's
+    alignment: AlignmentMethod = "se3"  # of the trajectory, for the ATE
+    # tolerance_s, max_gap_s: of the association in time
+    tolerance_s: float = DEFAULT_TOLERANCE_S
+    max_gap_s: float = DEFAULT_MAX_GAP_S
+    map_options: MapOptions = field(default_factory=MapOptions)  # of the comparison of maps
+    errors: Sequence[Path] = ()  # files for the map coloured by its errors
+    errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
+    out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
+    needs_reference: bool = True  # whether it is an error that there is no reference
+    evo: Path | None = None  # folder for the errors as files of evo; None: nowhere
+    write: bool = True  # whether the figures are written
+    report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Errors of an estimate."""
+
+    estimate: Estimate  # the trajectory and its map
+    reference: str | None  # description of the reference trajectory; None without one
+    metrics: TrajectoryMetrics | None  # errors of the trajectory
+    map: MapEvaluation | None  # errors of the map; None without a map or a reference for it
+    entropy: MapEntropy | None  # of the map; None without a map
+    notes: Sequence[str]  # remarks for the reader
+    written: Sequence[Path]  # the files
+
+    def to_json(self) -> dict[str, object]:
+        """The content of metrics.json."""
+        return {
+            **metrics_json(self.metrics, None if self.map is None else self.map.json),
+            "map_alignment": self.map and self.map.alignment.to_json(),
+            "map_entropy": self.entropy and self.entropy.to_json(),
+            "notes": list(self.notes),
+        }
+
+
+def evaluate(request: EvaluateRequest) -> Evaluation:
+    """Compare, and write the figures.
+
+    Raises:
+        InputError: a file is missing or damaged, or there is no reference.
+        OutputError: a file cannot be written.
+    """
+    check_error_files(request.errors)
+    estimate = read_estimate(request.run, request.map_file)
+    notes: list[str] = []
+    reference, metrics, trajectory = _reference(request, estimate, notes), None, None
+    if reference is not None:
+        trajectories = pair(estimate, reference)
+        trajectory = trajectories[0]
+        metrics = evaluate_trajectory(*trajectories, request.tolerance_s, request.max_gap_s, request.alignment)
+        notes += [warning] if (warning := disagreement(metrics)) is not None else []
+    # Poses of KITTI's camera do not give the LiDAR's world.
+    in_camera = estimate.run is not None and reference is not None and reference.stamps is None
+    compared = _evaluate_map(request, estimate, None if in_camera else metrics, notes)
+    if request.errors and compared is None:
+        raise InputError("--errors colours a map by its distance to a reference; name one with --reference-map MAP")
+    entropy = None
+    if compared is not None:
+        entropy = compared.entropy
+        notes += compared.warnings()
+    elif estimate.map_file is not None:
+        entropy = map_entropy(estimate.map_points())
+    out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
+    written = [*([] if out is None else [out]), *request.errors]
+    if request.evo is not None:
+        written += _write_evo(request.evo, request.run, metrics)
+    label = None if reference is None else reference.label
+    evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
+    if out is not None:
+        RunDirectory(out.parent).write_json(out.name, evaluation.to_json())
+    if compared is not None:
+        for path in request.errors:
+            write_errors(path, compared.comparison, compared.positions, request.errors_clip_m)
+    if request.report and estimate.run is not None and request.out is None:
+        _draw_report(request, estimate.run, evaluation, trajectory if in_camera else None)
+    return evaluation
+
+
+def _write_evo(folder: Path, run: Path | Trajectory, metrics: TrajectoryMetrics | None) -> list[Path]:
+    if metrics is None:
+        raise InputError("--evo saves the errors of a trajectory, and there is no reference for it")
+    return write_evo_files(folder, "estimate" if isinstance(run, Trajectory) else run.resolve().stem, metrics)
+
+
+def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:
+    """The page of the run with its errors; `compared` are the poses in the camera's frame, if they were compared."""
+    from lidarslam.viewer.run_report import Accuracy, leave_report
+
+    accuracy = Accuracy(
+        evaluation.metrics,
+        request.reference.name if isinstance(request.reference, Path) else "ground truth",
+        compared,
+        None if evaluation.map is None else evaluation.map.json,
+        None if evaluation.map is None else evaluation.map.errors,
+        tuple(evaluation.notes),
+    )
+    leave_report(run, accuracy)
+
+
+def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -> Poses | None:
+    """The reference trajectory; where a map is compared, its absence is only noted."""
+    if request.reference is not None:
+        return read_reference(request.reference, estimate.config.reader)
+    if not request.needs_reference:
+        return None
+    try:
+        return _own_truth(estimate)
+    except InputError as error:
+        if request.reference_map is None:
+            raise
+        notes.append(f"the trajectory is not evaluated: {error}")
+        return None
+
+
+def _own_truth(estimate: Estimate) -> Poses:
+    source, advice = estimate.source, "name a trajectory with --reference or a map with --reference-map"
+    if source is None:
+        raise InputError(f"{estimate.poses.label}: has no reference; {advice}")
+    if not source.exists():
+        raise InputError(f"{source}: the run's recording is not there any more; {advice}")
+    return recording_truth(source, estimate.config.reader)
+
+
+def _evaluate_map(
+    request: EvaluateRequest, estimate: Estimate, metrics: TrajectoryMetrics | None, notes: list[str]
+) -> MapEvaluation | None:
+    """Errors of the map; None without a reference map, or without a map for that of the simulation."""
+    reference = None
+    if request.reference_map is not None:
+        reference = load_reference_map(request.reference_map)
+    elif request.needs_reference:
+        sources = [path for path in (estimate.source, request.reference) if isinstance(path, Path) and path.exists()]
+        reference = next((found for found in map(find_reference_map, sources) if found is not None), None)
+        if reference is not None and estimate.map_file is None:
+            if estimate.run is not None:
+                notes.append("there is no map to compare with that of the simulation")
+            return None
+    return None if reference is None else evaluate_map(estimate, metrics, reference, request.map_options)
+
+
+def check_error_files(paths: Sequence[Path]) -> None:
+    """Refuse files that cannot be written later.
+
+    Raises:
+        OutputError: a file's name ends in neither .ply nor .rrd, or its folder does not exist.
+    """
+    for path in paths:
+        if path.suffix.lower() not in _SUFFIXES:
+            raise OutputError(f"{path}: the errors can be written as {' or '.join(_SUFFIXES)}; name such a file")
+        if not path.parent.is_dir():
+            raise OutputError(f"{path}: there is no folder {path.parent}; make it first")
+
+
+def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, clip_m: float) -> None:
+    """Write the map coloured by its distance from the reference, in the reference's frame.
+
+    A .ply file holds the points in double precision, with colours and distances. A .rrd file, for Rerun, also holds
+    the reference coloured by its distance from the map, and the sensor's path (K, 3).
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with replacing(path) as partial:
+        if path.suffix.lower() == ".rrd":
+            from lidarslam.viewer.rerun_errors import save_errors
+
+            save_errors(partial, comparison, positions, clip_m)
+            return
+        errors = comparison.map_errors
+        vertices = np.empty(len(errors.points), _FIELDS)
+        columns = [*errors.points.T, *error_colours(errors.distances_m, clip_m).T, errors.distances_m]
+        for (name, _), column in zip(_FIELDS, columns, strict=True):
+            vertices[name] = column
+        try:
+            write_ply(partial, vertices)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def write_evo_files(folder: Path, name: str, metrics: TrajectoryMetrics) -> list[Path]:
+    """Write NAME_ape.zip, the positions' errors after alignment, and NAME_rpe.zip, those from scan to scan.
+
+    Both hold `info.json`, `stats.json` and the arrays of a result of evo's.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    association = metrics.association
+    rows = np.arange(len(association.estimate))
+    ends = rows[1:][np.diff(association.rows) == 1]
+    absolute, _ = absolute_errors(association, metrics.T_reference_estimate)
+    relative, _ = relative_errors(association)
+    aligned = {"se3": "with SE(3) Umeyama alignment", "first_pose": "with origin alignment", "none": "not aligned"}
+    titles = (
+        f"APE w.r.t. translation part (m)\n({aligned[metrics.alignment]})",
+        "RPE w.r.t. translation part (m)\nfor delta = 1 (frames) using consecutive pairs\n(not aligned)",
+    )
+    paths = [folder / f"{name}_{ending}" for ending in (APE, RPE)]
+    parts = zip(paths, titles, ("APE (m)", "RPE (m)"), (absolute, relative), (rows, ends), strict=True)
+    for path, title, label, errors, chosen in parts:
+        info = {"title": title, "ref_name": "reference", "est_name": name, "label": label}
+        estimate, reference = association.estimate, association.reference
+        arrays = {
+            "error_array": errors,
+            "seconds_from_start": estimate.stamps[chosen] - estimate.stamps[0],
+            "timestamps": estimate.stamps[chosen],
+            "distances_from_start": reference.distances[chosen],
+            "distances": estimate.distances[chosen],
+        }
+        if len(errors):
+            _write_arrays(path, info, arrays)
+    return [path for path, errors in zip(paths, (absolute, relative), strict=True) if len(errors)]
+
+
+def _write_arrays(path: Path, info: dict[str, str], arrays: dict[str, FloatArray]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+            archive.writestr("info.json", json.dumps(info))
+            archive.writestr("stats.json", json.dumps(_statistics(arrays["error_array"])))
+            for name, values in arrays.items():
+                content = io.BytesIO()
+                np.save(content, values, allow_pickle=False)
+                archive.writestr(f"{name}.npy", content.getvalue())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _statistics(errors: FloatArray) -> dict[str, float]:
+    return {
+        "rmse": float(np.sqrt(np.mean(errors**2))),
+        "mean": float(np.mean(errors)),
+        "median": float(np.median(errors)),
+        "std": float(np.std(errors)),
+        "min": float(np.min(errors)),
+        "max": float(np.max(errors)),
+        "sse": float(np.sum(errors**2)),
+    }

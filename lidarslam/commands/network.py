@@ -1,0 +1,97 @@
+"""`lidarslam train` and `lidarslam export`: weights of the learned odometry."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.options import (
+    PATH,
+    command,
+    config_options,
+    default_out,
+    jobs_options,
+    out_option,
+    reader_options,
+    take_where,
+)
+from lidarslam.commands.terminal import EXIT_MENDABLE, say
+
+
+@command(
+    """lidarslam train office.mcap street.mcap
+    lidarslam train KITTI --sequence 00 -o trained --from shipped --steps 2000
+    lidarslam train --set simulated.recordings=100
+    lidarslam train -o trained --resume"""
+)
+@click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
+@out_option("Directory of the training.", "trained/SOURCE_TIME, after the first")
+@click.option("--resume", is_flag=True, help="Continue the training in DIR, on the same recordings.")
+@click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="auto: a GPU where there is one.",
+)
+@click.option("--steps", type=click.IntRange(min=1), help="Training steps.  [default: 12000]")
+@click.option("--network", type=click.Choice(["correlation", "delora"]), help="What to train.  [default: correlation]")
+@click.option(
+    "--losses",
+    type=click.Choice(["both", "point-to-plane", "plane-to-plane", "paper", "alignment"]),
+    help="Losses: the geometric ones, in DeLORA's form (paper), or the distance to the aligned motion (alignment)."
+    "  [default: both and alignment]",
+)
+@click.option("--from", "start_from", metavar="WEIGHTS", help="Initial weights; shipped: the included ones.")
+@click.option(
+    "--prepared", type=PATH, metavar="DIR", help="Cache of preprocessed recordings.  [default: prepared in --out]"
+)
+@jobs_options
+@reader_options
+@config_options
+@click.pass_context
+def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
+    """Train the learned odometry on recordings without labels.
+
+    Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun;
+    --jobs and --ray are for the preparation of recordings.
+    """
+    from lidarslam.odometry.network.shipped import require_train_extra
+    from lidarslam.storage.default_places import source_name
+
+    if out is None:
+        if options["resume"]:
+            raise click.UsageError("--resume continues the training in --out; name it")
+        if "WORLD_SIZE" in os.environ:
+            raise click.UsageError("the processes of torchrun share a directory; name it with --out")
+        out = default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
+    require_train_extra("training")
+    where = take_where(options)
+    from lidarslam.train.train import run_train
+
+    if not run_train(sources, say, out=out, where=where, **options):
+        ctx.exit(EXIT_MENDABLE)
+
+
+@command("lidarslam export --weights trained/weights.safetensors -o exported")
+@click.option("--weights", type=PATH, metavar="FILE", help="Trained weights.  [default: included]")
+@out_option("Folder for the ONNX graphs.", "exported/WEIGHTS_TIME")
+def export(weights: Path | None, out: Path | None) -> None:
+    """Export a trained network as ONNX.
+
+    `lidarslam run --weights DIR` starts faster with the folder than with the weights file, as it does not import torch.
+    docs/odometry.md lists inputs and outputs of the graphs.
+    """
+    from lidarslam.odometry.network.shipped import require_train_extra
+
+    require_train_extra("an export")
+    from lidarslam.odometry.network.checkpoint import load_checkpoint
+    from lidarslam.odometry.network.export import export_onnx
+    from lidarslam.odometry.network.shipped import default_weights
+
+    weights = weights or default_weights()
+    checkpoint = load_checkpoint(weights)
+    for path in export_onnx(checkpoint, out or default_out("exported", weights.stem)):
+        say(f"written to {path}")

@@ -1,0 +1,113 @@
+"""`lidarslam info`, `datasets` and `simulate`: recordings."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.options import (
+    FILE,
+    SOURCE,
+    Registered,
+    command,
+    config_options,
+    default_out,
+    jobs_options,
+    out_option,
+    reader_options,
+    take_config,
+    take_where,
+)
+from lidarslam.commands.terminal import say
+
+_WORLD = Registered("lidarslam.simulation.world", "WORLDS")
+_SENSOR = Registered("lidarslam.simulation.sensors", "SENSORS")
+_CARRIER = Registered("lidarslam.simulation.motion", "CARRIERS")
+_MOUNT = Registered("lidarslam.simulation.motion", "MOUNTS")
+_FORMAT = Registered("lidarslam.simulation.formats", "FORMATS")
+
+
+@command(
+    """lidarslam datasets
+    lidarslam datasets hilti_2022
+    lidarslam datasets /data --json"""
+)
+@click.argument("arguments", nargs=-1, metavar="[NAME | FOLDER]...")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; docs/data_sets.md describes the keys.")
+def datasets(arguments: tuple[str, ...], as_json: bool) -> None:
+    """List published data sets and those on disk, or describe one."""
+    from lidarslam.commands import catalogue_text as text
+
+    chosen, folders = text.choose(arguments)
+    on_disk = text.find_on_disk(folders)
+    if as_json:
+        say(text.as_json(chosen, on_disk))
+    elif chosen:
+        say("\n\n".join(text.describe_data_set(one, on_disk) for one in chosen))
+    else:
+        say(text.list_data_sets(on_disk))
+
+
+@command(
+    """lidarslam info recordings/2011_09_26_drive_0005_sync
+    lidarslam info office.mcap --json"""
+)
+@SOURCE
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; docs/command_line.md describes the keys.")
+@reader_options
+@config_options
+def info(source: Path, as_json: bool, **options: Any) -> None:
+    """Print what a recording holds, and what was inferred about it."""
+    from lidarslam.datasets.info_text import describe_as_json, describe_source
+
+    config = take_config(options, source).reader
+    say((describe_as_json if as_json else describe_source)(source, config))
+
+
+@command(
+    """lidarslam simulate
+    lidarslam simulate -o recordings/street --world street --sensor hdl-64e --motion car --format kitti
+    lidarslam simulate -o recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
+    lidarslam simulate -o recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000"""
+)
+@out_option("Folder of the recording.", "recordings/WORLD_TIME")
+@click.option("--world", type=_WORLD, default="office", show_default=True, help="Scene.")
+@click.option("--sensor", type=_SENSOR, default="vlp-16", show_default=True, help="LiDAR model.")
+@click.option(
+    "--motion",
+    type=_CARRIER,
+    help="Carrier of the LiDAR.  [default: handheld; car with --trajectory]",
+)
+@click.option(
+    "--speed",
+    "speed_mps",
+    type=click.FloatRange(min=0.1, max=60.0),
+    metavar="M/S",
+    help="Speed on straight stretches.  [default: that of the carrier, within the limit of the route]",
+)
+@click.option(
+    "--trajectory",
+    type=FILE,
+    metavar="FILE",
+    help="TUM or KITTI file to follow, KITTI's smoothed over 0.25 s. The street is built around it; in other worlds it"
+    " must keep clear of obstacles.",
+)
+@click.option("--mount", type=_MOUNT, default="upright", show_default=True, help="Mounting of the LiDAR.")
+@click.option("--scans", type=click.IntRange(min=1), help="Number of scans.  [default: 300, or all of the trajectory]")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
+@click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
+@click.option("--imu/--no-imu", default=False, show_default=True, help="Record an IMU of 200 Hz on the LiDAR too.")
+@jobs_options
+@click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
+def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
+    """Simulate a recording, with exact trajectory and map."""
+    from lidarslam.run.progress import show_count
+    from lidarslam.simulation.record import RecordRequest, format_summary, record
+
+    motion = motion or ("handheld" if trajectory is None else "car")
+    out = out or default_out("recordings", options["world"])
+    where = take_where(options)
+    request = RecordRequest(out, where=where, motion=motion, trajectory=trajectory, **options)
+    with show_count(out.name) as progress:
+        summary = record(request, progress)
+    say(format_summary(request, summary))

@@ -1,0 +1,168 @@
+"""One method on one recording: a run in a process of its own, and its result however it ended."""
+
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pydantic import ConfigDict, TypeAdapter, with_config
+from typing_extensions import TypedDict
+
+from lidarslam.compare.method_process import LOST, MethodRun, encode
+from lidarslam.compare.peers.estimation import describe_peer
+from lidarslam.compare.peers.registry import peer_named
+from lidarslam.compare.supervised import Ending, Limits, supervise
+from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.config.yaml_text import read_yaml
+from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
+from lidarslam.core.files import remove_partial_files
+from lidarslam.core.json_text import read_json
+from lidarslam.datasets.recording import Recording
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
+from lidarslam.run.request import describe_run
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import SUMMARY, RunDirectory
+from lidarslam.storage.finished_run import read_summary
+from lidarslam.viewer.run_report import with_run
+
+# Beside a run's own files: how its process went, and its standard error.
+PROCESS, LOG = "process.json", "process.log"
+COMMAND = (sys.executable, "-m", "lidarslam.compare.method_process")
+# The process starts here, so that no package in the user's folder is found first.
+_ROOT = Path(__file__).resolve().parents[2]
+_SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
+_MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
+_LONGEST_MESSAGE = 300
+
+
+@with_config(ConfigDict(extra="forbid"))
+class _Recorded(TypedDict):
+    status: MethodStatus
+    message: str
+    wall_s: float | None
+    peak_rss_mb: float | None
+
+
+_SHAPE = TypeAdapter(_Recorded)
+
+
+def obstacle(run: MethodRun, recording: Recording) -> str | None:
+    """Why a method cannot run on a recording; None where nothing is in its way."""
+    if run.peer is None:
+        return None
+    try:
+        peer_named(run.peer).require(lambda: recording.imu is not None)
+    except LidarSlamError as error:
+        return str(error)
+    return None
+
+
+def run_method(
+    run: MethodRun, limits: Limits, progress: Callable[[int, int], None], command: Sequence[str] = COMMAND
+) -> tuple[MethodResult, bool]:
+    """Run a method to any end; its result, and whether it was interrupted with Ctrl-C.
+
+    An earlier run of a comparison in its directory is replaced. `progress` is called after every scan with its number
+    from 1 and how many there are; the encoded request is the command's last arguments.
+    """
+    folder = run.request.out
+    clear(folder)
+
+    def see(line: str) -> None:
+        words = line.split()
+        if len(words) == 2 and all(word.isdecimal() for word in words):
+            progress(int(words[0]), int(words[1]))
+
+    ending = supervise([*command, *encode(run)], folder / LOG, limits, see, _ROOT)
+    remove_partial_files(folder)
+    status, message = judge(ending, folder, folder / LOG, limits)
+    result = MethodResult(folder.name, status, message, wall_s=ending.wall_s, peak_rss_mb=ending.peak_rss_mb)
+    RunDirectory(folder).write_json(PROCESS, {name: getattr(result, name) for name in _Recorded.__annotations__})
+    return _collect(run, result), ending.cause == "interrupt"
+
+
+def clear(folder: Path) -> None:
+    """Make a method's directory, or remove what a run of an earlier comparison left there."""
+    for one in (folder.parent, folder):
+        if one.is_symlink():  # what it leads to is not of this comparison
+            one.unlink()
+    if (folder / LOG).is_file():
+        files.remove_files(folder)
+        (folder / PROCESS).unlink(missing_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def finished_before(run: MethodRun) -> MethodResult | None:
+    """The result of an earlier run of the same request, if it came to its end.
+
+    The same are the source, its scans, the prior, the program's version and the configuration; the content of the
+    source and the prior is not looked at. Of a peer, its version counts too.
+    """
+    try:
+        folder = run.request.out
+        result = MethodResult(run.name, **read_json(folder / PROCESS, _SHAPE))
+        tree = read_yaml(folder / files.CONFIG)
+        was_run = tree.pop(files.RUN_SECTION)
+        is_same = Config.model_validate(tree) == run.request.config
+        peer = None if run.peer is None else peer_named(run.peer)
+        described = describe_run(run.request) if peer is None else describe_peer(run.request, peer, run.range_m)
+        is_same = is_same and all(was_run.get(key) == value for key, value in described.items())
+    except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError):
+        return None
+    return _collect(run, result) if is_same and result.status in WHOLE else None
+
+
+def _collect(run: MethodRun, result: MethodResult) -> MethodResult:
+    """The result with the content of its run directory; a damaged one counts as a failure."""
+    result = replace(result, settings=dump_yaml(run.request.config))
+    result = result if run.peer is None else replace(result, times_cover="registration")
+    if result.status not in (*WHOLE, "stopped"):
+        return result
+    try:
+        return replace(with_run(result, run.request.out), run=f"{run.request.out.parent.name}/{run.name}")
+    except (InputError, OSError) as error:
+        return replace(result, status="failed", message=f"its run directory cannot be read: {error}")
+
+
+def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> tuple[MethodStatus, str]:
+    """The status of a process by its run directory, which held no run before, and its log; the reason if it failed."""
+    has_result = (folder / SUMMARY).is_file()
+    if ending.cause == "memory":
+        return "out of memory", f"took more than {limits.memory_mb:,.0f} MB"
+    if ending.cause == "time":
+        return "timed out", f"took more than {limits.timeout_s:g} s"
+    if ending.cause == "interrupt":
+        return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
+    if has_result and ending.status in (0, LOST):
+        return ("lost", _where_lost(folder)) if ending.status else ("ok", "")
+    return _failed(ending.status, has_result, _last_words(log))
+
+
+def _failed(status: int, has_result: bool, said: str) -> tuple[MethodStatus, str]:
+    if any(words in said for words in _MEMORY_ERRORS):
+        return "out of memory", said
+    if status == -signal.SIGKILL:
+        return "out of memory", "killed by the system (signal 9), as it does when memory runs out"
+    if status < 0:
+        reason = f"{_SIGNALS.get(-status, 'ended by the system')} (signal {-status})"
+        return "failed", f"{reason}: {said}" if said else reason
+    return ("stopped" if has_result else "failed"), said or f"ended with status {status} and said nothing"
+
+
+def _where_lost(folder: Path) -> str:
+    summary = read_summary(folder)
+    if not summary["lost"] and not summary["map_contradictions"]:
+        return f"{summary['unconstrained_m']:.1f} m of its way are hardly constrained"
+    if not summary["lost"]:
+        slid = summary["map_contradictions"][0]
+        return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"
+    first = summary["lost"][0]
+    return f"first lost on scan {first['first']}: {first['reason']}"
+
+
+def _last_words(log: Path) -> str:
+    """The last line on standard error, without the program's name before it."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return last.removeprefix("lidarslam: ")[:_LONGEST_MESSAGE]

@@ -1,0 +1,126 @@
+"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph], or PEER[@scene]."""
+
+import re
+from dataclasses import dataclass
+
+from lidarslam.compare.peers.registry import ALL_PEERS, PEERS, peer_named
+from lidarslam.compare.peers.scene import BY_SCENE
+from lidarslam.core.errors import ConfigError
+from lidarslam.core.text import require_name
+from lidarslam.mapping.config import MappingName
+from lidarslam.odometry.config import ODOMETRIES
+from lidarslam.storage.comparison_folder import RESERVED
+
+# Name for the user -> name of the odometry in the configuration.
+_BASES = {
+    "learned": "learned",
+    "kiss-icp": "kiss-icp",
+    "kiss-icp-no-deskew": "kiss-icp",
+    "constant-velocity": "constant-velocity",
+    "imu": "imu",
+    "learned+imu": "learned+imu",
+    "prior": "external",
+}
+_NO_DESKEW = "kiss-icp-no-deskew"
+DEFAULT_METHODS = "learned+map,kiss-icp"
+# A peer's run: its poses as they are.
+_PEER = ("odometry.method=external", "mapping.method=off", "pose_graph.enabled=false")
+_ONLY_WITH_MAP = {
+    "constant-velocity": "only predicts",
+    "imu": "measures turns alone",
+    "learned+imu": "the IMU takes part in scan-to-map registration",
+}
+_NAME = re.compile(
+    r"(?P<base>[A-Za-z][\w.-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?"
+)
+_MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method of a comparison."""
+
+    name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`, and of its run directory
+    settings: tuple[str, ...]  # of the configuration, `key.path=value`
+    peer: str | None = None  # the peer that estimates the poses, see `lidarslam.compare.peers`
+    by_scene: bool = False  # whether maximum range and voxels follow the size of the scene
+
+    def __post_init__(self) -> None:
+        require_name(self.name, "method", RESERVED)
+
+    @property
+    def needs_prior(self) -> bool:
+        """Whether it takes its motions from a given trajectory."""
+        return self.peer is None and "odometry.method=external" in self.settings
+
+    def settings_at(self, range_m: float) -> tuple[str, ...]:
+        """Its settings where the size of the scene asks for this maximum range."""
+        if not self.by_scene:
+            return self.settings
+        by_scene = (f"odometry.kiss_icp.max_range_m={range_m!r}", "odometry.kiss_icp.voxel_size_m=null")
+        return (*self.settings, *by_scene)
+
+
+def _grammar() -> str:
+    return (
+        f"{', '.join([*_BASES, *ODOMETRIES.added])}; each with +map or +loam, with +graph, or with both as in"
+        " learned+map+graph; kiss-icp@0.5 for a voxel size of 0.5 m; and as they are "
+        f"{', '.join(ALL_PEERS.names)}; kiss-icp@{BY_SCENE}, and likewise a peer with voxels, for a range by the size"
+        " of the scene"
+    )
+
+
+def parse_method(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        ConfigError: no method is called so, or another package's cannot be loaded.
+    """
+    peer, by_scene = name.removesuffix(f"@{BY_SCENE}"), name.endswith(f"@{BY_SCENE}")
+    match = _NAME.fullmatch(name)
+    base = "" if match is None else match["base"]
+    if peer in PEERS or (base not in _BASES and peer in ALL_PEERS.added):
+        if not peer_named(peer).has_voxels and by_scene:
+            raise ConfigError(f"{name}: {peer} has no voxel size that could follow the size of the scene")
+        return Method(name, _PEER, peer, by_scene)
+    odometry = _BASES.get(base) or (base if base in ODOMETRIES.added else None)
+    if match is None or odometry is None:
+        raise ConfigError(f"no method is called {name!r}; there are: {_grammar()}")
+    if odometry in _ONLY_WITH_MAP and not match["mapping"]:
+        raise ConfigError(
+            f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
+            " a map"
+        )
+    by_scene = match["voxel"] == BY_SCENE and odometry == "kiss-icp"
+    size = None if match["voxel"] is None or by_scene else _voxel_size_m(name, match)
+    voxel = () if size is None else (f"odometry.kiss_icp.voxel_size_m={size!r}",)
+    deskew = ("odometry.kiss_icp.deskew=false",) if base == _NO_DESKEW else ()
+    pose_graph = str(match["graph"] is not None).lower()
+    switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
+    return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches), by_scene=by_scene)
+
+
+def _voxel_size_m(name: str, match: re.Match[str]) -> float:
+    if _BASES.get(match["base"]) != "kiss-icp":
+        raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
+    try:
+        size_m = float(match["voxel"])
+    except ValueError:
+        size_m = 0.0
+    if not 0.0 < size_m < float("inf"):
+        raise ConfigError(f"{name}: expected a voxel size in metres, as in kiss-icp@0.5, got {match['voxel']!r}")
+    return size_m
+
+
+def parse_methods(names: str) -> tuple[Method, ...]:
+    """The methods of a list with commas.
+
+    Raises:
+        ConfigError: one of them does not exist, one is named twice, or there is none.
+    """
+    chosen = [name.strip() for name in names.split(",") if name.strip()]
+    if not chosen:
+        raise ConfigError(f"no method is named; there are: {_grammar()}")
+    if len(set(chosen)) < len(chosen):
+        raise ConfigError(f"a method is named twice in {names!r}; name each once")
+    return tuple(parse_method(name) for name in chosen)

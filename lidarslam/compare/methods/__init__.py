@@ -1,1 +1,0 @@
-"""The methods of a comparison: their names, and the process of each."""

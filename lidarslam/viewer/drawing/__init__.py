@@ -1,1 +1,0 @@
-"""Parts of pictures: the view, the shaded clouds, paths and legend."""

@@ -1,0 +1,249 @@
+"""report.html, map.png and trajectory.png of a run, drawn from the files of its directory."""
+
+import csv
+import io
+import logging
+from base64 import b64encode
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+
+from lidarslam.config.settings import Config, load_config
+from lidarslam.config.yaml_text import read_yaml
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.text import count, scan_span, small_length
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.comparison.comparison import MapErrors, MethodResult, ScanSeries, SequenceComparison
+from lidarslam.evaluation.report.report import RunPage, render_run
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import MAP_TILES, SCANS_CSV, RunDirectory
+from lidarslam.storage.finished_run import read_statuses, read_summary, read_trajectory
+from lidarslam.viewer.picture import draw_runs, fit_frame, load_drawn_runs
+
+logger = logging.getLogger(__name__)
+
+_NO_CLOUD = PointCloud(np.empty((0, 3)), np.empty((0, 3)))
+_CAPTION = (
+    "From above, to scale; the colour is the height. The path is orange where tracking was degraded, red where it was"
+    " lost."
+)
+# Stretches of lost scans that are listed; scans.csv has them all.
+_LISTED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """Errors of a run, as far as there are references."""
+
+    metrics: TrajectoryMetrics | None = None
+    reference: str = "ground truth"  # name of the reference trajectory
+    trajectory: Trajectory | None = None  # the poses that were compared; None: the run's own
+    map_metrics: Mapping[str, object] | None = None  # the content of metrics.json's "map"
+    map_errors: MapErrors | None = None
+    notes: tuple[str, ...] = ()  # remarks for the reader
+
+
+def leave_report(run: Path, accuracy: Accuracy) -> bool:
+    """Draw the page and the pictures of a finished run; whether it could be done. A failure is a warning."""
+    try:
+        _draw(run, accuracy)
+    except KeyboardInterrupt:
+        logger.warning("%s: no %s was drawn: interrupted", run, files.REPORT)
+    except Exception as error:
+        logger.warning("%s: no %s was drawn: %s", run, files.REPORT, error or type(error).__name__)
+        logger.info("raised here:", exc_info=True)
+    else:
+        return True
+    return False
+
+
+def _draw(run: Path, accuracy: Accuracy) -> None:
+    directory, (drawn,) = RunDirectory(run), load_drawn_runs([run])
+    path, truth = replace(drawn, cloud=_NO_CLOUD), _true_path(accuracy)
+    frame = fit_frame([drawn])
+    alone = fit_frame([path], reference=truth, turn_deg=frame.view.turn_deg)
+    _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], reference=truth, frame=alone).pixels)
+    picture = None
+    if len(drawn.cloud):
+        picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn], frame=frame).pixels)
+    directory.write_text(files.REPORT, render_run(_page(run, accuracy, picture)))
+
+
+def _true_path(accuracy: Accuracy) -> FloatArray | None:
+    """Positions of the reference in the run's world; None without one, or in the frame of a camera."""
+    if accuracy.metrics is None or accuracy.trajectory is not None:
+        return None
+    reference = accuracy.metrics.association.reference
+    return reference.transformed(inverse(accuracy.metrics.T_reference_estimate)).positions
+
+
+def _write_picture(directory: RunDirectory, name: str, pixels: NDArray[np.uint8]) -> str:
+    """Write a PNG file; its content in base64."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, format="PNG")
+    with directory.replacing(name) as partial:
+        partial.write_bytes(content.getvalue())
+    return b64encode(content.getvalue()).decode()
+
+
+def _page(run: Path, accuracy: Accuracy, picture: str | None) -> RunPage:
+    summary, settings = read_summary(run), (run / files.CONFIG).read_text(encoding="utf-8")
+    described = read_yaml(run / files.CONFIG).get(files.RUN_SECTION) or {}
+    result = with_run(MethodResult(run.resolve().name, "lost" if summary["lost_scans"] else "ok"), run)
+    result = replace(
+        result,
+        trajectory=accuracy.trajectory or result.trajectory,
+        metrics=accuracy.metrics,
+        map_metrics=accuracy.map_metrics,
+        map_errors=accuracy.map_errors,
+        peak_rss_mb=summary["peak_rss_mb"],
+        series=read_series(run),
+    )
+    reference = None if accuracy.metrics is None else accuracy.metrics.association.reference
+    return RunPage(
+        title=result.name,
+        about=describe_source(described),
+        sequence=SequenceComparison(
+            result.name, str(described.get("source", "")), reference, accuracy.reference, [result]
+        ),
+        picture=picture,
+        caption=_CAPTION,
+        warnings=[*describe_warnings(summary), *accuracy.notes],
+        summary=describe_results(summary),
+        changed=changed_settings(load_config(run / files.CONFIG)),
+        settings=settings,
+    )
+
+
+def with_run(result: MethodResult, run: Path) -> MethodResult:
+    """The result with what a run directory holds.
+
+    Raises:
+        InputError: a file is damaged, or lacks a quantity.
+    """
+    trajectory, summary = read_trajectory(run), read_summary(run)
+    statuses = read_statuses(run, len(trajectory))
+    try:
+        ms = {stage: values["median"] for stage, values in summary["ms_per_scan"].items()}
+        return replace(
+            result,
+            scans=len(trajectory),
+            trajectory=trajectory,
+            lost=np.array([status == "lost" for status in statuses], dtype=np.bool_),
+            lost_reasons=tuple(stretch["reason"] for stretch in summary["lost"]),
+            map_entropy=summary["map_entropy"],
+            elapsed_ms_per_scan=summary["elapsed_ms_per_scan"],
+            latency_ms_median=summary["latency_ms"]["median"],
+            latency_ms_p99=summary["latency_ms"]["p99"],
+            ms_per_scan_median=ms.pop("total"),
+            ms_per_scan_p95=summary["ms_per_scan"]["total"]["p95"],
+            ms_per_scan_p99=summary["ms_per_scan"]["total"]["p99"],
+            stage_ms=ms,
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{run / files.SUMMARY}: not a run's summary ({error!r}); make the run again") from error
+
+
+def read_series(run: Path) -> ScanSeries | None:
+    """The registration of each scan; None where no table has been kept.
+
+    Raises:
+        InputError: the table is damaged.
+    """
+    file = run / files.SCANS_CSV
+    if not file.is_file():
+        return None
+    try:
+        with file.open(encoding="utf-8", newline="") as lines:
+            rows = list(csv.DictReader(lines))
+        stamps = _column(rows, "stamp")
+        return ScanSeries(
+            times_s=stamps - stamps[:1],
+            statuses=read_statuses(run, len(rows)),
+            residual_m=_column(rows, "residual_m"),
+            inlier_ratio=_column(rows, "inlier_ratio"),
+            points_used=_column(rows, "points_used"),
+        )
+    except (KeyError, ValueError, csv.Error) as error:
+        raise InputError(f"{file}: not a run's table ({error!r}); make the run again") from error
+
+
+def _column(rows: list[dict[str, str]], name: str) -> FloatArray:
+    """Numbers (N,), NaN where there is none."""
+    return np.array([float(row[name] or "nan") for row in rows], dtype=np.float64)
+
+
+def describe_source(described: Mapping[str, Any]) -> list[str]:
+    """Lines about what was run, from config.yaml's section about it."""
+    chosen = {name: described.get(name) for name in ("start", "stop", "step")}
+    part = chosen != {"start": 0, "stop": None, "step": 1}
+    lines = [f"Source: {described.get('source', 'unknown')}"]
+    lines += [f"Scans: {', '.join(f'{name} {value}' for name, value in chosen.items())}"] if part else []
+    lines += [f"Prior: {described['prior']}"] if described.get("prior") else []
+    return [*lines, f"lidarslam {described.get('version', '')}"]
+
+
+def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Quantities of summary.json in words, but for those in the report's tables."""
+    lost, degraded, scans = summary["lost_scans"], summary["degraded_scans"], summary["scans"]
+    shown = {
+        "path": f"{summary['length_m']:.1f} m in {summary['duration_s']:.1f} s, {count(scans, 'scan')}",
+        "tracking": f"{scans - lost - degraded:,} ok, {degraded:,} degraded, {lost:,} lost",
+    }
+    if summary["map_points"]:
+        moved = summary["map_points_moved"]
+        removed = f"; {count(moved, 'point')} of moving objects removed" if moved else ""
+        voxel = small_length(summary["map_voxel_size_m"])
+        tiles = summary.get("map_tiles")
+        whole = f", of {tiles['points']:,} in {MAP_TILES}/" if tiles else ""
+        shown["map"] = f"{count(summary['map_points'], 'point')}{whole}, voxels of {voxel}{removed}"
+    if summary["pose_graph"] is not None:
+        graph = summary["pose_graph"]
+        closed = count(summary["loop_closures"], "loop")
+        shown["pose graph"] = (
+            f"{count(graph['keyframes'], 'keyframe')}, {closed} closed, poses corrected by up to"
+            f" {small_length(graph['largest_correction_m'])}"
+        )
+    return shown
+
+
+def describe_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Lost stretches, and the warnings of summary.json."""
+    for stretch in summary["lost"][:_LISTED]:
+        yield f"tracking was lost on {scan_span(stretch['first'], stretch['last'])}: {stretch['reason']}"
+    if (more := len(summary["lost"]) - _LISTED) > 0:
+        yield f"tracking was lost on {more} more {'stretch' if more == 1 else 'stretches'}; {SCANS_CSV} lists them"
+    yield from summary["warnings"]
+
+
+def changed_settings(config: Config) -> dict[str, str]:
+    """Settings that differ from the defaults, with these."""
+    usual = dict(_flat(Config().model_dump(mode="json")))
+    ours = dict(_flat(config.model_dump(mode="json")))
+    changed = {name: value for name, value in ours.items() if value != usual.get(name)}
+    return {name: f"{_as_yaml(value)} (default {_as_yaml(usual.get(name))})" for name, value in changed.items()}
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Values by their dotted names."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _as_yaml(value: Any) -> str:
+    """A value as in YAML."""
+    if isinstance(value, str):
+        return value
+    return str(yaml.safe_dump(value, default_flow_style=True)).removesuffix("\n").removesuffix("\n...")

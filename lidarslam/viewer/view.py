@@ -1,0 +1,229 @@
+"""The view of a picture, orthographic so that one scale bar holds everywhere, and clouds as its shaded pixels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
+
+from lidarslam.core.geometry import FloatArray
+
+WIDTH = 1600
+# Height of a picture and its margin, relative to its width.
+_TALLEST, _LOWEST, _MARGIN = 0.625, 0.2, 0.025
+# The frame holds this share of the occupied cells, along each axis, and up to so much of the size beyond.
+_FRAMED_PERCENT, _BEYOND = (0.5, 99.5), 0.3
+_CELLS = 300
+_SAMPLED = 5_000
+# The picture is turned only where this saves much empty space.
+_TURNS_DEG = (*range(0, 95, 5), *range(-85, 0, 5))
+_WORTH_TURNING = 1.2
+_LEAST_SIZE_M = 1.0
+# Points are drawn as squares that close the gaps between neighbours, up to this share of the width.
+_LARGEST_SPLAT = 1 / 60
+_GAPS_CLOSED = 1.7
+_SAMPLED_PLACES, _SAMPLED_POINTS = 5, 400
+# The light comes from the upper left of the picture, along right, up and towards the camera.
+_LIGHT = np.array([-0.45, 0.5, 0.74])
+_AMBIENT = 0.55
+# Eye-dome lighting (Boucheny, 2009): distances of the neighbours in splats, and how strongly a pixel behind them is
+# darkened.
+_REACHES, _EDGE_STRENGTH, _STEEPEST = (1, 3), 0.8, 4.0
+_NOTHING = np.float32(-1e9)  # depth where there is no point, behind all points
+# Surfaces that face away by more than this are left out, so that one looks through ceilings into rooms.
+_LEAST_FACING = -0.1
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An orthographic view, and the part of the scene that the picture shows."""
+
+    axes: FloatArray  # (3, 3) unit vectors in the world, in rows: right, up, towards the camera
+    centre: FloatArray  # (2,) along right and up, at the middle of the picture, m
+    pixel_m: float  # edge of a pixel
+    # width, height: of the picture, pixels
+    width: int
+    height: int
+    size_m: FloatArray  # (2,) of the scene along right and up; the picture shows a margin around it
+
+    @property
+    def area_m2(self) -> float:
+        """What the picture shows."""
+        return self.width * self.height * self.pixel_m**2
+
+    @property
+    def turn_deg(self) -> float:
+        """Of the picture about z."""
+        return float(np.rad2deg(np.arctan2(self.axes[0, 1], self.axes[0, 0])))
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Column and row (N, 2) of points (N, 3); pixel centres are at whole numbers."""
+        across = (points @ self.axes[:2].T - self.centre) / self.pixel_m
+        middle = 0.5 * np.array([self.width, self.height]) - 0.5
+        return np.asarray(across * [1.0, -1.0] + middle, dtype=np.float64)
+
+    def depth(self, points: FloatArray) -> FloatArray:
+        """Distance (N,) of points (N, 3) towards the camera, m."""
+        depth: FloatArray = points @ self.axes[2]
+        return depth
+
+    def enlarged(self, factor: int) -> "View":
+        """The same part of the scene on more pixels."""
+        width, height = self.width * factor, self.height * factor
+        return replace(self, pixel_m=self.pixel_m / factor, width=width, height=height)
+
+
+def view_axes(turn_deg: float, elevation_deg: float) -> FloatArray:
+    """Right, up and towards the camera (3, 3), in rows; right is x turned about z, 90 degrees look straight down."""
+    turn, elevation = np.deg2rad([turn_deg, elevation_deg])
+    right = np.array([np.cos(turn), np.sin(turn), 0.0])
+    towards = np.array([np.cos(elevation) * np.sin(turn), -np.cos(elevation) * np.cos(turn), np.sin(elevation)])
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+def fit_view(
+    points: FloatArray, path: FloatArray, elevation_deg: float = 90.0, turn_deg: float | None = None, width: int = WIDTH
+) -> View:
+    """The view that holds points (N, 3), but for strays, and the whole path (M, 3).
+
+    Args:
+        points: of all clouds; may be empty.
+        path: positions of all trajectories; may be empty.
+        elevation_deg: of the camera above the horizon.
+        turn_deg: of the picture about z; None: the turn that leaves the least empty space seen from above, whatever the
+            elevation; 0 unless it saves much.
+        width: of the picture, pixels; its height follows the scene.
+    """
+    if turn_deg is None:
+        sample = points[:: max(1, len(points) // _SAMPLED)]
+        areas = {turn: _fit(view_axes(turn, 90.0), sample, path, width).area_m2 for turn in _TURNS_DEG}
+        best = min(areas, key=lambda turn: areas[turn])
+        turn_deg = float(best) if areas[0] > _WORTH_TURNING * areas[best] else 0.0
+    return _fit(view_axes(turn_deg, elevation_deg), points, path, width)
+
+
+def turning_views(
+    points: FloatArray, path: FloatArray, elevation_deg: float, turns_deg: Sequence[float], width: int
+) -> list[View]:
+    """Views about the vertical through the middle of the scene, one for each turn, all of one scale; see `fit_view`."""
+    sample = points[:: max(1, len(points) // _SAMPLED)]
+    # The middle of the scene, in the world.
+    middle = np.mean([_box(np.roll(np.eye(3), -axis, axis=0), sample, path)[:, 0] for axis in range(3)], axis=1)
+    axes = [view_axes(turn_deg, elevation_deg) for turn_deg in turns_deg]
+    reach = np.max([np.abs(_box(of, sample, path) - of[:2] @ middle) for of in axes], axis=(0, 1))
+    return [_view(of, of[:2] @ middle, 2.0 * reach, width) for of in axes]
+
+
+def _fit(axes: FloatArray, points: FloatArray, path: FloatArray, width: int) -> View:
+    box = _box(axes, points, path)
+    return _view(axes, box.mean(axis=0), box[1] - box[0], width)
+
+
+def _view(axes: FloatArray, centre: FloatArray, size_m: FloatArray, width: int) -> View:
+    margin = round(_MARGIN * width)
+    tallest, lowest = round(_TALLEST * width), round(_LOWEST * width)
+    pixel_m = float((size_m / [width - 2 * margin, tallest - 2 * margin]).max())
+    height = int(np.clip(np.ceil(size_m[1] / pixel_m) + 2 * margin, lowest, tallest))
+    return View(axes, centre, pixel_m, width, height, size_m)
+
+
+def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:
+    """Lower and upper corner (2, 2) along right and up."""
+    corners = []
+    if len(points):
+        corners.append(_occupied(points @ axes[:2].T))
+    if len(path):
+        across = path @ axes[:2].T
+        corners.append(np.stack([across.min(axis=0), across.max(axis=0)]))
+    if not corners:
+        return np.array([[-0.5, -0.5], [0.5, 0.5]]) * _LEAST_SIZE_M
+    box = np.stack([np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]])
+    short = np.maximum(_LEAST_SIZE_M - (box[1] - box[0]), 0.0) / 2.0
+    return np.stack([box[0] - short, box[1] + short])
+
+
+def _occupied(across: FloatArray) -> FloatArray:
+    """Corners of the occupied cells, so that dense places do not count more than the ends of a long drive."""
+    low, high = across.min(axis=0), across.max(axis=0)
+    inner_low, inner_high = np.percentile(across, _FRAMED_PERCENT, axis=0)  # strays would make the cells large
+    cell_m = max(float((inner_high - inner_low).max()) / _CELLS, 1e-6)
+    row = np.floor((across - low) / cell_m).astype(np.int64) @ np.array([1, 1 << 32])
+    cells = across[np.unique(row, return_index=True)[1]]
+    inner_low, inner_high = np.percentile(cells, _FRAMED_PERCENT, axis=0)
+    beyond = _BEYOND * (inner_high - inner_low) + cell_m
+    return np.stack([np.maximum(low, inner_low - beyond), np.minimum(high, inner_high + beyond)])
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One cloud, drawn: the K pixels where there is a point."""
+
+    # (K,): the pixel's number in the picture, row by row; the row of the point; brightness from 0 to 1
+    pixels: NDArray[np.intp]
+    points: NDArray[np.intp]
+    brightness: NDArray[np.float32]
+
+
+def draw_layer(points: FloatArray, normals: FloatArray, view: View) -> Layer:
+    """Draw points (N, 3) with normals (N, 3); surfaces that face away are left out."""
+    splat = int(np.clip(np.ceil(_GAPS_CLOSED * spacing_m(points) / view.pixel_m), 1, _LARGEST_SPLAT * view.width))
+    towards = view.depth(points)
+    facing = np.flatnonzero(normals @ view.axes[2] > _LEAST_FACING)
+    index = _rasterise(view.project(points), facing[np.argsort(towards[facing])], view, splat)
+    pixels = np.flatnonzero(index >= 0)
+    seen = index.reshape(-1)[pixels]
+    depth = (towards - towards.mean()).astype(np.float32)[seen]
+    return Layer(pixels, seen, _lit(normals, view)[seen] * _eye_dome(depth, pixels, view, splat))
+
+
+def spacing_m(points: FloatArray) -> float:
+    """Median distance between neighbouring points (N, 3), from a few places."""
+    if len(points) < 2:
+        return 0.0
+    distances: list[FloatArray] = []
+    for place in points[:: max(1, len(points) // _SAMPLED_PLACES)][:_SAMPLED_PLACES]:
+        count = min(_SAMPLED_POINTS, len(points))
+        near = points[np.argpartition(((points - place) ** 2).sum(axis=1), count - 1)[:count]]
+        distances.append(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1])
+    return float(np.median(np.concatenate(distances)))
+
+
+def _rasterise(pixels: FloatArray, order: NDArray[np.intp], view: View, splat: int) -> NDArray[np.intp]:
+    """Row of the nearest point at every pixel (height, width), -1 where there is none; the nearest is last in order."""
+    column, row = np.round(pixels[order]).astype(np.int64).T
+    inside = np.flatnonzero((column >= 0) & (column < view.width) & (row >= 0) & (row < view.height))
+    rank = np.full((view.height, view.width), -1, dtype=np.int32)
+    rank[row[inside], column[inside]] = inside  # of several points at a pixel the last stays
+    rank = maximum_filter(rank, size=splat, mode="constant", cval=-1)
+    return np.append(order, -1)[rank]
+
+
+def _lit(normals: FloatArray, view: View) -> NDArray[np.float32]:
+    """Brightness (N,) of surfaces by their angle to the light."""
+    light = _LIGHT / np.linalg.norm(_LIGHT) @ view.axes
+    lit: FloatArray = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(normals @ light, 0.0)
+    return lit.astype(np.float32)
+
+
+def _eye_dome(depth: NDArray[np.float32], pixels: NDArray[np.intp], view: View, splat: int) -> NDArray[np.float32]:
+    """Brightness (K,): darker the farther a pixel lies behind its neighbours, relative to their distance.
+
+    Opposite neighbours count together, so that a plane has no shade however it is inclined.
+    """
+    border = max(_REACHES) * splat
+    width = view.width + 2 * border
+    framed = np.full((view.height + 2 * border) * width, _NOTHING)
+    middle = (pixels // view.width + border) * width + pixels % view.width + border
+    framed[middle] = depth
+    behind = np.zeros_like(depth)
+    for reach, stride in product([splat * reach for reach in _REACHES], (1, width)):
+        pair = np.zeros_like(depth)
+        for neighbour in (framed[middle - reach * stride], framed[middle + reach * stride]):
+            step = np.clip((neighbour - depth) / np.float32(reach * view.pixel_m), -_STEEPEST, _STEEPEST)
+            pair += np.where(neighbour == _NOTHING, np.float32(0.0), step)
+        behind += np.maximum(pair, 0.0)
+    darkness: NDArray[np.float32] = behind * np.float32(_EDGE_STRENGTH / (2 * len(_REACHES)))
+    return np.exp(-darkness)
