@@ -19,7 +19,7 @@ from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import associate
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.comparison_folder import run_directories
 from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
 from lidarslam.storage.finished_run import read_statuses, read_trajectory, shown_map

@@ -23,7 +23,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import MapErrors, MethodResult, ScanSeries, SequenceComparison
 from lidarslam.evaluation.report.report import RunPage, render_run
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import MAP_TILES, SCANS_CSV, RunDirectory
 from lidarslam.storage.finished_run import read_statuses, read_summary, read_trajectory

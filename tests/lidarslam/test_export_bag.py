@@ -18,8 +18,7 @@ from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.exports.source import read_run_scans
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.point_cloud import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 SCANS = 6
 FIRST_STAMP = 1_700_000_000.123456789

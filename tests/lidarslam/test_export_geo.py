@@ -19,8 +19,7 @@ from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
 from lidarslam.exports.bag import RosMessages, nanoseconds
-from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.point_cloud import write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 from ..conftest import Room
 

@@ -13,7 +13,7 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.viewer.annotations import INK, START, round_length
 from lidarslam.viewer.picture import (
     OBLIQUE,
