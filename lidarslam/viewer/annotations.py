@@ -79,7 +79,7 @@ def levels(values: FloatArray) -> FloatArray:
     if not len(values):
         return values
     low, high = np.percentile(values, [_CLIPPED_PERCENT, 100.0 - _CLIPPED_PERCENT])
-    return np.clip((values - low) / max(high - low, 1e-6), 0.0, 1.0)
+    return np.asarray(np.clip((values - low) / max(high - low, 1e-6), 0.0, 1.0))
 
 
 def fit_scale(quantity: Quantity, values: FloatArray) -> ColourScale | None:
