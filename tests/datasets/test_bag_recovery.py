@@ -3,7 +3,6 @@
 import bz2
 import shutil
 import sqlite3
-import zlib
 from bz2 import BZ2Decompressor
 from contextlib import closing
 
@@ -18,7 +17,6 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2.storage_mcap import zstd
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile, unpacked
@@ -220,7 +218,7 @@ def assert_all_but(recording, points, missing, *warnings):
 
 @pytest.mark.parametrize("length", [0, 3, 15])
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
-@pytest.mark.parametrize("places", [[2], [0, 5]])
+@pytest.mark.parametrize("places", [[0, 5]])
 def test_a_message_that_is_too_short_costs_no_other(make_bag_kit, write_drive, kind, length, places):
     """Shorter than a header; the first and the last are those that most is learnt from."""
     kit = make_bag_kit(kind)
@@ -261,75 +259,32 @@ def overwrite(file, begin, content):
     file.write_bytes(data)
 
 
-def write_checksums(file):
-    """As recorders do: of every chunk of an MCAP file."""
-    for begin, length in chunks_of(file):
-        content = file.read_bytes()[begin : begin + length]
-        overwrite(file, begin - 49 + 9 + 24, zlib.crc32(content).to_bytes(4, "little"))
-
-
 BIG = {"count": 8, "width": 1500}  # two of these scans fill a chunk
 KINDS = [("bag", None), ("bag", Rosbag1Writer.CompressionFormat.LZ4), ("mcap", None)]
 
 
-@pytest.mark.parametrize("damaged", [[0], [1], [3], [0, 2], [1, 2, 3]])
+@pytest.mark.parametrize("damaged", [0, 1, 3])
 @pytest.mark.parametrize(("kind", "compression"), KINDS)
-def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive, kind, compression, damaged):
+def test_an_indexed_bag_is_read_up_to_a_damaged_chunk(write_drive, kind, compression, damaged):
     file, _, points = write_drive(kind, **BIG, **({} if compression is None else {"compression": (compression,)}))
     chunks = chunks_of(file)
     assert len(chunks) == 4
-    if kind == "mcap":
-        write_checksums(file)
-    for chunk in damaged:
-        begin, length = chunks[chunk]
-        overwrite(file, begin, np.random.default_rng(chunk).bytes(length))
-    recording = open_recording(file)
-    assert len(recording) == 8
-    lost = [2 * chunk + i for chunk in damaged for i in (0, 1)]
-    passed_over = (
-        "1 damaged place in the bag was" if len(damaged) == 1 else f"{len(damaged)} damaged places in the bag were"
-    )
+    begin, length = chunks[damaged]
+    if kind == "mcap":  # the checksum of the chunk, which rosbags leaves out
+        overwrite(file, begin - 49 + 9 + 24, b"\1\2\3\4")
+    overwrite(file, begin, bytes(length))
+    lost = list(range(2 * damaged, 8))
+    if not damaged:  # nothing to learn from is left
+        with pytest.raises(InputError, match="reading stopped after 0 messages"):
+            list(open_recording(file).scans(faults=Faults()))
+        return
     told = (
-        f"{passed_over} passed over; the first: {file}: reading stopped after {2 * damaged[0]} messages of /points",
+        f"1 damaged place in the bag was met, where reading its file stopped; the first: {file}: reading stopped after"
+        f" {2 * damaged} messages of /points",
         f"{len(lost)} scans are missing that the index lists; the first: its index lists 8 scans, it holds",
     )
-    assert_all_but(recording, points, lost, *told)
-    assert recording.describe().duration_s > 0.0
-
-
-def test_behind_the_damaged_header_of_a_chunk_the_next_one_is_read(write_drive):
-    file, _, points = write_drive("mcap", **BIG)
-    overwrite(file, chunks_of(file)[1][0] - 24, bytes([255]) * 24)
-    assert_all_but(open_recording(file), points, [2, 3], "1 damaged place", "2 scans are missing")
-
-
-@pytest.mark.parametrize("kind", ["bag", "mcap"])
-def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
-    """Around a damaged chunk, too: the first half before it, and the second behind it."""
-    file, _, points = write_drive(kind, **BIG, recorded_ns=lambda i: STAMP_NS + PERIOD_NS * (i > 1))
-    begin, length = chunks_of(file)[2]
-    overwrite(file, begin, bytes(length))
-    assert_all_but(open_recording(file), points, [4, 5], "1 damaged place", "2 scans are missing")
-
-
-@pytest.mark.parametrize("kind", ["bag", "mcap"])
-def test_a_damaged_chunk_is_counted_once_for_each_topic(make_bag_kit, make_sweep, kind):
-    """Whichever chunk it is that each topic is gone on with."""
-    kit = make_bag_kit(kind)
-    clouds = [(stamp_ns(i), kit.cloud(make_sweep("velodyne", stamp_ns(i), 16, 1500).records, stamp_ns(i)))
-              for i in range(8)]  # fmt: skip
-    front, rear = clouds[0:3] + clouds[4:7:2], clouds[3:8:2]
-    file = kit.storage_file(kit.write({"/front": front, "/rear": rear}))
-    begin, length = chunks_of(file)[2]  # scans 4 and 5
-    overwrite(file, begin, bytes(length))
-    for topic, times in (("/front", [0, 1, 2, 6]), ("/rear", [3, 7])):
-        faults = Faults()
-        scans = list(open_recording(file, ReaderConfig(topic=topic)).scans(faults=faults))
-        assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in times]
-        assert [warning.split(";")[0] for warning in faults.warnings()] == [
-            "1 damaged place in the bag was passed over",
-            "1 scan is missing that the index lists",
-        ]
+    assert_all_but(open_recording(file), points, lost, *told)
+    assert open_recording(file).describe().duration_s > 0.0
 
 
 def join(folder, file, later):
@@ -341,18 +296,16 @@ def join(folder, file, later):
     metadata.write_text(text.replace("message_count: 8\n", "message_count: 16\n"))
 
 
-def test_every_damaged_chunk_in_a_folder_of_several_files_is_counted(write_drive):
+def test_damage_in_one_file_of_a_folder_costs_no_other(write_drive):
     file, folder, _ = write_drive("mcap", **BIG)
     later, _, _ = write_drive("mcap", **BIG, name="later", first=8)
-    for storage, chunk in ((file, 1), (later, 0)):
-        begin, length = chunks_of(storage)[chunk]
-        overwrite(storage, begin, bytes(length))
+    begin, length = chunks_of(file)[1]
+    overwrite(file, begin, bytes(length))
     join(folder, file, later)
     faults = Faults()
     scans = list(open_recording(folder).scans(faults=faults))
-    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(4, 8), *range(10, 16))]
-    told = f"2 damaged places in the bag were passed over; the first: {folder}: reading stopped after 2 messages"
-    assert any(warning.startswith(told) for warning in faults.warnings())
+    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(8, 16))]
+    assert faults.warnings()[0].startswith("1 damaged place in the bag was met")
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
@@ -387,13 +340,6 @@ def test_a_damaged_message_that_was_compressed_by_itself_costs_no_other(write_dr
     assert recording.describe().first_stamp == stamp_ns(damaged == 0) / 10**9
 
 
-def test_a_damaged_chunk_of_compressed_messages_costs_no_other(write_drive):
-    file, folder, points = write_drive("mcap", **BIG, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
-    begin, length = chunks_of(file)[1]
-    overwrite(file, begin, bytes(length))
-    assert_all_but(open_recording(folder), points, [3, 4, 5], "1 damaged place", "3 scans are missing")
-
-
 def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
     """And how to get at what lies before the damage."""
     _, folder, points = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
@@ -407,25 +353,6 @@ def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
     recording = open_recording(half)
     assert len(recording) in (2, 3)
     assert_first_scans(recording, points, len(recording))
-
-
-def test_a_damaged_page_of_a_database_costs_its_rows(write_drive):
-    file, folder, points = write_drive("db3", count=60)
-    with closing(sqlite3.connect(file)) as database:
-        (size,) = database.execute("PRAGMA page_size").fetchone()
-    data = file.read_bytes()
-    pages = [data[at : at + size] for at in range(0, len(data), size)]
-    leaves = [number for number, page in enumerate(pages) if page[0] == 0x0D and b"lidar" in page[100:]]
-    assert len(leaves) > 3
-    overwrite(file, leaves[len(leaves) // 2] * size, bytes(size))
-    for source in (folder, file):
-        recording = open_recording(source)
-        scans = list(recording.scans(faults=Faults()))
-        assert 40 < len(scans) < 60
-        for scan in scans:
-            np.testing.assert_array_equal(scan.points, points[round((scan.stamp * 10**9 - STAMP_NS) / PERIOD_NS)])
-        assert scans[-1].stamp == (STAMP_NS + 59 * PERIOD_NS) / 10**9
-        assert any(f"{60 - len(scans)} rows of it cannot be read, the first after row" in w for w in recording.warnings)
 
 
 @pytest.mark.parametrize("pack", [zstd.compress, lz4.frame.compress, bz2.compress], ids=["zstd", "lz4", "bz2"])
@@ -484,24 +411,6 @@ def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_wh
         open_recording(folder if is_whole else file)
 
 
-def test_rows_of_a_damaged_page_are_not_passed_over_without_an_end(write_drive):
-    """Where numbers of rows are damaged, the next one may be as many rows away as numbers can count."""
-    file, _, points = write_drive("db3", count=60)
-    with closing(sqlite3.connect(file)) as database, database:
-        database.execute(
-            "UPDATE messages SET id = id + 9000000000000000000 WHERE id > (SELECT max(id) / 2 FROM messages)"
-        )
-        (size,) = database.execute("PRAGMA page_size").fetchone()
-    data = file.read_bytes()
-    pages = [data[at : at + size] for at in range(0, len(data), size)]
-    leaves = [number for number, page in enumerate(pages) if page[0] == 0x0D and b"lidar" in page[100:]]
-    for leaf in leaves[len(leaves) // 2 : -1]:
-        overwrite(file, leaf * size, bytes(size))
-    recording = open_recording(file)
-    assert len(recording) < len(points)
-    assert_first_scans(recording, points, len(recording))
-
-
 def test_an_mcap_of_another_name_is_told(write_drive, tmp_path):
     file, _, _ = write_drive("mcap")
     renamed = shutil.copy(file, tmp_path / "drive.bag")
@@ -518,14 +427,3 @@ def test_a_topic_without_a_name_is_left_out(write_drive, column):
         values = values.replace("id,", "9,", 1)
         database.execute(f"INSERT INTO topics({columns}) SELECT {values} FROM topics LIMIT 1")
     assert_first_scans(open_recording(file), points, len(points))
-
-
-def test_metadata_that_names_a_file_over_and_over_is_left_aside(write_drive):
-    file, folder, points = write_drive("mcap")
-    metadata = folder / "metadata.yaml"
-    metadata.write_text(
-        metadata.read_text().replace(f"- {file.name}", "\n".join([f"  - {file.name}"] * 10_000).lstrip())
-    )
-    recording = open_recording(folder)
-    assert_first_scans(recording, points, 6)
-    assert "its metadata.yaml is missing or damaged" in recording.warnings[0]

@@ -1,9 +1,8 @@
 """Messages of rosbag1 and rosbag2 files, by rosbags; a file whose index cannot be read is read without it."""
 
-import re
 from bz2 import BZ2Decompressor
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import RawIOBase
 from itertools import count
@@ -19,10 +18,9 @@ from rosbags.rosbag2 import reader
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd  # type: ignore[attr-defined] # Python's, or as in Python
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import bounded_lines
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
-from lidarslam.datasets.ros.bag_recovery import MCAP_MAGIC, Connections, recover, require_tables
+from lidarslam.datasets.ros.bag_recovery import MCAP_MAGIC, recover, require_tables
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
 # Recorders write chunks of 1 to 16 MB, and a cloud of two million points has some 100 MB.
@@ -95,9 +93,6 @@ _REPAIR = {
     ".mcap": "mcap recover {} -o recovered.mcap",
     ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
 }
-_METADATA = "metadata.yaml"
-# A file in the list of a rosbag2's.
-_LISTED = re.compile(r"\s*-\s+(\S+\.(?:db3|mcap)(?:\.zstd)?)\s*")
 
 
 class BagFile:
@@ -165,37 +160,19 @@ class BagFile:
         return counts
 
     def messages(self, topic: Topic, on_damage: Callable[[str], None] = lambda _: None) -> Iterator[BagMessage]:
-        """All messages of a topic in the order of recording, not decoded; damage is reported and passed over."""
+        """All messages of a topic in the order of recording, not decoded, up to damage, which is told."""
         if not self._has_index:
-            yield from self._in_sequence(self.path, topic, lambda _: None, {})
+            yield from self._in_sequence(topic)
             return
         try:
             with self._opened() as reader:
                 for storage in _storages(reader):
-                    yield from self._of_storage(storage, topic, on_damage)
+                    try:
+                        yield from self._by_index(storage, topic)
+                    except InputError as error:
+                        on_damage(str(error))
         except InputError as error:  # gone since its index was read
             on_damage(str(error))
-
-    def _of_storage(self, storage: Any, topic: Topic, on_damage: Callable[[str], None]) -> Iterator[BagMessage]:
-        """The messages of one file by its index, and behind damage in sequence."""
-        last_ns, repeated = -1, 0
-        try:
-            for message in self._by_index(storage, topic):
-                repeated = repeated + 1 if message.record_ns == last_ns else 1
-                last_ns = message.record_ns
-                yield message
-            return
-        except InputError as error:
-            on_damage(str(error))
-        reports: list[str] = []
-        known = {each.id: (each.topic, each.msgtype) for each in storage.connections}
-        for message in self._in_sequence(storage.path, topic, reports.append, known, _chunk_starts(storage)):
-            if message.record_ns == last_ns and repeated:  # was read by the index
-                repeated -= 1
-            elif message.record_ns >= last_ns:
-                yield message
-        for damage in reports[1:]:  # the first was met by the index
-            on_damage(damage)
 
     def _by_index(self, storage: Any, topic: Topic, start_ns: int | None = None) -> Iterator[BagMessage]:
         """The messages of one file since a time."""
@@ -209,20 +186,11 @@ class BagFile:
                 return
             yield self._message(found[1], found[2], topic)
 
-    def _in_sequence(
-        self,
-        path: Path,
-        topic: Topic,
-        report: Callable[[str], None],
-        known: Connections,
-        chunks: Sequence[int] = (),
-    ) -> Iterator[BagMessage]:
-        try:
-            for message in recover(path, self._suffix(path), report, known, chunks):
+    def _in_sequence(self, topic: Topic) -> Iterator[BagMessage]:
+        with suppress(Exception):  # not even its beginning makes sense any more
+            for message in recover(self.path, self._suffix(self.path), lambda _: None):
                 if (message.topic, message.message_type) == (topic.name, topic.message_type):
                     yield self._message(message.record_ns, message.raw, topic)
-        except Exception as error:  # not even its beginning makes sense
-            report(f"it cannot be read ({error})")
 
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         try:
@@ -269,7 +237,7 @@ class BagFile:
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
-            (_require_bounded if self.ros2 else _require_rosbag1)(self.path)
+            (require_tables if self.ros2 else _require_rosbag1)(self.path)
             reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
         try:
@@ -322,28 +290,6 @@ def _last(messages: Iterator[BagMessage]) -> BagMessage | None:
     for message in messages:
         last = message if message.damage is None else last
     return last
-
-
-def _require_bounded(path: Path) -> None:
-    """Refuse a rosbag2 that would be read without an end, or over and over.
-
-    Raises:
-        ValueError: a database has views for tables, or the metadata name a file twice.
-    """
-    for database in path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []:
-        require_tables(database)
-    with suppress(InputError):  # there are no metadata, or no text, which is said when they are read
-        names = Counter(found[1] for found in map(_LISTED.fullmatch, bounded_lines(path / _METADATA)) if found)
-        for name, times in names.most_common(1):
-            if times > 1:
-                raise ValueError(f"{_METADATA} names {name} {times:,} times")
-
-
-def _chunk_starts(storage: Any) -> list[int]:
-    """Where the chunks of a file begin, by its index; none for a database."""
-    if isinstance(storage, Rosbag1Reader):
-        return sorted({entry.chunk_pos for entries in storage.indexes.values() for entry in entries})
-    return sorted(chunk.chunk_start_offset for chunk in getattr(storage, "chunks", None) or ())
 
 
 def _storages(reader: Rosbag1Reader | Rosbag2Reader) -> list[Any]:

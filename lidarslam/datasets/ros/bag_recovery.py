@@ -6,7 +6,7 @@ because rosbags needs an index, and `StreamReader` of mcap 1.6 loses a chunk tha
 
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
 from itertools import chain, pairwise
@@ -19,8 +19,6 @@ from rosbags.rosbag2.storage_mcap import decompress, read_exact, read_string
 from rosbags.typesys.msg import normalize_msgtype
 
 Report = Callable[[str], None]
-Connections = Mapping[int, tuple[str, str]]
-"""Topic and type, by the number in each message."""
 
 # Records are read whole; a longer one is a damaged length.
 _LONGEST_RECORD = 1 << 30
@@ -29,10 +27,8 @@ _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 # A damaged database may hold anything for a name.
 _TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
-# Rows in a row that are passed over: a page has a hundred, and a damaged number of a row may be any.
-_MOST_DAMAGED = 1_000
 # By the table itself, because the pages of its index lie at the end.
-_ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id"
+_ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
 
 
 class RecoveredMessage(NamedTuple):
@@ -44,19 +40,10 @@ class RecoveredMessage(NamedTuple):
     raw: bytes
 
 
-def recover(
-    path: Path, suffix: str, report: Report, known: Connections | None = None, chunks: Sequence[int] = ()
-) -> Iterator[RecoveredMessage]:
-    """The messages of a `.bag`, `.mcap` or `.db3` file, as far as it is readable; damage is reported.
+def recover(path: Path, suffix: str, report: Report) -> Iterator[RecoveredMessage]:
+    """The messages of a `.bag`, `.mcap` or `.db3` file, as far as it is readable; damage is reported, a line each.
 
-    A damaged chunk costs its own messages alone, and so does a damaged page of a database.
-
-    Args:
-        path: the file.
-        suffix: which kind it is.
-        report: called with one line for each damaged place.
-        known: the connections that an index lists; the records about them may be damaged.
-        chunks: where its chunks begin by an index; behind a damaged record the next of them is read.
+    A damaged chunk costs its own messages alone; anything else ends the file.
 
     Raises:
         ValueError, OSError, sqlite3.Error: it is no such file at all.
@@ -64,7 +51,7 @@ def recover(
     if suffix == ".db3":
         yield from _database(path, report)
         return
-    records = (_Rosbag1Records if suffix == ".bag" else _McapRecords)(report, known or {})
+    records = (_Rosbag1Records if suffix == ".bag" else _McapRecords)(report)
     with path.open("rb") as file:
         if file.read(len(records.magic)) != records.magic:
             raise ValueError(f"it does not begin as a {suffix} file")
@@ -74,7 +61,7 @@ def recover(
                 yield from records.read(file)
             except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
                 report(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})")
-                file.seek(min((start for start in chunks if start > at), default=size))
+                return
 
 
 class _Records:
@@ -82,9 +69,9 @@ class _Records:
 
     magic: bytes
 
-    def __init__(self, report: Report, known: Connections) -> None:
+    def __init__(self, report: Report) -> None:
         self._report = report
-        self._connections = dict(known)
+        self._connections: dict[int, tuple[str, str]] = {}  # topic and type, by the number in each message
         self._schemas: dict[int, str] = {}
 
     def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
@@ -116,7 +103,7 @@ class _Rosbag1Records(_Records):
         if kind == RecordType.CONNECTION:
             fields = Header.read(BytesIO(struct.pack("<I", size) + data))
             named = normalize(header.get_string("topic")), normalize_msgtype(fields.get_string("type"))
-            self._connections.setdefault(header.get_uint32("conn"), named)
+            self._connections[header.get_uint32("conn")] = named
         elif kind == RecordType.MSGDATA:
             named = self._connections[header.get_uint32("conn")]
             yield RecoveredMessage(*named, header.get_time("time"), data)
@@ -142,8 +129,7 @@ class _McapRecords(_Records):
             self._schemas[schema] = read_string(body)
         elif opcode == _CHANNEL:
             channel, schema = struct.unpack("<HH", read_exact(body, 4))
-            if channel not in self._connections:
-                self._connections[channel] = (read_string(body), self._schemas[schema])
+            self._connections[channel] = (read_string(body), self._schemas[schema])
         elif opcode == _MESSAGE:
             channel, _, record_ns, _ = struct.unpack("<HIQQ", read_exact(body, 22))
             yield RecoveredMessage(*self._connections[channel], record_ns, body.read())
@@ -167,15 +153,16 @@ def _reason(error: Exception) -> str:
 
 
 def require_tables(path: Path) -> None:
-    """Refuse a database whose messages or topics are a view: its query may run without an end.
+    """Refuse a database, or a folder with one, whose messages or topics are a view: its query may have no end.
 
     Raises:
         ValueError: it has such a view.
     """
-    with closing(_connected(path)) as database, suppress(sqlite3.Error):  # damaged, which is found when it is read
-        for name, kind in database.execute("SELECT name, type FROM sqlite_master"):
-            if name.lower() in ("messages", "topics") and kind != "table":
-                raise ValueError(f"its {name} are a {kind}, not a table")
+    for file in path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []:
+        with closing(_connected(file)) as database, suppress(sqlite3.Error):  # damaged, which is found when it is read
+            for name, kind in database.execute("SELECT name, type FROM sqlite_master"):
+                if name.lower() in ("messages", "topics") and kind != "table":
+                    raise ValueError(f"its {name} are a {kind}, not a table")
 
 
 def _connected(path: Path) -> sqlite3.Connection:
@@ -204,23 +191,11 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
 
 
 def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:
-    """The rows of the table of messages; those on damaged pages are passed over one by one."""
-    done, lost, in_a_row, first = -1, 0, 0, ""
-    while in_a_row < _MOST_DAMAGED:
-        try:
-            for number, *row in database.execute(_ROWS, (done,)):
-                yield tuple(row)
-                done, in_a_row = number, 0
-            break
-        except sqlite3.Error as error:
-            first = first or f"after row {done:,} ({_reason(error)})"
-        try:
-            (last,) = database.execute("SELECT max(id) FROM messages").fetchone()
-        except sqlite3.Error:  # its end is gone too
-            report(f"it breaks off {first}")
-            return
-        done, lost, in_a_row = done + 1, lost + 1, in_a_row + 1
-        if done >= last:
-            break
-    if lost:
-        report(f"{lost:,} rows of it cannot be read, the first {first}")
+    """The rows of the table of messages, up to damage."""
+    rows = 0
+    try:
+        for row in database.execute(_ROWS):
+            yield row
+            rows += 1
+    except sqlite3.Error as error:
+        report(f"it breaks off after {rows:,} rows ({_reason(error)})")

@@ -40,7 +40,7 @@ _NEGLIGIBLE = 0.05
 _PAIRS, _LOOKED_AT = 40, 600
 _FRAMES_LOOKED_AT = 10
 
-_DAMAGED = "damaged places in the bag were passed over"
+_DAMAGED = "damaged places in the bag were met, where reading its file stopped"
 _MISSING = "scans are missing that the index lists"
 _NO_HEADER_STAMPS = "The message headers have no stamps, so the times of recording are used."
 _NEVER_SET = "scans were left out: their stamps were never set"
