@@ -49,11 +49,13 @@ class Saved:
     Args:
         values: the tree.
         place: the file, and where in it, for errors.
+        remedy: what to do where it is of no use, for errors.
     """
 
-    def __init__(self, values: Mapping[str, Any], place: str = "the state") -> None:
+    def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:
         self._values = values
         self.place = place
+        self.remedy = remedy
 
     def value(self, name: str) -> Any:
         """The tree under a name; InputError where there is none."""
@@ -73,15 +75,15 @@ class Saved:
         """A branch at this place; InputError where it is a value."""
         if not isinstance(tree, dict):
             raise self.unfit("a tree", tree)
-        return Saved(tree, self.place)
+        return Saved(tree, self.place, self.remedy)
 
     def at(self, name: str) -> "Saved":
         """The same tree, for errors about the value under a name."""
-        return Saved(self._values, f"{self.place}, {name}")
+        return Saved(self._values, f"{self.place}, {name}", self.remedy)
 
     def refuse(self, reason: str) -> InputError:
         """The error for a tree of another program."""
-        return InputError(f"{self.place}: is not what this program saves ({reason}); begin again with --overwrite")
+        return InputError(f"{self.place}: is not what this program saves ({reason}); {self.remedy}")
 
     def unfit(self, wanted: str, found: Any) -> InputError:
         """The error for a value of another type or shape."""
@@ -324,7 +326,7 @@ class BlockFile(Stateful):
         is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
         for index, checksum in enumerate(self._checksums):
             if is_short or zlib.crc32(self.read(index)) != checksum:
-                raise InputError(f"{self._path}: is damaged (block {index}); begin again with --overwrite")
+                raise InputError(f"{self._path}: is damaged (block {index}); {saved.remedy}")
 
     def __len__(self) -> int:
         return len(self._checksums)

@@ -1,6 +1,7 @@
 """The common part of the readers: a recording on disk, whose scans are read one at a time."""
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from lidarslam.datasets.times.point_time import PointTimeModel
 
 logger = logging.getLogger(__name__)
 
+_LISTED = 8
 _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
 
 
@@ -187,6 +189,30 @@ def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
             f"expected start >= 0, stop >= 0 and step >= 1, got start {start}, stop {stop} and step {step}"
         )
     return range(start, count if stop is None else min(stop, count), step)
+
+
+def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun: str = "sequence") -> str:
+    """Of the names of a data set's sequences the only one, or the wanted one: by name, or by the last number in it.
+
+    Raises:
+        InputError: there is no such sequence, or several to choose from.
+    """
+    number = int(wanted) if wanted is not None and wanted.isdecimal() else None
+    fitting = [name for name in names if wanted in (None, name)] or [
+        name for name in names if number is not None and _last_number(name) == number
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
+    listed = f"{', '.join(names[:_LISTED])}{more}"
+    if wanted is None:
+        raise InputError(f"{source}: holds {len(names):,} {noun}s; choose one with --sequence: {listed}")
+    raise InputError(f"{source}: has no {noun} {wanted!r}; there are: {listed}")
+
+
+def _last_number(name: str) -> int | None:
+    numbers = re.findall(r"[0-9]+", name)
+    return int(numbers[-1]) if numbers else None
 
 
 def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | None:

@@ -130,7 +130,7 @@ def test_the_sequence_must_be_chosen_among_several(tmp_path, rng):
     for name in ("03", "07"):
         _write_sequence(tmp_path, rng, name)
     (tmp_path / "sequences" / "11").mkdir()  # no scans: not available
-    with pytest.raises(InputError, match=r"holds the sequences 03, 07; choose one with --sequence 03, or name"):
+    with pytest.raises(InputError, match="holds 2 sequences; choose one with --sequence: 03, 07"):
         open_recording(tmp_path)
     with pytest.raises(InputError, match=r"there are: 03, 07$"):
         open_recording(tmp_path, ReaderConfig(sequence="11"))

@@ -13,10 +13,10 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
 from lidarslam.datasets.published.stamped_files import poses_wxyz
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import choose_sequence
 from lidarslam.datasets.times.stamps import increasing_rows
 
 _COLUMNS = 9
-_LISTED = 8
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -39,13 +39,9 @@ def _find_sequence(source: Path, wanted: str | None) -> Path:
             raise InputError(f"{source}: is one sequence, not {wanted}; leave --sequence out or give the folder above")
         return source
     names = sorted(folder.name for folder in source.iterdir() if is_sequence(folder)) if source.is_dir() else []
-    if wanted in names or (wanted is None and len(names) == 1):
-        return source / (wanted or names[0])
     if not names:
         raise InputError(f"{source}: expected pcds and poses/gt_poses.txt in it, or in folders in it; found neither")
-    more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
-    reason = "choose a sequence with --sequence" if wanted is None else f"has no sequence {wanted!r}"
-    raise InputError(f"{source}: {reason}; there are: {', '.join(names[:_LISTED])}{more}")
+    return source / choose_sequence(source, names, wanted)
 
 
 class ApolloRecording(ScanFolderRecording):

@@ -20,7 +20,7 @@ from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.published.kitti_files import read_calibration, read_sweep_timing
 from lidarslam.datasets.published.stamped_files import increasing, read_table
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.stored_recording import FileRecording, choose_sequence
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import scan_rate
 
@@ -40,19 +40,8 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
 def _find_drive(source: Path, wanted: str | None) -> Path:
     if (source / _POINTS).is_dir():
         return source.resolve()
-    drives = sorted(path.parent for path in (source / SCANS).glob(f"*/{_POINTS}") if path.is_dir())
-    chosen = [path for path in drives if wanted is None or path.name == wanted or _number(path) == wanted.zfill(4)]
-    if len(chosen) == 1:
-        return chosen[0].resolve()
-    names = ", ".join(path.name for path in drives) or "none"
-    if wanted is None and drives:
-        raise InputError(f"{source}: holds the drives {names}; choose one with --sequence {_number(drives[0])}")
-    raise InputError(f"{source}: has no drive {wanted or ''} with {_POINTS} in {SCANS}; there are: {names}")
-
-
-def _number(drive: Path) -> str:
-    """0003 of 2013_05_28_drive_0003_sync."""
-    return drive.name[-9:-5]
+    names = sorted(path.parent.name for path in (source / SCANS).glob(f"*/{_POINTS}") if path.is_dir())
+    return (source / SCANS / choose_sequence(source, names, wanted, "drive")).resolve()
 
 
 class Kitti360Recording(FileRecording):

@@ -21,7 +21,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.published.kitti_files import read_tr
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.stored_recording import FileRecording, choose_sequence
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
 
 
@@ -40,21 +40,10 @@ def _find_sequence(source: Path, wanted: str | None) -> Path:
         if wanted is not None and wanted.zfill(2) != name.zfill(2):
             raise InputError(f"{source}: is the sequence {name}, not {wanted}; leave --sequence out or give the root")
         return source
-    folders = sorted(f.parent for f in (source / "sequences").glob("*/velodyne") if f.is_dir())
-    available = ", ".join(f.name for f in folders)
-    if not folders:
+    names = sorted(path.parent.name for path in (source / "sequences").glob("*/velodyne") if path.is_dir())
+    if not names:
         raise InputError(f"{source}: expected sequences/NN/velodyne or velodyne below it, found neither")
-    if wanted is None:
-        if len(folders) > 1:
-            raise InputError(
-                f"{source}: holds the sequences {available}; choose one with --sequence {folders[0].name},"
-                f" or name its folder, {folders[0]}"
-            )
-        return folders[0]
-    for folder in folders:
-        if folder.name in (wanted, wanted.zfill(2)):
-            return folder
-    raise InputError(f"{source}: has no sequence {wanted!r} with scans; there are: {available}")
+    return source / "sequences" / choose_sequence(source, names, wanted)
 
 
 class KittiOdometryRecording(FileRecording):

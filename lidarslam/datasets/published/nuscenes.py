@@ -24,7 +24,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.published.stamped_files import poses_wxyz
 from lidarslam.datasets.recording import PointField, Recording
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.stored_recording import FileRecording, choose_sequence
 from lidarslam.datasets.times.stamps import increasing_rows
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
@@ -144,7 +144,6 @@ def _select(
 
 
 _FIELDS = ("x", "y", "z", "intensity", "ring")
-_LISTED = 8
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -157,21 +156,8 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     if not versions:
         raise InputError(f"{source}: expected v1.0-*/scene.json below it, found none; give the root of nuScenes")
     found = {name: (version, token) for version in versions for name, token in scenes(version).items()}
-    name = _scene_name(source, sorted(found), config.sequence)
+    name = choose_sequence(source, sorted(found), config.sequence, "scene")
     return NuScenesRecording(source, config, name, *found[name])
-
-
-def _scene_name(source: Path, names: list[str], wanted: str | None) -> str:
-    if wanted is None and len(names) == 1:
-        return names[0]
-    name = f"scene-{wanted.zfill(4)}" if wanted is not None and wanted.isdecimal() else wanted
-    if name in names:
-        return name
-    more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
-    listed = f"{', '.join(names[:_LISTED])}{more}"
-    if wanted is None:
-        raise InputError(f"{source}: holds {len(names):,} scenes; choose one with --sequence: {listed}")
-    raise InputError(f"{source}: has no scene {wanted!r}; there are: {listed}")
 
 
 class NuScenesRecording(FileRecording):

@@ -1,7 +1,6 @@
 """The IMU of a bag: its topic, its messages sensor_msgs/Imu, and its extrinsic from /tf_static."""
 
 import re
-import struct
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,6 +17,7 @@ from lidarslam.datasets.imu_samples import summarise, usable_samples
 from lidarslam.datasets.recording import ImuSummary, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, BagMessage, StampSource, deserialize, find_stamp_source
+from lidarslam.datasets.ros.driver_messages import behind_header
 
 _TOPIC = "tf_static"
 
@@ -179,10 +179,7 @@ def _common(first: Sequence[str], second: Sequence[str]) -> int:
 
 def imu_numbers(raw: bytes, ros2: bool) -> FloatArray | None:
     """The numbers (37,) of a serialised message, all of one size behind its header; None if it is cut off."""
-    order = ">" if ros2 and raw[1] != 1 else "<"
-    (characters,) = struct.unpack_from(f"{order}I", raw, 12)
-    # CDR aligns numbers to their size, counted from behind the four bytes of encapsulation.
-    start = 4 + -(-(12 + characters) // 8) * 8 if ros2 else 16 + characters
+    order, start = behind_header(raw, ros2, 8)
     if len(raw) < start + 8 * _NUMBERS:
         return None
     return np.frombuffer(raw, f"{order}f8", _NUMBERS, start).astype(np.float64)

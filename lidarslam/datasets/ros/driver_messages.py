@@ -46,6 +46,17 @@ _CDR_ALIGNED_POINT = 20
 ByteOrder = Literal["<", ">"]
 
 
+def behind_header(raw: bytes, ros2: bool, alignment: int) -> tuple[ByteOrder, int]:
+    """Byte order of a serialised message, and where its first field behind the std_msgs/Header begins.
+
+    ROS 1: seq, stamp, length of frame_id and its characters, packed. ROS 2 (CDR): four bytes of encapsulation, the same
+    without seq; a field is aligned to its own size, counted from behind the encapsulation.
+    """
+    order: ByteOrder = ">" if ros2 and raw[1:2] != b"\x01" else "<"
+    (characters,) = struct.unpack_from(f"{order}I", raw, 12)
+    return order, 4 + -(-(12 + characters) // alignment) * alignment if ros2 else 16 + characters
+
+
 def decode_custom_message(raw: bytes, ros2: bool) -> DecodedCloud:
     """Decode a serialised CustomMsg; the times are nanoseconds of a clock, `timebase + offset_time`, as uint64.
 
@@ -57,25 +68,12 @@ def decode_custom_message(raw: bytes, ros2: bool) -> DecodedCloud:
         InputError: the bytes are not such a message.
     """
     try:
-        return _decode_cdr(raw) if ros2 else _decode_ros1(raw)
+        # timebase, point_num, lidar_id, rsvd[3], number of points, points
+        order, start = behind_header(raw, ros2, 8)
+        timebase, count = struct.unpack_from(f"{order}Q8xI", raw, start)
     except struct.error as error:
         raise InputError(f"a Livox CustomMsg of {len(raw)} bytes ends too early ({error})") from error
-
-
-def _decode_ros1(raw: bytes) -> DecodedCloud:
-    # header: seq, stamp, length of frame_id and its characters; then timebase, point_num, lidar_id, rsvd[3], points.
-    (characters,) = struct.unpack_from("<I", raw, 12)
-    timebase, count = struct.unpack_from("<Q8xI", raw, 16 + characters)
-    return _points(raw, 36 + characters, count, timebase, "<", packed=True)
-
-
-def _decode_cdr(raw: bytes) -> DecodedCloud:
-    # The same without seq; everything is aligned to its own size, counted from behind the four bytes of encapsulation.
-    order: ByteOrder = "<" if raw[1:2] == b"\x01" else ">"
-    (characters,) = struct.unpack_from(order + "I", raw, 12)
-    start = 4 + -(-(12 + characters) // 8) * 8
-    timebase, count = struct.unpack_from(order + "Q8xI", raw, start)
-    return _points(raw, start + 20, count, timebase, order, packed=False)
+    return _points(raw, start + 20, count, timebase, order, packed=not ros2)
 
 
 def _points(raw: bytes, start: int, count: int, timebase: int, order: ByteOrder, packed: bool) -> DecodedCloud:
@@ -114,12 +112,9 @@ def decode_scan_message(raw: bytes, ros2: bool) -> DecodedCloud:
 
 def _packets(raw: bytes, ros2: bool) -> list[tuple[float, bytes]]:
     """Stamp in seconds and data of each packet of a message."""
-    # ROS 1: seq, stamp, frame_id, number of packets, packets one behind the other. CDR: four bytes of encapsulation,
-    # the same without seq, everything aligned to four bytes.
-    order: Literal["<", ">"] = ">" if ros2 and raw[1:2] == b"\x00" else "<"
+    # The number of packets, and the packets; in CDR all are aligned to four bytes.
     try:
-        (characters,) = struct.unpack_from(order + "I", raw, 12)
-        start = 16 + (-(-characters // 4) * 4 if ros2 else characters)
+        order, start = behind_header(raw, ros2, 4)
         (count,) = struct.unpack_from(order + "I", raw, start)
     except struct.error as error:
         raise InputError(f"a VelodyneScan of {len(raw)} bytes ends too early ({error})") from error

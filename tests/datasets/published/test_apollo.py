@@ -74,7 +74,7 @@ def test_the_description_has_no_assumed_rate(area: Path) -> None:
 
 
 def test_the_sequence_has_to_be_chosen(area: Path) -> None:
-    with pytest.raises(InputError, match="choose a sequence with --sequence; there are: MathildaAVE-1, SanJose"):
+    with pytest.raises(InputError, match="choose one with --sequence: MathildaAVE-1, SanJose"):
         open_recording(area)
     with pytest.raises(InputError, match="has no sequence 'x'; there are: MathildaAVE-1"):
         open_recording(area, ReaderConfig(sequence="x"))

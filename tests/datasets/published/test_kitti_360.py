@@ -74,9 +74,9 @@ def test_the_root_and_a_drive(root, wanted):
 
 
 def test_which_drive(root):
-    with pytest.raises(InputError, match="choose one with --sequence 0000"):
+    with pytest.raises(InputError, match="choose one with --sequence: 2013_05_28_drive_0000_sync"):
         open_recording(root)
-    with pytest.raises(InputError, match=r"no drive 7 .*there are: 2013_05_28_drive_0000_sync"):
+    with pytest.raises(InputError, match=r"no drive .7..*there are: 2013_05_28_drive_0000_sync"):
         open_recording(root, ReaderConfig(sequence="7"))
 
 
