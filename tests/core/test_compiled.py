@@ -110,13 +110,6 @@ def test_a_full_disk_costs_time_only(load: Load, tmp_path: Path, monkeypatch: py
     assert not kept(tmp_path)
 
 
-def test_where_no_folder_will_do_nothing_is_kept() -> None:
-    """A function without a file is as one in a folder that cannot be written, for a user without a home."""
-    names: dict[str, Any] = {}
-    exec(compile(SOURCE, "<nowhere>", "exec"), names)
-    assert names["total"](np.arange(4.0)) == 6.0
-
-
 def test_numba_may_be_switched_off() -> None:
     thinned = "one_per_cell(np.eye(3), 9.0), central_per_cell(np.eye(3), 9.0)"
     code = f"from lidarslam.core.thinning import *; import numpy as np; print({thinned})"
@@ -240,11 +233,3 @@ def test_a_user_without_a_home_keeps_code_in_a_temporary_folder(tmp_path: Path) 
     command = [sys.executable, "-c", code]
     runs = [subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)]
     assert [int(done.stdout) for done in runs] == [0, 1]
-
-
-def test_division_by_zero_gives_infinity_as_in_numpy() -> None:
-    @compiled
-    def inverse(value: float) -> float:
-        return 1.0 / value
-
-    assert inverse(0.0) == np.inf

@@ -1,12 +1,19 @@
-"""Files are whole or absent, and a directory has one writer."""
+"""Files are whole or absent, a directory has one writer, texts are bounded, arrays are read on several threads."""
 
+import os
+import sys
 import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from lidarslam.core.errors import OutputError
-from lidarslam.core.files import make_directory, only_writer, remove_partial_files, replacing
+from lidarslam.core import files as module
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.files import bounded_lines, make_directory, only_writer, read_array, remove_partial_files, replacing
 
 
 def names(path: Path) -> list[str]:
@@ -65,3 +72,70 @@ def test_a_patient_writer_waits_for_the_other(tmp_path: Path) -> None:
     threading.Timer(0.3, other.__exit__, (None, None, None)).start()
     with only_writer(tmp_path, 60.0), pytest.raises(OutputError, match="another lidarslam is writing"):
         only_writer(tmp_path).__enter__()
+
+
+def test_lines_have_no_ends_and_no_mark(tmp_path: Path) -> None:
+    (tmp_path / "text").write_bytes(b"\xef\xbb\xbfa \r\n\n\xc3\xa9\xef\xbb\xbf\nlast")
+    assert list(bounded_lines(tmp_path / "text")) == ["a ", "", "\u00e9\ufeff", "last"]
+    (tmp_path / "empty").touch()
+    assert list(bounded_lines(tmp_path / "empty")) == []
+
+
+@pytest.mark.parametrize("content", [b"1 2\n\xff\xfe", b"1" * 200_000, b"1 2\n" + b" " * 65_537])
+def test_what_is_no_text_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "text").write_bytes(content)
+    with pytest.raises(InputError, match="text: cannot be read as text"):
+        list(bounded_lines(tmp_path / "text"))
+
+
+def test_a_file_of_nothing_is_refused_at_once(tmp_path: Path) -> None:
+    """Twenty gigabytes that take no room on the disk."""
+    (tmp_path / "sparse").touch()
+    os.truncate(tmp_path / "sparse", 20 << 30)
+    with pytest.raises(InputError, match="a line has more than 65,536 bytes"):
+        list(bounded_lines(tmp_path / "sparse"))
+
+
+def test_a_text_has_a_bounded_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LONGEST_BYTES", 1_000)
+    (tmp_path / "long").write_text("1 2 3\n" * 200)
+    with pytest.raises(InputError, match="longer than a gigabyte"):
+        list(bounded_lines(tmp_path / "long"))
+    with pytest.raises(InputError, match="cannot be read as text"):
+        list(bounded_lines(tmp_path / "missing"))
+
+
+READERS, TIMES = 4, 12_000
+
+
+class Garbage:
+    """It is collected, and its finaliser lets another thread run, in the midst of anything."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+    def __del__(self) -> None:
+        sum(range(200))
+
+
+@pytest.fixture
+def eager_threads() -> Iterator[None]:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.usefixtures("eager_threads")
+def test_readers_do_not_disturb_one_another() -> None:
+    points = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")])
+    file = BytesIO()
+    np.save(file, points)
+
+    def read(_: int) -> None:
+        for _ in range(TIMES):
+            Garbage()
+            assert read_array(BytesIO(file.getvalue())).dtype == points.dtype
+
+    with ThreadPoolExecutor(READERS) as readers:
+        list(readers.map(read, range(READERS)))

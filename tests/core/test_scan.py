@@ -107,11 +107,6 @@ def test_construction_is_checked():
         Scan(points, np.nan)
 
 
-def test_a_scan_is_frozen():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Scan(np.ones((1, 3)), 0.0).stamp = 1.0
-
-
 @pytest.mark.parametrize("chosen", [np.array([True, False, True, False]), np.array([0, 2])], ids=["mask", "indices"])
 def test_select_keeps_everything_in_step(chosen):
     scan = Scan.from_raw(

@@ -140,7 +140,7 @@ def test_a_ray_that_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_one_job_does_not_load_ray() -> None:
-    code = "from lidarslam.core.tasks import *; from lidarslam.core.tasks import *; import sys\n"
+    code = "from lidarslam.core.tasks import *; import sys\n"
     code += "with open_tasks(Where()) as tasks: print(list(tasks.run(abs, [-1])), 'ray' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[1]", "False"]

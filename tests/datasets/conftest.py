@@ -1,5 +1,6 @@
-"""Point clouds as the drivers lay them out, and bags that hold them."""
+"""Point clouds as the drivers lay them out, bags that hold them, and files of scans."""
 
+import struct
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -280,3 +281,61 @@ def ros2_kit(tmp_path: Path) -> BagKit:
 def make_bag_kit(tmp_path: Path) -> Callable[[str], BagKit]:
     """A bag of a given kind."""
     return lambda kind: BagKit(kind, tmp_path)
+
+
+_PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "u4": "uint", "i4": "int"}
+
+
+@pytest.fixture(scope="session")
+def formats() -> SimpleNamespace:
+    """Tables of points as the bytes of scan files."""
+    return SimpleNamespace(pcd=_pcd_bytes, ply=_ply_bytes)
+
+
+def _pcd_bytes(table: np.ndarray, data: str = "binary") -> bytes:
+    """A PCD file."""
+    kinds = {"f": "F", "u": "U", "i": "I"}
+    types = [table.dtype[name] for name in table.dtype.names]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(table.dtype.names),
+        "SIZE " + " ".join(str(t.base.itemsize) for t in types),
+        "TYPE " + " ".join(kinds[t.base.kind] for t in types),
+        "COUNT " + " ".join(str(int(np.prod(t.shape)) if t.shape else 1) for t in types),
+        f"WIDTH {len(table)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(table)}",
+        f"DATA {data}",
+    ]
+    header = ("\n".join(lines) + "\n").encode()
+    if data == "ascii":
+        return header + _ascii(table)
+    if data == "binary":
+        return header + table.tobytes()
+    columns = b"".join(np.ascontiguousarray(table[name]).tobytes() for name in table.dtype.names)
+    packed = _lzf_literals(columns)
+    return header + struct.pack("<II", len(packed), len(columns)) + packed
+
+
+def _ascii(table: np.ndarray) -> bytes:
+    return "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in table).encode()
+
+
+def _lzf_literals(data: bytes) -> bytes:
+    """An LZF stream without copies, as a compressor writes what does not repeat."""
+    return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
+
+
+def _ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes = b"", faces: bool = False) -> bytes:
+    """A PLY file; other elements may come before the vertices, and a face behind them."""
+    properties = "".join(f"property {_PLY_NAMES[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names)
+    header = f"ply\nformat {encoding} 1.0\ncomment made by a test\n{before}element vertex {len(table)}\n{properties}"
+    header += "element face 1\nproperty list uchar int vertex_indices\n" * faces + "end_header\n"
+    if encoding == "ascii":
+        return header.encode() + prefix + _ascii(table) + b"3 0 1 2\n" * faces
+    order = "<" if "little" in encoding else ">"
+    return (
+        header.encode() + prefix + table.astype(table.dtype.newbyteorder(order)).tobytes() + (b"\3" + bytes(12)) * faces
+    )

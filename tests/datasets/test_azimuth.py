@@ -142,25 +142,18 @@ def test_times_that_cannot_be_had_are_a_warning(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
 @pytest.mark.parametrize("order", ["firing", "rings"])
-def test_formats_with_rings_alone(tmp_path, suffix, order):
+def test_formats_with_rings_alone(formats, tmp_path, suffix, order):
     folder = record(tmp_path / "raw", order=order)
     for path in folder.glob("*.npy"):
-        _write(path.with_suffix(suffix), np.load(path))
+        table = np.load(path)
+        path.with_suffix(suffix).write_bytes(
+            formats.pcd(table) if suffix == ".pcd" else formats.ply(table, "binary_little_endian")
+        )
         path.unlink()
     recording = open_recording(folder)
     _, times, _ = sweep(0.0, order=order)
     np.testing.assert_allclose(next(recording.scans()).time_offsets, times - times.min(), atol=2 * PERIOD_S / COLUMNS)
     assert recording.warnings == ()
-
-
-def _write(path, table):
-    kinds = "\n".join(f"property {'ushort' if name == 'ring' else 'float'} {name}" for name in table.dtype.names)
-    header = {
-        ".pcd": "VERSION .7\nFIELDS x y z ring\nSIZE 4 4 4 2\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-        f"WIDTH {len(table)}\nHEIGHT 1\nPOINTS {len(table)}\nDATA binary\n",
-        ".ply": f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{kinds}\nend_header\n",
-    }
-    path.write_bytes(header[path.suffix].encode() + table.tobytes())
 
 
 def test_ranges_that_contradict_one_another_are_not_taken_for_compensation():

@@ -4,7 +4,6 @@ Nothing else may come out of any reader: no other exception, no warning of NumPy
 """
 
 import io
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -103,63 +102,34 @@ def _as_bin(points: np.ndarray) -> bytes:
     return np.stack([points[name] for name in ("x", "y", "z", "intensity")], axis=1).astype("<f4").tobytes()
 
 
-def _as_npy(points: np.ndarray) -> bytes:
-    out = io.BytesIO()
-    np.save(out, points)
-    return out.getvalue()
+FORMATS = ("plain.bin", "structured.npy", "ascii.pcd", "binary.pcd", "binary_compressed.pcd", "ascii.ply",
+           "binary_little_endian.ply", "binary_big_endian.ply")  # fmt: skip
 
 
-def _as_text(points: np.ndarray) -> bytes:
-    return "".join(" ".join(str(value) for value in row.item()) + "\n" for row in points).encode()
+@pytest.fixture
+def encode(formats):
+    """The bytes of a file of points, by its name."""
+
+    def encoded(name: str, points: np.ndarray) -> bytes:
+        kind, _, suffix = name.partition(".")
+        if suffix in ("pcd", "ply"):
+            return bytes((formats.pcd if suffix == "pcd" else formats.ply)(points, kind))
+        out = io.BytesIO()
+        np.save(out, points)
+        return _as_bin(points) if suffix == "bin" else out.getvalue()
+
+    return encoded
 
 
-def _as_pcd(points: np.ndarray, data: str) -> bytes:
-    count = len(points)
-    header = (
-        "VERSION 0.7\nFIELDS x y z intensity t ring\nSIZE 4 4 4 4 4 2\nTYPE F F F F U U\nCOUNT 1 1 1 1 1 1\n"
-        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
-    ).encode()
-    if data == "ascii":
-        return header + _as_text(points)
-    if data == "binary":
-        return header + points.tobytes()
-    raw = b"".join(np.ascontiguousarray(points[name]).tobytes() for name in points.dtype.names)
-    literal = b"".join(bytes([len(raw[i : i + 32]) - 1]) + raw[i : i + 32] for i in range(0, len(raw), 32))
-    return header + struct.pack("<II", len(literal), len(raw)) + literal
-
-
-def _as_ply(points: np.ndarray, data: str) -> bytes:
-    names = {"f4": "float", "u4": "uint", "u2": "ushort"}
-    fields = "".join(f"property {names[points.dtype[name].str[1:]]} {name}\n" for name in points.dtype.names)
-    header = f"ply\nformat {data} 1.0\nelement vertex {len(points)}\n{fields}end_header\n".encode()
-    if data == "ascii":
-        return header + _as_text(points)
-    if data == "binary_big_endian":
-        points = points.astype(points.dtype.newbyteorder(">"))
-    return header + points.tobytes()
-
-
-FORMATS = {
-    "plain.bin": _as_bin,
-    "structured.npy": _as_npy,
-    "ascii.pcd": lambda points: _as_pcd(points, "ascii"),
-    "binary.pcd": lambda points: _as_pcd(points, "binary"),
-    "compressed.pcd": lambda points: _as_pcd(points, "binary_compressed"),
-    "ascii.ply": lambda points: _as_ply(points, "ascii"),
-    "little.ply": lambda points: _as_ply(points, "binary_little_endian"),
-    "big.ply": lambda points: _as_ply(points, "binary_big_endian"),
-}
-
-
-@pytest.mark.parametrize("name", list(FORMATS))
+@pytest.mark.parametrize("name", FORMATS)
 @fuzzed
 @given(damage=damages(), place=st.integers(0, SCANS - 1))
-def test_folder_of_damaged_scans(tmp_path, table, name, damage, place):
-    data = FORMATS[name](table)
-    header = len(data) - len(FORMATS[name](table[:0])) if name == "plain.bin" else len(FORMATS[name](table[:0]))
+def test_folder_of_damaged_scans(tmp_path, table, encode, name, damage, place):
+    data = encode(name, table)
+    header = len(data) - len(encode(name, table[:0])) if name == "plain.bin" else len(encode(name, table[:0]))
     for index in range(SCANS):
         damaged = damage(data, min(header, len(data)))
-        whole = FORMATS[name](np.roll(table, index))
+        whole = encode(name, np.roll(table, index))
         (tmp_path / f"{index}{Path(name).suffix}").write_bytes(damaged if index == place else whole)
     (tmp_path / "times.txt").write_text("".join(f"{100 + index / 10}\n" for index in range(SCANS)))
     # A change may well make another valid scan; the other three are never lost.
@@ -297,9 +267,9 @@ def test_clouds_that_say_what_is_not_so(
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "plain.bin"])
-def test_a_header_that_promises_more_than_there_is(tmp_path, table, name):
+def test_a_header_that_promises_more_than_there_is(tmp_path, table, encode, name):
     """One point more, and so many that making room for them would fill any memory."""
-    data = FORMATS[name](table)
+    data = encode(name, table)
     for promised in ("121", "1000000000000"):
         lie = data.replace(b"POINTS 120", f"POINTS {promised}".encode())
         lie = lie.replace(b"element vertex 120", f"element vertex {promised}".encode())
@@ -324,8 +294,8 @@ def test_pickled_objects_are_never_unpickled(tmp_path):
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith((".pcd", ".ply"))])
-def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, name):
-    lie = FORMATS[name](table).replace(b"POINTS 120", b"POINTS 0").replace(b"element vertex 120", b"element vertex 0")
+def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, encode, name):
+    lie = encode(name, table).replace(b"POINTS 120", b"POINTS 0").replace(b"element vertex 120", b"element vertex 0")
     (tmp_path / name).write_bytes(lie)
     with pytest.raises(InputError, match=r"promises no points, and .* bytes follow|is truncated"):
         next(open_recording(tmp_path).scans())
@@ -333,8 +303,8 @@ def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, 
 
 @pytest.mark.parametrize("before", [False, True])
 @pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith(".ply")])
-def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, name, before):
-    header, body = FORMATS[name](table).split(b"end_header\n")
+def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, encode, name, before):
+    header, body = encode(name, table).split(b"end_header\n")
     faces, vertex = b"element face 1000000000000\nproperty uchar n\n", header.index(b"element vertex")
     header = header[:vertex] + faces + header[vertex:] if before else header + faces
     for points in (b"element vertex 120", b"element vertex 0"):

@@ -182,18 +182,6 @@ def test_of_several_the_nearest(ros2_kit, make_sweep, rng, names, expected):
         _ = open_recording(path, ReaderConfig(imu_topic="/none")).imu
 
 
-def test_of_several_as_near_the_fastest(ros2_kit, make_sweep, rng):
-    slow, fast = Samples(rng, 11), Samples(rng, 41)
-    path = ros2_kit.write(
-        {
-            "/points": clouds(ros2_kit, make_sweep),
-            "/a/imu": slow.messages(ros2_kit),
-            "/b/imu": fast.messages(ros2_kit),
-        }
-    )
-    fast.assert_found(open_recording(path).imu)
-
-
 def test_where_no_cloud_is_stamped_samples_have_the_times_of_recording(ros2_kit, make_sweep, samples):
     unset = [(t, ros2_kit.cloud(make_sweep("velodyne", STAMP_NS).records, 0)) for t, _ in clouds(ros2_kit, make_sweep)]
     path = ros2_kit.write({"/points": unset, "/imu": samples.messages(ros2_kit)})
@@ -248,12 +236,6 @@ def test_a_damaged_table(tmp_path, content, message):
     assert len(list(recording.scans())) == 3
     with pytest.raises(InputError, match=message):
         _ = recording.imu
-
-
-def test_an_empty_table(tmp_path):
-    folder = folder_of_scans(tmp_path / "scans")
-    (folder / "imu.csv").write_text("stamp_s,wx,wy,wz,ax,ay,az\n")
-    assert open_recording(folder).imu is None
 
 
 def test_samples_out_of_the_sensors_range_are_left_out():

@@ -162,12 +162,6 @@ def test_a_point_has_its_own_sweeps_start_and_end(tmp_path, rng):
     np.testing.assert_allclose(two.time_offsets, [-0.056, -0.028, 0.0265], atol=1e-6)
 
 
-def test_point_times_can_be_switched_off(tmp_path, rng):
-    recording = open_recording(_write_drive(tmp_path, rng), ReaderConfig(time_reference="none"))
-    assert next(recording.scans()).time_offsets is None
-    assert recording.describe().point_time is None
-
-
 def test_truth_is_the_lidars_pose_at_the_oxts_stamps(tmp_path, rng):
     recording = open_recording(_write_drive(tmp_path, rng))
     truth = recording.ground_truth
@@ -264,26 +258,6 @@ def test_without_calibration_or_oxts_there_is_no_truth(tmp_path, rng):
     recording = open_recording(drive)
     assert recording.ground_truth is None
     assert recording.describe().ground_truth is None
-
-
-def test_the_correction_changes_elevations_and_no_times(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
-    raised = next(open_recording(drive).scans())
-    plain = next(open_recording(drive, ReaderConfig(elevation_correction_deg=0.0)).scans())
-    elevation = [np.arctan2(s.points[:, 2], np.hypot(s.points[:, 0], s.points[:, 1])) for s in (plain, raised)]
-    np.testing.assert_allclose(np.rad2deg(elevation[1] - elevation[0]), 0.205, atol=1e-9)
-    np.testing.assert_array_equal(raised.time_offsets, plain.time_offsets)
-
-
-def test_describe(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
-    info = open_recording(drive).describe()
-    assert (info.reader, info.scans, len(info.first), info.first.dropped) == ("kitti-raw", 8, 60, 0)
-    assert info.first_stamp == pytest.approx(FIRST_STAMP, abs=3e-7)
-    assert info.rate_hz == pytest.approx(1 / MID_S, rel=1e-4)
-    assert info.ground_truth.name == "oxts"
-    assert (info.point_time.field, info.point_time.unit, info.point_time.reference) == ("azimuth", "s", "relative")
-    assert -0.050 <= info.first.time_offsets.min() < -0.04 < 0.04 < info.first.time_offsets.max() <= 0.053
 
 
 def test_damaged_and_foreign_files_are_named(tmp_path, rng):

@@ -1,6 +1,7 @@
 """The Apollo reader on scans and poses in the layout that KISS-ICP reads too."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,16 +20,8 @@ def _T_world_lidar(index: int) -> np.ndarray:
     return exp([0.0, 0.0, 2.0, 10.0, -20.0, 3.0]) @ exp(np.multiply(index, [0.0, 0.0, 0.05, 1.0, 0.0, 0.0]))
 
 
-def _write_pcd(path: Path, points: np.ndarray) -> None:
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
-        f"COUNT 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n"
-    )
-    path.write_bytes(header.encode() + points.astype("<f4").tobytes())
-
-
 @pytest.fixture
-def area(tmp_path: Path, rng: np.random.Generator) -> Path:
+def area(tmp_path: Path, rng: np.random.Generator, formats: SimpleNamespace) -> Path:
     """Two sequences of one area; scans are counted from 1 on, without leading zeros."""
     for name in ("MathildaAVE-1", "SanJoseDowntown-2"):
         folder = tmp_path / "TrainData" / name
@@ -38,7 +31,8 @@ def area(tmp_path: Path, rng: np.random.Generator) -> Path:
         for index in range(1, SCANS + 1):
             points = rng.uniform(-30.0, 30.0, (20, 4))
             points[:, 3] = index
-            _write_pcd(folder / "pcds" / f"{index}.pcd", points)
+            table = np.rec.fromarrays(points.astype("<f4").T, names="x,y,z,intensity")
+            (folder / "pcds" / f"{index}.pcd").write_bytes(formats.pcd(table))
             T = _T_world_lidar(index)
             numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
             lines.append(f"{index} {START + 0.1 * index:.6f} {' '.join(f'{number:.9f}' for number in numbers)}\n")

@@ -1,0 +1,159 @@
+"""Text of unknown origin cannot steer a terminal or leave a folder; hints can be typed."""
+
+import os
+import subprocess
+import sys
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarslam.core.errors import ConfigError
+from lidarslam.core.text import (
+    as_typed,
+    command_line,
+    joined,
+    one_line,
+    printable,
+    require_name,
+    safe_name,
+    stays_below,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("lidar_top", "lidar_top"),
+        ("Größe 测试 ★", "Größe 测试 ★"),
+        ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
+        ("a\nb\r\tc", "a\\nb\\r\\tc"),
+        ("abc\u202egnp.exe", "abc\\u202egnp.exe"),
+        ("\x9b31m", "\\x9b31m"),
+        ("bad\udcff", "bad\\udcff"),
+        ("a\u2028b", "a\\u2028b"),
+    ],
+)
+def test_what_a_terminal_would_act_on_is_spelt_out(text: str, shown: str) -> None:
+    assert one_line(text) == shown
+
+
+@given(st.text())
+def test_no_text_holds_a_control_character_afterwards(text: str) -> None:
+    for shown in (one_line(text), printable(text).replace("\n", "")):
+        assert not [c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp")]
+        assert not [
+            c for c in shown if unicodedata.bidirectional(c) in ("LRE", "RLE", "LRO", "RLO", "LRI", "RLI", "FSI")
+        ]
+        shown.encode("utf-8")
+
+
+def test_lines_of_ours_stay_lines() -> None:
+    assert printable("source  a\ntopic  \x1b[2J\n") == "source  a\ntopic  \\x1b[2J\n"
+
+
+def test_the_middle_of_a_long_text_is_left_out() -> None:
+    shown = one_line("begin" + "x" * 100_000 + "end", longest=100)
+    assert shown.startswith("begin")
+    assert shown.endswith("xend")
+    assert len(shown) < 120
+
+
+def test_a_line_break_in_a_name_is_no_line() -> None:
+    assert joined(["written to a\nb", "next"]) == "written to a\\nb\nnext"
+
+
+@pytest.mark.parametrize(
+    "name", ["new\nline", "it's\t\\ \x1b[2J", "plain", "a b", "$HOME\r`x`", os.fsdecode(b"bad\xff'"), "abc\u202egnp"]
+)
+def test_a_command_with_any_name_is_one_line_that_a_shell_reads_back(name: str) -> None:
+    typed = command_line("printf", "%s", name)
+    assert typed.isprintable()
+    printed = subprocess.run(["bash", "-c", typed], capture_output=True, check=True, env={"LC_ALL": "C.UTF-8"}).stdout
+    assert printed == os.fsencode(name)
+
+
+UNSAFE = ["", " ", ".", "..", "...", ".hidden", "/abs/path", "../../x", "a/b", "a\\b", "a\0b", "a\nb", "\x1b[2J",
+          "\ud800", "\u202eabc", "x" * 121, "\u00e4" * 61]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNSAFE)
+def test_unsafe_names_are_refused_by_name(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"method .* cannot be the name of a folder"):
+        require_name(name, "method")
+
+
+@pytest.mark.parametrize(
+    "name", ["04", "kiss-icp@0.5", "a+map+graph", "p2pl + pl2pl", "stra\u00dfe", "a..b", "x" * 120]
+)
+def test_other_names_stay(name: str) -> None:
+    assert require_name(name, "method") == name
+    assert safe_name(name) == name
+
+
+def test_reserved_names_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"'recordings': .*another file"):
+        require_name("recordings", "recording", {"recordings"})
+
+
+def test_a_path_that_stays_below_its_folder() -> None:
+    assert [path for path in ("a", "a/b.bin", "./a", "a..b/..c") if not stays_below(path)] == []
+    assert [path for path in ("..", "../a", "a/../../b", "/a", "//a", "a/..") if stays_below(path)] == []
+
+
+@given(st.text(max_size=300))
+def test_a_safe_name_stays_in_its_folder(text: str) -> None:
+    name = safe_name(text)
+    path = Path("/folder") / name
+    assert path.parent == Path("/folder")
+    assert name == require_name(name, "recording")
+
+
+def test_safe_names_are_told_apart() -> None:
+    assert [safe_name(text) for text in ("hilti/basement_2", "..", "/points", " ")] == [
+        "hilti_basement_2", "recording", "_points", "recording",
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The programs of an environment that is not on the path, seen from the folder it lies in."""
+    programs = tmp_path / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    for name in ("python", "lidarslam"):
+        (programs / name).write_text("#!/bin/sh\n")
+        (programs / name).chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(programs / "python"))
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.chdir(tmp_path)
+    return programs
+
+
+def test_a_program_off_the_path_is_named_by_its_file(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert as_typed("lidarslam") == "./.venv/bin/lidarslam"
+    monkeypatch.chdir(environment)
+    assert as_typed("lidarslam") == "./lidarslam"
+    monkeypatch.chdir("/usr")
+    assert as_typed("lidarslam") == str(environment / "lidarslam")
+
+
+def test_a_program_on_the_path_is_named_by_its_name(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(environment))
+    assert as_typed("lidarslam") == "lidarslam"
+
+
+def test_another_program_of_the_name_on_the_path_is_not_meant(
+    environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "lidarslam").write_text("#!/bin/sh\n")
+    (other / "lidarslam").chmod(0o755)
+    monkeypatch.setenv("PATH", str(other))
+    assert as_typed("lidarslam") == "./.venv/bin/lidarslam"
+
+
+def test_a_program_that_is_not_beside_keeps_its_name(environment: Path) -> None:
+    assert as_typed("rerun") == "rerun"
