@@ -23,7 +23,7 @@ from lidarslam.core.scan import ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import Guess, guess_mounting, transform_of
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.mesh import Caster
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route

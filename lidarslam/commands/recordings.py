@@ -24,7 +24,7 @@ _WORLD = Registered("lidarslam.simulation.world", "WORLDS")
 _SENSOR = Registered("lidarslam.simulation.sensors", "SENSORS")
 _CARRIER = Registered("lidarslam.simulation.motion", "CARRIERS")
 _MOUNT = Registered("lidarslam.simulation.motion", "MOUNTS")
-_FORMAT = Registered("lidarslam.simulation.formats", "FORMATS")
+_FORMAT = Registered("lidarslam.simulation.writers", "FORMATS")
 
 
 @command(

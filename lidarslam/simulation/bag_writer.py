@@ -25,8 +25,7 @@ from lidarslam.datasets.ros.made_messages import (
     vector,
     write_chunk_checksums,
 )
-from lidarslam.simulation.recorder import SimulatedScan
-from lidarslam.simulation.writers import CLOCK_START_NS, Rig, clock_ns
+from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_ns
 
 Records = NDArray[np.void]
 _FIRST_RETURN = 0x10

@@ -17,16 +17,15 @@ from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import as_typed, command_line, count, joined, small_length
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum, write_tum
-from lidarslam.simulation.formats import FORMATS, find_format
 from lidarslam.simulation.mesh import world_mesh
 from lidarslam.simulation.motion import Carrier, Motion, find_carrier, motion_along, mount_pose
-from lidarslam.simulation.recorder import SimulatedScan, Simulation
+from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_s
 from lidarslam.simulation.reference_map import KeyArray, ReferenceMap, SeenSurfaces, sample_seen
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import Sensor, find_sensor
 from lidarslam.simulation.world import World, build_world
 from lidarslam.simulation.worlds.along import build_along
-from lidarslam.simulation.writers import Rig, as_records, clock_s, write_ply
+from lidarslam.simulation.writers import FORMATS, as_records, find_format, write_ply
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """A sensor on a carrier in a world: scans made one at a time, in any order, with the truth about them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,9 +11,8 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.caster import Caster, Hits
 from lidarslam.simulation.imu import MEMS_IMU, ImuModel, sample_imu
-from lidarslam.simulation.mesh import first_ground_triangle
+from lidarslam.simulation.mesh import Caster, Hits, first_ground_triangle
 from lidarslam.simulation.motion import Motion
 from lidarslam.simulation.noise import bloom, intensities, measure, ranges_in_grass, reflectivity
 from lidarslam.simulation.sensors import Rays, Sensor
@@ -36,6 +35,31 @@ class SimulatedScan:
     intensities: NDArray[np.float32]  # (N,) whole numbers from 0 to 255
     true_ranges: FloatArray | None = None  # (N,) or None if unknown
     moving: NDArray[np.bool_] | None = None  # (N,) whether the ray met a mover, or None if unknown
+
+
+# Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives
+# the same bytes; far from zero, so that readers can tell offsets from a stamp from readings of the clock.
+CLOCK_START_NS = 1_704_067_200 * 10**9
+
+
+def clock_ns(time: float, start_ns: int = CLOCK_START_NS) -> int:
+    """The clock's reading at a simulated time in seconds, to the nanosecond."""
+    return start_ns + round(time * 1e9)
+
+
+def clock_s(time: float, start_ns: int = CLOCK_START_NS) -> float:
+    """The same in seconds, the float64 that a reader makes of the nanoseconds."""
+    return clock_ns(time, start_ns) / 10**9
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The sensor on its carrier, as far as a file format has to know it."""
+
+    driver: str  # whose messages the sensor speaks: "velodyne", "ouster", "hesai" or "livox"
+    sweep_s: float  # duration of a sweep
+    T_world_lidar_at: Callable[[FloatArray], FloatArray]  # true poses (N, 4, 4) at times (N,), simulated seconds
+    imu: ImuSamples | None = None  # on simulated time too; None where none is to be recorded
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,10 @@ from scipy.interpolate import CubicSpline
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.imu import GRAVITY
 from lidarslam.simulation.motion import CHANNELS, Carrier, Motion, Sway, Swing, find_carrier, ground_under
 from lidarslam.simulation.world import World
+from lidarslam.simulation.worlds.paths import lengths_along, turning_angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,7 @@ class RoundedPath:
     @cached_property
     def lengths(self) -> FloatArray:
         """(M,) length along the polyline at each vertex; the path's parameter u."""
-        steps = np.linalg.norm(np.diff(self.vertices[:, :2], axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return lengths_along(self.vertices[:, :2])
 
     @cached_property
     def _directions(self) -> FloatArray:
@@ -65,14 +66,6 @@ def _window(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     step = 0.5 + 15.0 / 16.0 * z * (1.0 - z2 * (2.0 / 3.0 - z2 / 5.0))
     ramp = 5.0 / 32.0 + 0.5 * z + 15.0 / 16.0 * z2 * (0.5 - z2 * (1.0 / 6.0 - z2 / 30.0))
     return ramp, step, bump
-
-
-def turning_angles(vertices: FloatArray) -> FloatArray:
-    """(M,) change of heading at each vertex (M, >=2) of a closed polyline, in [-pi, pi]; counter-clockwise positive."""
-    xy = vertices[:, :2]
-    arriving, leaving = xy - np.roll(xy, 1, axis=0), np.roll(xy, -1, axis=0) - xy
-    cross = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
-    return np.asarray(np.arctan2(cross, (arriving * leaving).sum(axis=1)))
 
 
 def corner_windows(vertices: FloatArray, corner_m: float, cut_m: float) -> FloatArray:
@@ -204,7 +197,6 @@ _LARGEST_WINDOW_M = 12.0
 _DRIVES_STRAIGHT_DEG = 90.0
 # Straight legs may leave the route sideways, hardly upwards.
 _LIFT_WEIGHT = np.array([1.0, 1.0, 4.0])
-_GRAVITY = 9.81
 
 
 def motion_along_route(name: str, world: World, seed: int, speed_mps: float | None = None) -> Motion:
@@ -344,14 +336,13 @@ def _on_the_ground(carrier: Carrier, world: World, way: FloatArray) -> FloatArra
     z = ground.height + lift + flight
     roll, pitch = np.zeros(len(z)), np.zeros(len(z))
     if carrier.leans_with_ground:
-        slope_pitch, slope_roll = ground.pitch_and_roll(yaw, rise)
-        pitch, roll = pitch + slope_pitch, roll + slope_roll
+        pitch, roll = ground.pitch_and_roll(yaw, rise)
     velocity = np.gradient(xy, TIME_STEP_S, axis=0)
     if carrier.banks:
         c, s = np.cos(yaw), np.sin(yaw)
         ax, ay = np.gradient(velocity, TIME_STEP_S, axis=0).T
-        pitch += np.arctan(smoothed(c * ax + s * ay, carrier.smoothing_s) / _GRAVITY)
-        roll -= np.arctan(smoothed(c * ay - s * ax, carrier.smoothing_s) / _GRAVITY)
+        pitch += np.arctan(smoothed(c * ax + s * ay, carrier.smoothing_s) / GRAVITY)
+        roll -= np.arctan(smoothed(c * ay - s * ax, carrier.smoothing_s) / GRAVITY)
     speed = np.hypot(*velocity.T) + 0.3 * np.abs(np.gradient(yaw, TIME_STEP_S))
     activity = smoothed(np.minimum(speed / (0.5 * carrier.speed_mps), 1.0), _SETTLE_S - TIME_STEP_S)
     return np.column_stack([xy, z, roll, pitch, yaw, activity])

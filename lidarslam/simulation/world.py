@@ -17,46 +17,24 @@ T = TypeVar("T")
 class Boxes:
     """Solid boxes in the world."""
 
-    centres: FloatArray  # (N, 3)
-    half_sizes: FloatArray  # (N, 3) along the box's own axes, positive
-    R_world_box: FloatArray  # (N, 3, 3)
-
-    def __post_init__(self) -> None:
-        n = len(self.centres)
-        _check(self, centres=(n, 3), half_sizes=(n, 3), R_world_box=(n, 3, 3))
-        if (self.half_sizes <= 0.0).any():
-            raise ValueError("Boxes.half_sizes must be positive")
+    centres: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3)
+    half_sizes: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) along its own axes, positive
+    R_world_box: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))  # (N, 3, 3)
 
     def __len__(self) -> int:
         return len(self.centres)
-
-    @classmethod
-    def empty(cls) -> "Boxes":
-        """No box."""
-        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Cylinders:
     """Solid cylinders with flat ends, in any direction: poles, trunks, pipes."""
 
-    starts: FloatArray  # (N, 3) centres of the two ends, in the world
-    ends: FloatArray  # (N, 3)
-    radii: FloatArray  # (N,) positive
-
-    def __post_init__(self) -> None:
-        n = len(self.starts)
-        _check(self, starts=(n, 3), ends=(n, 3), radii=(n,))
-        if (self.radii <= 0.0).any() or (np.linalg.norm(self.ends - self.starts, axis=1) <= 0.0).any():
-            raise ValueError("Cylinders must have positive radii and lengths")
+    starts: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) centres of one end, in the world
+    ends: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) and of the other
+    radii: FloatArray = field(default_factory=lambda: np.empty(0))  # (N,) positive
 
     def __len__(self) -> int:
         return len(self.starts)
-
-    @classmethod
-    def empty(cls) -> "Cylinders":
-        """No cylinder."""
-        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +48,6 @@ class HeightField:
     origin_xy: FloatArray  # (2,)
     cell_m: float
     heights: FloatArray
-
-    def __post_init__(self) -> None:
-        _check(self, origin_xy=(2,))
-        if self.heights.ndim != 2 or min(self.heights.shape) < 2 or not np.isfinite(self.heights).all():
-            raise ValueError(f"HeightField.heights must be a finite grid of at least (2, 2), got {self.heights.shape}")
-        if not self.cell_m > 0.0:
-            raise ValueError(f"HeightField.cell_m must be positive, got {self.cell_m}")
 
     def height_at(self, xy: FloatArray) -> FloatArray:
         """z (N,) of the surface's triangles at (N, 2) world positions; outside the grid, that of its border."""
@@ -109,11 +80,6 @@ class Mover:
     speed_mps: float
     start_m: float  # along the polyline at time 0
 
-    def __post_init__(self) -> None:
-        _check(self, waypoints=(len(self.waypoints), 3))
-        if not len(self.waypoints):
-            raise ValueError("Mover.waypoints must hold a point")
-
     def pose_at(self, times: FloatArray) -> FloatArray:
         """T_world_mover (N, 4, 4) at times (N,) in seconds, x along the polyline."""
         steps = np.roll(self.waypoints, -1, axis=0) - self.waypoints
@@ -142,11 +108,6 @@ class Route:
     free_height_m: float  # free space above the ground
     speed_limit_mps: float
 
-    def __post_init__(self) -> None:
-        _check(self, waypoints=(len(self.waypoints), 3))
-        if len(self.waypoints) < 3:
-            raise ValueError(f"Route.waypoints must hold three corners or more, got {len(self.waypoints)}")
-
 
 @dataclass(frozen=True, eq=False)
 class World:
@@ -159,8 +120,8 @@ class World:
     name: str
     seed: int
     route: Route
-    boxes: Boxes = field(default_factory=Boxes.empty)
-    cylinders: Cylinders = field(default_factory=Cylinders.empty)
+    boxes: Boxes = field(default_factory=Boxes)
+    cylinders: Cylinders = field(default_factory=Cylinders)
     height_fields: tuple[HeightField, ...] = ()
     movers: tuple[Mover, ...] = ()
     map_spacing_m: float = 0.05
@@ -169,12 +130,6 @@ class World:
     def ground_at(self, xy: FloatArray) -> FloatArray:
         """z (N,) of the first height field, which is the ground; 0 where there is none."""
         return self.height_fields[0].height_at(xy) if self.height_fields else np.zeros(len(xy))
-
-
-def _check(owner: object, **shapes: tuple[int, ...]) -> None:
-    for name, shape in shapes.items():
-        if getattr(owner, name).shape != shape:
-            raise ValueError(f"{type(owner).__name__}.{name} must be {shape}, got {getattr(owner, name).shape}")
 
 
 # Each is a module of lidarslam.simulation.worlds with `build(seed: int) -> World`.

@@ -1,8 +1,9 @@
-"""The clock of recordings, and the writers of KITTI's layout and of folders of PLY files."""
+"""The formats of recordings: the table, KITTI's layout and folders of PLY files; bags are in `bag_writer`."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,32 +14,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.imu_samples import COLUMNS, EXTRINSIC, IMU_FILE
 from lidarslam.datasets.mounting import KITTI_DEG, correct_elevation
-from lidarslam.simulation.recorder import SimulatedScan
-
-# Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives
-# the same bytes; far from zero, so that readers can tell offsets from a stamp from readings of the clock.
-CLOCK_START_NS = 1_704_067_200 * 10**9
-
-
-def clock_ns(time: float, start_ns: int = CLOCK_START_NS) -> int:
-    """The clock's reading at a simulated time in seconds, to the nanosecond."""
-    return start_ns + round(time * 1e9)
-
-
-def clock_s(time: float, start_ns: int = CLOCK_START_NS) -> float:
-    """The same in seconds, the float64 that a reader makes of the nanoseconds."""
-    return clock_ns(time, start_ns) / 10**9
-
-
-@dataclass(frozen=True)
-class Rig:
-    """The sensor on its carrier, as far as a file format has to know it."""
-
-    driver: str  # whose messages the sensor speaks: "velodyne", "ouster", "hesai" or "livox"
-    sweep_s: float  # duration of a sweep
-    T_world_lidar_at: Callable[[FloatArray], FloatArray]  # true poses (N, 4, 4) at times (N,), simulated seconds
-    imu: ImuSamples | None = None  # on simulated time too; None where none is to be recorded
-
+from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_s
+from lidarslam.simulation.world import choose
 
 Writer = Callable[[Path, Iterable[SimulatedScan], Rig], None]
 """Makes the folder, which does not exist yet, and writes the scans, holding one of them at a time."""
@@ -163,3 +140,62 @@ def _format_calibration() -> str:
         lines[f"P{camera}"] = np.array([focal_row, centre, [0.0, 0.0, 1.0, 0.0]])
     texts = {name: " ".join(f"{value:.12e}" for value in rows.reshape(-1)) for name, rows in lines.items()}
     return "".join(f"{name}: {texts[name]}\n" for name in sorted(texts))
+
+
+@dataclass(frozen=True)
+class Format:
+    """One row of the table."""
+
+    write: Writer
+    layout: str  # of the files, for the recording's README
+    files: tuple[str, ...]  # their names in the recording's folder, as patterns
+    source: str = ""  # the one to give to `lidarslam run`; empty: the folder itself, which always works too
+    imu: str = ""  # where an IMU's samples are; empty where the format has no place for them
+    clock_start_ns: int = CLOCK_START_NS  # the clock's reading at the simulated time zero
+
+    def source_in(self, folder: Path) -> Path:
+        """The argument for `lidarslam run` of the recording in that folder."""
+        return folder / self.source.format(name=folder.name)
+
+
+_BAG_MESSAGES = "with the messages of the sensor's own driver, stamped at the start of each sweep"
+_KITTI_LAYOUT = (
+    "the layout of the KITTI odometry benchmark. As there, the scans are motion compensated, here exactly and to the"
+    " stamp at the start of the sweep; there is no per-point time; every point lies 0.205 degrees too low, which"
+    " readers of KITTI (this one too) correct; poses/00.txt is in the frame of the camera that calib.txt describes (Tr)"
+)
+_PLY_LAYOUT = (
+    "one binary PLY file a scan, with x, y, z in metres, intensity, t in nanoseconds from the scan's stamp, and ring;"
+    " timestamps.txt has a stamp a line, seconds since 1970"
+)
+_ROSBAG2_LAYOUT = f"a ROS 2 bag (SQLite) {_BAG_MESSAGES}; the folder is the bag"
+_MCAP_LAYOUT = f"a ROS 2 bag (MCAP) {_BAG_MESSAGES}; the folder is the bag, and its .mcap file can be read alone"
+
+_IMU_TABLE = "imu.csv has its samples, stamped by the same clock, and T_lidar_imu in its first line"
+_IMU_MESSAGES = "its messages are sensor_msgs/Imu on the topic of the sensor's driver, and /tf_static has T_lidar_imu"
+
+
+def _bag_writer(kind: Literal["rosbag1", "rosbag2", "mcap"]) -> Writer:
+    def write(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
+        from lidarslam.simulation.bag_writer import write_bag
+
+        write_bag(folder, scans, rig, kind)
+
+    return write
+
+
+_PLY_FILES = ("scan_*.ply", "timestamps.txt", "imu.csv")
+FORMATS: dict[str, Format] = {
+    "kitti": Format(write_kitti, _KITTI_LAYOUT, ("sequences", "poses"), clock_start_ns=0),
+    "ply": Format(write_ply_scans, _PLY_LAYOUT, _PLY_FILES, imu=_IMU_TABLE),
+    "rosbag1": Format(
+        _bag_writer("rosbag1"), f"a ROS 1 bag {_BAG_MESSAGES}", ("*.bag",), source="{name}.bag", imu=_IMU_MESSAGES
+    ),
+    "rosbag2": Format(_bag_writer("rosbag2"), _ROSBAG2_LAYOUT, ("metadata.yaml", "*.db3"), imu=_IMU_MESSAGES),
+    "mcap": Format(_bag_writer("mcap"), _MCAP_LAYOUT, ("metadata.yaml", "*.mcap"), imu=_IMU_MESSAGES),
+}
+
+
+def find_format(name: str) -> Format:
+    """The format of that name."""
+    return choose("recording format", name, FORMATS)

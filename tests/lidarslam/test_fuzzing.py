@@ -22,9 +22,8 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.simulation.formats import FORMATS
-from lidarslam.simulation.recorder import SimulatedScan
-from lidarslam.simulation.writers import Rig, write_kitti, write_ply_scans
+from lidarslam.simulation.recorder import Rig, SimulatedScan
+from lidarslam.simulation.writers import FORMATS, write_kitti, write_ply_scans
 from lidarslam.storage.finished_run import load_map
 from lidarslam.storage.unfinished import Unfinished
 

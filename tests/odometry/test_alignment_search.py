@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from lidarslam.odometry.alignment import alignment as search
 from lidarslam.odometry.alignment.alignment import (
     DOUBTFUL,
     Alignment,
@@ -30,11 +29,6 @@ def street(box_room) -> list[SweepImages]:
     boxes = [((x - 0.15, y - 0.15, -5.0), (x + 0.15, y + 0.15, 5.0)) for x, y in poles]
     scene = type(box_room)((-np.inf, -6.0, -1.8), (np.inf, 6.0, np.inf), (*pilasters, *boxes))
     return scene.sweeps(2, TWIST)
-
-
-@pytest.fixture
-def no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "STEPS_M", ())
 
 
 def moved(along_m: float) -> FloatArray:
@@ -73,10 +67,6 @@ def test_steps_along_the_direction_in_doubt_find_the_motion(street):
     assert found.explained > DOUBTFUL
 
 
-def test_no_steps_are_tried_where_there_are_none(street, no_steps):
-    assert wrong_by_m(one_on_the_other(street, REST)) > 1.3
-
-
 def test_a_good_alignment_is_not_searched_around(street):
     found = one_on_the_other(street, moved(1.35))
     alone = align(InitialEstimate(moved(1.35)), second_on_first(street), FINE)
@@ -94,20 +84,6 @@ def test_of_guesses_that_explain_as_much_the_first_is_taken(corridor):
     for first, second in ((-0.2, 0.2), (0.2, -0.2)):
         found = one_on_the_other(sweeps, moved(first), moved(second))
         assert found.T_prev_curr[0, 3] == pytest.approx(first, abs=0.01)
-
-
-def test_guesses_that_are_alike_are_as_good_as_the_first(street):
-    both = one_on_the_other(street, moved(1.3), moved(1.45))
-    assert np.array_equal(both.T_prev_curr, one_on_the_other(street, moved(1.3)).T_prev_curr)
-
-
-def test_information_is_about_the_first_guess_alone(street, corridor, no_steps):
-    """It holds the first guess along the corridor, and says nothing of another that is taken instead."""
-    firm = 1e9 * np.eye(6)
-    held = one_on_the_other(corridor.sweeps(2, TWIST), moved(1.0), information=firm)
-    np.testing.assert_allclose(held.T_prev_curr, moved(1.0), atol=1e-4)
-    other = one_on_the_other(street, REST, moved(1.3), information=firm)
-    assert wrong_by_m(other) < 0.02
 
 
 @pytest.mark.parametrize(("sigma_m", "found"), [(0.7, True), (0.03, False)])

@@ -118,15 +118,3 @@ def test_peaks_are_followed_down_to_the_least_probability():
     scores[0, 178] = 18.0
     scores[0, 2] = 17.0  # near the one across the seam
     assert [int(left[0].argmax()) for left in _peaks(scores, 4, 6)] == [10, 100, 178]
-
-
-def test_peaks_on_the_border_of_shifts():
-    scores = np.zeros((1, 37, 37), dtype=np.float32)
-    scores[0, 0, 36], scores[0, 30, 3] = 8.0, 7.0
-    assert [divmod(int(left[0].argmax()), 37) for left in _peaks(scores, 3, 4)] == [(0, 36), (30, 3)]
-
-
-def test_empty_scans_give_finite_candidates(search):
-    nothing = np.zeros((3, 16, 720), dtype=np.float32)
-    candidates, _ = search.compare(search.describe(nothing, nothing), nothing, nothing)
-    assert all(np.isfinite(one.T_prev_curr).all() and np.isfinite(one.covariance).all() for one in candidates)

@@ -43,17 +43,6 @@ def test_all_distances_and_tree_agree_however_they_are_split(max_distances: int,
     torch.testing.assert_close(distance, tree_distance, rtol=1e-6, atol=0)
 
 
-def test_items_without_reference(search) -> None:
-    query, reference, valid = _clouds()
-    valid[1] = False
-    index, distance = search(query, reference, valid)
-    assert (index[1] == 0).all()
-    assert distance[1].isinf().all()
-    alone = search(query[2:], reference[2:], valid[2:])
-    assert torch.equal(index[2], alone[0][0])
-    assert torch.equal(distance[2], alone[1][0])
-
-
 def test_what_is_not_finite_is_not_found(search) -> None:
     query, reference, valid = _clouds()
     expected = search(query, reference, valid)
@@ -65,16 +54,3 @@ def test_what_is_not_finite_is_not_found(search) -> None:
         expected[0][item, point], expected[1][item, point] = 0, torch.inf
     assert torch.equal(index, expected[0])
     assert torch.equal(distance, expected[1])
-
-
-@pytest.mark.parametrize(("queries", "references"), [(0, 5), (5, 0)])
-def test_empty_clouds(search, queries: int, references: int) -> None:
-    index, distance = search(torch.ones(2, queries, 3), torch.ones(2, references, 3), torch.ones(2, references).bool())
-    assert index.shape == distance.shape == (2, queries)
-    assert distance.isinf().all()
-
-
-def test_no_gradient_through_the_search(search) -> None:
-    query, reference, valid = _clouds()
-    _, distance = search(query.requires_grad_(), reference, valid)
-    assert not distance.requires_grad

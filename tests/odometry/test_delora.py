@@ -34,16 +34,6 @@ def test_has_the_parameters_of_the_published_weights(network: DeloraNetwork) -> 
     assert heads == 200_907
 
 
-@pytest.mark.parametrize(("height", "width", "columns"), [(16, 16, 1), (17, 45, 2), (64, 720, 23)])
-@torch.no_grad()
-def test_any_image_size(network: DeloraNetwork, height: int, width: int, columns: int) -> None:
-    images = _images(1, height, width)
-    assert features(network, *images).shape == (1, 512, (height + 1) // 2, columns)
-    T = motion(network, *images)
-    assert T.shape == (1, 4, 4)
-    assert T.isfinite().all()
-
-
 @pytest.mark.parametrize("scale", [0.1, 30.0])
 @torch.no_grad()
 def test_outputs_are_rigid(network: DeloraNetwork, scale: float) -> None:
@@ -53,14 +43,6 @@ def test_outputs_are_rigid(network: DeloraNetwork, scale: float) -> None:
     torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(3, 3, 3), rtol=0, atol=1e-6)
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(3))
     assert torch.equal(T[:, 3], torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(3, 4))
-
-
-@torch.no_grad()
-def test_begins_near_the_identity(network: DeloraNetwork) -> None:
-    prev, curr = _images()
-    T = motion(network, 50.0 * prev, 50.0 * curr)
-    assert (T - torch.eye(4)).abs().max() < 0.2
-    assert (T - torch.eye(4)).abs().max() > 0.0
 
 
 @torch.no_grad()
@@ -95,8 +77,3 @@ def test_gradients_reach_every_parameter() -> None:
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.abs().max() > 0, name
-
-
-def test_order_of_the_images_matters(network: DeloraNetwork) -> None:
-    prev, curr = _images(1)
-    assert (motion(network, prev, curr) - motion(network, curr, prev)).abs().max() > 1e-5

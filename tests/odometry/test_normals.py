@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -120,18 +119,6 @@ def test_edges_are_left_out_where_the_neighbourhood_is_no_plane() -> None:
     assert (lenient > 0.0).float().mean() > 0.8
 
 
-def test_a_sphere_from_within_gives_its_radii() -> None:
-    # Off its centre, so that normals are not merely the rays reversed.
-    directions, centre, radius = rays(), torch.tensor([1.0, -0.5, 0.2], dtype=torch.float64)[:, None, None], 6.0
-    along = (directions * centre).sum(dim=0)
-    ranges = along + (along.square() - centre.square().sum() + radius**2).sqrt()
-    truth = (centre - directions * ranges) / radius
-    inner = surface_normals(image_of(directions, ranges), CONFIG)[:, :, 1:-1]
-    errors = errors_deg(inner, truth[:, 1:-1])
-    assert len(errors) == (ROWS - 2) * COLUMNS
-    assert errors.max() < 0.2
-
-
 @pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.03])
 def test_one_ring_has_no_normals(noise_m: float) -> None:
     directions = rays()
@@ -145,28 +132,6 @@ def test_one_ring_has_no_normals(noise_m: float) -> None:
         assert not surface_normals(image, CONFIG).any()
 
 
-@pytest.mark.parametrize("distance", [0.0, 0.05, 3.0, 80.0])
-def test_points_that_are_all_the_same_have_no_normals(distance: float) -> None:
-    point = distance * torch.tensor([0.48, 0.64, 0.6])
-    image = torch.cat([point, torch.tensor([distance])])[None, :, None, None].repeat(1, 1, 8, 32)
-    assert not surface_normals(image, CONFIG).any()
-    # and neither have they with the rounding of a transformation
-    image[:, :3] *= 1.0 + 1e-7 * torch.randn(1, 3, 8, 32, generator=torch.Generator().manual_seed(0))
-    assert not surface_normals(image, CONFIG).any()
-
-
-def test_walls_a_step_apart_do_not_mix() -> None:
-    directions, truth = rays(columns=720), torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
-    near, far = plane_ranges(directions, truth, 4.0), plane_ranges(directions, truth, 5.0)
-    ranges = torch.where(torch.arange(720) < 20, near, far)
-    ranges = torch.where(directions[0] > 0.5, ranges, math.inf)
-    gated = surface_normals(image_of(directions, ranges), FIRST_TRY)
-    assert (gated[0, :, :, 10:30].norm(dim=0) > 0.0).all()
-    assert errors_deg(gated, truth[:, None, None]).max() < 0.1
-    mixed = surface_normals(image_of(directions, ranges), [PATCHES[0]._replace(gate_m=5.0, max_flatness=1.0)])
-    assert errors_deg(mixed, truth[:, None, None]).max() > 10.0
-
-
 def test_sparse_rows_on_the_ground_get_a_normal_at_the_second_try() -> None:
     truth = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     image = image_of(rays(), plane_ranges(rays(), truth, 1.8))
@@ -176,35 +141,6 @@ def test_sparse_rows_on_the_ground_get_a_normal_at_the_second_try() -> None:
     assert not first[:, :, ring].any()
     assert both[:, :, ring].any(dim=1).all()
     assert errors_deg(both, truth[:, None, None]).max() < 0.1
-
-
-def test_normals_of_the_first_try_are_kept() -> None:
-    image = image_of(rays(), room(rays())[0], 0.01)
-    first, both = surface_normals(image, FIRST_TRY), surface_normals(image, CONFIG)
-    there = first.any(dim=1, keepdim=True)
-    assert torch.equal(both * there, first)
-    assert both.any(dim=1).sum() > there.sum()
-
-
-def test_the_second_try_has_its_own_gate_and_columns() -> None:
-    image = image_of(rays(), room(rays())[0], 0.01)
-    again = surface_normals(image, [*FIRST_TRY, *FIRST_TRY])
-    assert torch.equal(again, surface_normals(image, FIRST_TRY))
-
-
-@pytest.mark.parametrize("shift", [1, 4, 170])
-def test_neighbourhoods_go_on_across_the_seam(shift: int) -> None:
-    image = image_of(rays(), room(rays())[0], 0.01)
-    rolled = surface_normals(image.roll(shift, dims=3), CONFIG)
-    assert torch.equal(rolled, surface_normals(image, CONFIG).roll(shift, dims=3))
-
-
-def test_the_lowest_and_the_highest_row_are_no_neighbours() -> None:
-    # Two rows that would be a plane together, were the image to wrap from top to bottom.
-    image = image_of(rays(), torch.full((ROWS, COLUMNS), 5.0, dtype=torch.float64))
-    image[:, :, 1:-1] = 0.0
-    assert not surface_normals(image, CONFIG).any()
-    assert surface_normals(image.roll(1, dims=2), CONFIG)[:, :, :2].any()
 
 
 def test_empty_pixels_have_no_normals_and_too_few_neighbours_neither() -> None:
@@ -218,71 +154,6 @@ def test_empty_pixels_have_no_normals_and_too_few_neighbours_neither() -> None:
     )
     assert not normals[0, :, 1:-1].norm(dim=0)[counts[0] < FIRST_TRY[0].min_neighbours].any()
     assert normals.any()
-
-
-def test_empty_pixels_are_no_neighbours_of_points_within_the_gate_of_the_origin() -> None:
-    truth = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
-    image = image_of(rays(), plane_ranges(rays(), truth, 0.3))
-    image[:, :, torch.rand(ROWS, COLUMNS, generator=torch.Generator().manual_seed(0)) < 0.3] = 0.0
-    errors = errors_deg(surface_normals(image, CONFIG), truth[:, None, None])
-    assert len(errors) > 1000
-    assert errors.max() < 0.1
-
-
-@pytest.mark.parametrize("spread", ["near one another", "anywhere"])
-def test_normals_of_sparse_points_are_numbers(spread):
-    """One or two neighbours have a scatter that rounding may make less than nothing."""
-    g = torch.Generator().manual_seed(0)
-    azimuth = (torch.arange(180) + 0.5) * (2.0 * math.pi / 180.0)
-    elevation = torch.linspace(-0.3, 0.3, 16)[:, None].expand(16, 180)
-    rays = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
-    ranges = 0.5 + 0.01 * torch.randn(20, 1, 16, 180, generator=g)
-    if spread == "anywhere":
-        ranges = 10.0 ** (3.0 * torch.rand(20, 1, 16, 180, generator=g) - 1.0)
-    seen = torch.rand(20, 1, 16, 180, generator=g) < 0.15
-    normals = surface_normals(torch.cat([rays * ranges, ranges], dim=1) * seen, CONFIG)
-    assert normals.isfinite().all()
-    length = normals.norm(dim=1)
-    assert ((length < 1e-6) | ((length - 1.0).abs() < 1e-4)).all()
-
-
-def slow_normals(image: Tensor, config: Sequence[Patch]) -> np.ndarray:
-    """Normals (H, W, 3) of an image (4, H, W), pixel by pixel, with LAPACK's eigenvectors."""
-    values = image.double().numpy()
-    _, height, width = values.shape
-    found = np.zeros((height, width, 3))
-    for patch in config:
-        for i, j in np.argwhere(values[3] > 0.0):
-            if found[i, j].any():
-                continue
-            rows = np.arange(max(i - patch.rows, 0), min(i + patch.rows, height - 1) + 1)
-            columns = np.arange(j - patch.columns, j + patch.columns + 1) % width
-            around = values[:, rows][:, :, columns].reshape(4, -1).T
-            near = around[(around[:, 3] > 0.0) & (np.abs(around[:, 3] - values[3, i, j]) <= patch.gate_m), :3]
-            apart = np.sort(np.linalg.norm(near - values[:3, i, j], axis=1))
-            if len(near) < patch.min_neighbours or apart[1] > patch.nearest_m:
-                continue
-            spread, axes = np.linalg.eigh((near - near.mean(axis=0)).T @ (near - near.mean(axis=0)))
-            away = axes[:, 0] @ values[:3, i, j]
-            is_plane = spread[0] <= patch.max_flatness * spread[1] and spread[1] >= patch.min_spread * spread[2]
-            if is_plane and abs(away) >= 0.04 * values[3, i, j]:
-                found[i, j] = -np.sign(away) * axes[:, 0]
-    return found
-
-
-@pytest.mark.parametrize("config", [CONFIG, FIRST_TRY, FINE_PATCHES])
-@pytest.mark.parametrize("noise_m", [0.01, 0.03])
-def test_the_compiled_loops_find_what_lapack_finds(config: Sequence[Patch], noise_m: float) -> None:
-    """Where a neighbourhood is just a plane, rounding decides."""
-    image = image_of(rays(columns=180), room(rays(columns=180))[0], noise_m)
-    image[..., ::7, 20:60] = 0.0
-    found, expected = surface_normals(image, config)[0].double().movedim(0, -1).numpy(), slow_normals(image[0], config)
-    there, also = found.any(axis=-1), expected.any(axis=-1)
-    assert there.mean() > 0.3
-    assert (there != also).mean() < 2e-3
-    cosine = (found * expected).sum(axis=-1)[there & also]
-    assert (cosine < 1.0 - 1e-4).mean() < 1e-3
-    assert not found[image[0, 3].numpy() == 0.0].any()
 
 
 @pytest.mark.parametrize(("distance_m", "share"), [(1.0, 0.0), (8.0, 0.8)])

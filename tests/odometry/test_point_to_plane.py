@@ -140,10 +140,3 @@ def test_an_image_without_points_says_nothing(box_room):
     assert not H.any()
     assert not g.any()
     assert sums.fit(motion(1)).inliers == 0
-
-
-def test_a_motion_that_is_none_holds_nothing(box_room):
-    """NaN, as of equations without a solution, must not lead out of the image."""
-    sums = PointToPlane(noisy_pair(box_room, True), STEP)
-    H, _ = sums.normal_equations(PairMotion(np.full((4, 4), np.nan), np.zeros(6), np.zeros(6)), 0.5)
-    assert not H.any()

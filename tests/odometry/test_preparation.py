@@ -47,14 +47,6 @@ def test_sudden_turns_are_found_from_rest(box_room):
     assert errors(recording, fast)[1].max() < 0.003
 
 
-def test_intervals_are_from_middle_to_middle(box_room):
-    scans = box_room.scans(3, SLOW)
-    scans[1] = Scan(scans[1].points, scans[1].stamp + 0.1, scans[1].time_offsets - 0.1)  # the same, stamped at its end
-    recording = prepare(scans, CONFIG)
-    torch.testing.assert_close(recording.interval_s, torch.full((2,), 0.1), rtol=0, atol=1e-6)
-    assert errors(recording, SLOW)[0].max() < 0.15
-
-
 def test_scans_of_different_places_are_not_valid(box_room, corridor):
     scans = [*box_room.scans(2, SLOW), *corridor.scans(2, SLOW)]
     assert prepare(scans, CONFIG).valid.tolist() == [True, False, True]
@@ -70,12 +62,6 @@ def test_one_bad_scan_does_not_lose_those_after_it(box_room, kind):
     rotation_deg, translation_m = (error[recording.valid] for error in errors(recording, TURNING))
     assert rotation_deg.max() < 0.15
     assert translation_m.max() < 0.006
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_pairs_need_two_scans(box_room, count):
-    with pytest.raises(ValueError, match=f"this recording has {count}"):
-        prepare(box_room.scans(2, SLOW)[:count], CONFIG)
 
 
 def test_scans_at_one_time_do_not_move_infinitely_fast(box_room):

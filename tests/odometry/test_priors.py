@@ -48,13 +48,6 @@ def test_scans_outside_the_external_trajectory_are_said_to_be_uncovered() -> Non
     assert "does not cover" in failed.failure
 
 
-def test_a_gap_in_the_cover_is_made_up_by_the_next_covered_scan() -> None:
-    odometry = external(first=0.5)
-    assert odometry.estimate(scan_at(0.1)).failure is not None
-    assert odometry.estimate(scan_at(0.6)).failure is None
-    np.testing.assert_allclose(odometry.estimate(scan_at(0.7)).T_prev_curr, exp(0.1 * VELOCITY), atol=1e-9)
-
-
 def with_a_hole(step_s: float, hole_s: float, largest_interval_s: float | None = None) -> ExternalOdometry:
     """Ten poses up to second 0, ten from the end of the hole on."""
     before = step_s * np.arange(-9, 1)
@@ -74,31 +67,6 @@ def test_a_scan_in_a_hole_of_the_external_trajectory_is_not_covered(stamp: float
     caught_up = odometry.estimate(scan_at(1.45))
     assert caught_up.failure is None
     np.testing.assert_allclose(caught_up.T_prev_curr, exp(1.55 * VELOCITY), atol=1e-9)
-
-
-@pytest.mark.parametrize("stamp", [-0.0008, 0.0, 0.0008, 1.3992, 1.4, 1.4008])
-def test_a_scan_at_the_edge_of_a_hole_is_covered(stamp: float) -> None:
-    odometry = with_a_hole(step_s=0.1, hole_s=1.4)
-    odometry.estimate(scan_at(-0.1))
-    motion = odometry.estimate(scan_at(stamp))
-    assert motion.failure is None
-    np.testing.assert_allclose(motion.T_prev_curr, exp((stamp + 0.1) * VELOCITY), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("step_s", "hole_s", "largest_interval_s", "covered"),
-    [
-        (0.1, 0.99, None, True),
-        (0.1, 1.01, None, False),
-        (0.5, 2.4, None, True),
-        (0.5, 2.6, None, False),
-        (0.1, 0.3, 0.2, False),
-        (0.1, 1.4, 2.0, True),
-    ],
-)
-def test_how_long_a_hole_may_be(step_s: float, hole_s: float, largest_interval_s: float | None, covered: bool) -> None:
-    motion = with_a_hole(step_s, hole_s, largest_interval_s).estimate(scan_at(0.5 * hole_s))
-    assert (motion.failure is None) is covered
 
 
 @pytest.mark.parametrize("poses", [0, 1])

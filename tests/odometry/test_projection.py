@@ -76,19 +76,6 @@ def test_a_point_is_in_the_pixel_of_its_angles() -> None:
     assert pixel_of(points) == [(0, 0), (15, 1), (7, 22), (8, 89)]
 
 
-def test_the_nearest_point_is_kept() -> None:
-    points = torch.cat([one(2.0, 1.0, 7.0), one(2.1, 1.1, 3.0), one(2.2, 1.2, 3.001)])
-    result = project(points, GRID)
-    assert result.index[0, 8, 0] == 1
-    assert (result.index >= 0).sum() == 1
-    torch.testing.assert_close(result.images[0, :3, 8, 0], points[1].float())
-    assert result.images[0, 3, 8, 0] == pytest.approx(3.0, rel=1e-6)
-
-
-def test_of_equally_near_points_the_first_is_kept() -> None:
-    assert project(one(2.0, 1.0, 7.0).repeat(5, 1), GRID).index.max() == 0
-
-
 def test_every_pixel_holds_the_nearest_of_a_dense_cloud() -> None:
     points = random_cloud(20_000)
     row, column = place(points, GRID)
@@ -115,12 +102,6 @@ def test_images_and_index_agree() -> None:
     assert result.index.dtype == torch.int64
 
 
-def test_the_order_of_points_does_not_matter() -> None:
-    points = random_cloud(5000)
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))
-    assert torch.equal(project(points, GRID).images, project(points[order], GRID).images)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("shift", [1, 30, -7])
 def test_a_turn_by_columns_rolls_the_image(shift: int, dtype: torch.dtype) -> None:
@@ -129,14 +110,6 @@ def test_a_turn_by_columns_rolls_the_image(shift: int, dtype: torch.dtype) -> No
     after = project(turned(points, shift * 2.0 * math.pi / GRID.columns).to(dtype), GRID)
     assert torch.equal(after.index, before.index.roll(shift, dims=2))
     torch.testing.assert_close(rotate_columns(before.images, torch.tensor([shift])), after.images, rtol=1e-5, atol=2e-5)
-
-
-def test_the_image_has_no_seam() -> None:
-    tiny = 1e-4
-    points = torch.cat(
-        [one(tiny, 0.5, 9.0), one(-tiny, 0.5, 9.0), one(180 - tiny, 0.5, 9.0), one(180 + tiny, 0.5, 9.0)]
-    )
-    assert pixel_of(points) == [(8, 0), (8, 89), (8, 44), (8, 45)]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -151,12 +124,6 @@ def test_columns_are_inside_the_image_however_close_to_the_seam(dtype: torch.dty
             assert column == 0 or number >= 2
 
 
-def test_points_above_and_below_are_left_out() -> None:
-    elevations = torch.tensor([-16.01, -15.99, 15.99, 16.01, 90.0, -90.0])
-    points = polar(torch.full((6,), 2.0), elevations, torch.full((6,), 5.0))
-    assert pixel_of(points) == [(0, 0), (15, 0)]
-
-
 def test_invalid_points_are_left_out() -> None:
     nan, inf = math.nan, math.inf
     bad = torch.tensor([[0.0, 0.0, 0.0], [nan, 1.0, 0.0], [1.0, nan, 0.0], [1.0, 0.0, nan], [inf, 0.0, 0.0]])
@@ -165,17 +132,6 @@ def test_invalid_points_are_left_out() -> None:
     result = project(torch.cat([bad, torch.tensor([[4.0, 0.1, 0.0]])]), GRID)
     assert result.index[result.index >= 0].tolist() == [len(bad)]
     assert result.images.isfinite().all()
-
-
-@pytest.mark.parametrize("point", [[4.0, 0.0, 0.5], [0.0, 4.0, 0.5], [4.0, 1.0, 0.0], [-4.0, 0.0, 0.0]])
-def test_a_point_with_a_coordinate_of_zero_stays(point: list[float]) -> None:
-    assert len(pixel_of(torch.tensor([point]))) == 1
-
-
-def test_no_points_give_empty_images() -> None:
-    result = project(torch.empty(0, 3), GRID)
-    assert torch.equal(result.images, torch.zeros(1, 4, 16, 90))
-    assert torch.equal(result.index, torch.full((1, 16, 90), -1))
 
 
 def test_a_grid_around_a_scan_puts_its_rings_in_rows() -> None:
@@ -190,56 +146,9 @@ def test_a_grid_around_a_scan_puts_its_rings_in_rows() -> None:
     np.testing.assert_allclose(row, rings, atol=1e-9)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 50])
-def test_a_grid_around_few_points_holds_them(count: int) -> None:
-    # A single ring with noise, which must not be spread over many rows.
-    elevation = 3.0 + 1e-3 * torch.randn(count, generator=torch.Generator().manual_seed(0))
-    points = polar(7.0 * torch.arange(count) + 2.0, elevation, torch.full((count,), 5.0))
-    grid = ImageGrid.around(points.numpy(), 8, 90)
-    assert math.degrees(grid.elevation_high - grid.elevation_low) >= 1.0 - 1e-9
-    result = project(points, grid)
-    assert (result.index[0, 0] >= 0).sum() == min(count, 50)
-    assert (result.index[0, 1:] == -1).all()
-
-
-def test_grids_without_pixels_or_height_are_refused() -> None:
-    with pytest.raises(ValueError, match="pixels"):
-        ImageGrid(0, 90, -0.1, 0.1)
-    with pytest.raises(ValueError, match="ascend"):
-        ImageGrid(16, 90, 0.1, 0.1)
-
-
-def test_each_image_is_rotated_by_its_own_shift() -> None:
-    shifts = [0, 1, -3, 200]
-    clouds = [random_cloud(400, seed) for seed in range(4)]
-    before = torch.cat([project(cloud, GRID).images for cloud in clouds])
-    step = 2.0 * math.pi / GRID.columns
-    after = [project(turned(cloud, s * step), GRID).images for cloud, s in zip(clouds, shifts, strict=True)]
-    rotated = rotate_columns(before, torch.tensor(shifts))
-    torch.testing.assert_close(rotated, torch.cat(after), rtol=1e-5, atol=2e-5)
-    assert torch.equal(rotated[0], before[0])
-
-
-def test_rotation_takes_images_of_normals_too() -> None:
-    normals = torch.randn(2, 3, 4, 12, generator=torch.Generator().manual_seed(0))
-    quarter = rotate_columns(normals, torch.tensor([3, 3]))
-    moved = normals.roll(3, dims=3)
-    expected = torch.stack([-moved[:, 1], moved[:, 0], moved[:, 2]], dim=1)
-    torch.testing.assert_close(quarter, expected, rtol=0.0, atol=1e-6)
-
-
 def test_mirrored_images_are_of_mirrored_clouds() -> None:
     points = random_cloud(3000)
     mirrored = project(points * torch.tensor([1.0, -1.0, 1.0]), GRID)
     before = project(points, GRID)
     assert torch.equal(mirrored.index, before.index.flip(2))
     assert torch.equal(mirror(before.images), mirrored.images)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_two_images_made_in_one_go_are_those_made_one_by_one(dtype: torch.dtype) -> None:
-    points, fine = random_cloud(5000).to(dtype).numpy(), ImageGrid(40, 90, GRID.elevation_low, GRID.elevation_high)
-    for found, grid in zip(projection.project(points, [GRID, fine]), (GRID, fine), strict=True):
-        (alone,) = projection.project(points, [grid])
-        assert np.array_equal(found.index, alone.index)
-        assert np.array_equal(found.image, alone.image)

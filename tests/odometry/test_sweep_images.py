@@ -47,31 +47,6 @@ def test_offsets_are_from_the_middle_of_the_sweep_wherever_the_stamp_is(box_room
     np.testing.assert_allclose(images_of(stamped).offsets, box_room.sweeps(1, TWIST)[0].offsets, atol=1e-7)
 
 
-def test_the_middle_of_a_sweep_is_between_its_ends_however_its_points_are_spread():
-    scan = Scan(np.ones((4, 3)), 5.0, np.array([0.02, 0.09, 0.0, 0.01]))
-    assert scan.middle_offset_s == pytest.approx(0.045)
-
-
-def test_scans_without_times_have_no_offsets(box_room):
-    scan = box_room.scans(1, TWIST)[0]
-    untimed = Scan(scan.points, scan.stamp)
-    assert untimed.middle_offset_s == 0.0
-    images = images_of(untimed)
-    assert not images.offsets.any()
-    assert np.array_equal(images.points, box_room.sweeps(1, TWIST)[0].points)
-
-
-def test_an_empty_scan_is_an_empty_image():
-    assert EMPTY.middle_offset_s == 0.0
-    images = images_of(EMPTY)
-    assert images.points.shape == (3, 16, 360)
-    assert images.offsets.shape == (16, 360)
-    assert not images.points.any()
-    assert not images.normals.any()
-    assert not images.offsets.any()
-    assert images.low < images.high
-
-
 def test_the_rows_are_those_of_the_first_scan_that_has_points(box_room):
     full = box_room.scans(1, TWIST)[0]
     level = np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.1]])
@@ -95,24 +70,6 @@ def test_a_scan_of_few_points_does_not_fix_the_rows(box_room):
     assert 3.0 < low[1] == low[2] < 10.0
     np.testing.assert_allclose(low[3:], -18.0, atol=1e-4)
     np.testing.assert_allclose(high[3:], 18.0, atol=1e-4)
-
-
-def test_an_imager_begins_anew(box_room):
-    """Two sensors' imagers do not share their rows."""
-    images_of(box_room.scans(1, TWIST)[0])
-    narrow = images_of(Scan(np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 1.0]]), 0.0))
-    assert np.rad2deg(narrow.high) == pytest.approx(math.degrees(math.atan(0.1)), abs=1e-4)
-
-
-def rows_for(scan: Scan) -> int:
-    return Imager(CONFIG).images(scan).alignment.points.shape[1]
-
-
-@pytest.mark.parametrize("with_rings", [True, False])
-@pytest.mark.parametrize(("rings", "rows"), [(16, 16), (32, 32), (64, 64), (128, 64)])
-def test_alignment_sees_as_many_rows_as_there_are_rings(box_room, rings, rows, with_rings):
-    (scan,) = replace(box_room, rows=rings, columns=720).scans(1, TWIST)
-    assert rows_for(scan if with_rings else replace(scan, rings=None)) == rows
 
 
 @pytest.mark.parametrize("azimuth_deg", [360.0, 70.0])

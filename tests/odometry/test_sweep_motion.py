@@ -54,29 +54,10 @@ def test_motions_are_those_between_stamps_wherever_these_are(way, change, at):
         np.testing.assert_allclose(motion, between(way, stamps[number], stamps[number + 1]), atol=1e-12)
 
 
-def test_stamps_in_the_middle_leave_the_motion_as_it_is():
-    middles = np.array([0.0, 0.1, 0.2])
-    for number, motion in enumerate(retimed(growing, middles, middles, change=0.7)):
-        np.testing.assert_allclose(motion, between(growing, middles[number], middles[number + 1]), atol=1e-12)
-
-
 def test_stamps_that_come_unevenly_are_met():
     middles, stamps = np.array([0.0, 0.1, 0.2, 0.3]), np.array([-0.05, 0.06, 0.14, 0.25])
     for number, motion in enumerate(retimed(even, middles, stamps)):
         np.testing.assert_allclose(motion, between(even, stamps[number], stamps[number + 1]), atol=1e-12)
-
-
-def test_after_forgetting_it_begins_anew():
-    """The first motion after a gap goes on evenly backwards to the stamp before."""
-    interpolator = StampInterpolator()
-    interpolator.between_stamps(between(even, 0.0, 0.1), np.zeros(6), (0.0, 0.1), (-0.05, 0.05))
-    assert interpolator.last is not None
-    np.testing.assert_allclose(interpolator.last.velocity, 0.7 * AXIS, atol=1e-12)
-    interpolator.forget()
-    assert interpolator.last is None
-    T = exp(np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0]))  # another way altogether
-    motion = interpolator.between_stamps(T, np.zeros(6), (0.2, 0.3), (0.15, 0.25))
-    np.testing.assert_allclose(motion, T, atol=1e-12)
 
 
 def test_the_way_is_along_the_middles_in_the_end():

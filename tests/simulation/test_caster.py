@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarslam.simulation.caster import Caster, meet_boxes
-from lidarslam.simulation.mesh import box_mesh
+from lidarslam.simulation.mesh import Caster, box_mesh, meet_boxes
 from lidarslam.simulation.world import Boxes, Mover, Route, World
 
 ROUTE = Route(np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0]]), 1.0, 1.0, 3.0, 1.0)

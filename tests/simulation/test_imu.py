@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.imu import EXACT_IMU, GRAVITY, MEMS_IMU, InertialErrors, bias_paths, sample_imu
+from lidarslam.simulation.imu import EXACT_IMU, GRAVITY, MEMS_IMU, InertialErrors, bias_paths
 from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
@@ -98,9 +98,3 @@ def test_biases_walk_as_a_random_walk():
     np.testing.assert_allclose(walked.std(), 1e-3 * np.sqrt(10.0), rtol=0.1)
     assert (ends[:, -1, 3:] == ends[:, 0, 3:]).all()
     np.testing.assert_allclose(ends[:, 0, 3:].std(), 0.1, rtol=0.1)
-
-
-def test_samples_lie_on_the_grid_of_the_rate():
-    still = lambda times: np.tile(np.eye(4), (len(times), 1, 1))  # noqa: E731
-    stamps = sample_imu(MEMS_IMU, still, 0.3, 0.4, 0).stamps
-    np.testing.assert_allclose(stamps, 0.3 + 0.005 * np.arange(21), atol=1e-12)

@@ -67,12 +67,6 @@ def test_boxes_are_closed_and_of_their_size(boxes):
     np.testing.assert_allclose(areas(mesh).reshape(-1, 12).sum(axis=1), 2.0 * (a * b + b * c + c * a))
 
 
-def test_box_corners_lie_where_the_box_is(boxes):
-    corners = box_mesh(boxes).vertices.reshape(len(boxes), 8, 3) - boxes.centres[:, None]
-    inside_out = np.abs(corners @ boxes.R_world_box)
-    np.testing.assert_allclose(inside_out, np.broadcast_to(boxes.half_sizes[:, None], inside_out.shape))
-
-
 def test_cylinders_are_closed_and_hold_as_much_as_round_ones(cylinders):
     mesh = cylinder_mesh(cylinders)
     per_solid = 4 * CYLINDER_SIDES
@@ -107,8 +101,3 @@ def test_world_mesh_holds_everything_that_stands(boxes, cylinders, field):
     corners = np.concatenate([part.vertices[part.triangles] for part in parts])
     np.testing.assert_array_equal(mesh.vertices[mesh.triangles], corners)
     assert mesh.triangles.dtype == np.int32
-
-
-def test_nothing_gives_no_triangle():
-    empty = world_mesh(World("empty", 0, Route(np.eye(3), 1.0, 1.0, 2.0, 1.0)))
-    assert empty.vertices.shape == empty.triangles.shape == (0, 3)

@@ -8,14 +8,9 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, is_rigid, make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion import CARRIERS, Sway, motion_along, rotations
+from lidarslam.simulation.motion import CARRIERS, Sway, motion_along
 from lidarslam.simulation.route_motion import (
-    TIME_STEP_S,
-    RoundedPath,
-    corner_windows,
     motion_along_route,
-    rest_to_rest,
-    straightened,
 )
 from lidarslam.simulation.world import Route, World
 
@@ -93,15 +88,6 @@ def test_follows_the_ground(motion, poses, yard):
         assert np.abs(above).max() < 0.08
 
 
-def test_wheels_lean_with_the_ground(yard):
-    motion = motion_along_route("tracked", yard, seed=4)
-    T = motion.pose_at(np.arange(0.0, motion.duration_s, 0.1))
-    ahead = T[:, :3, 3] + 0.3 * T[:, :3, 0]
-    left = T[:, :3, 3] + 0.3 * T[:, :3, 1]
-    assert np.abs(ahead[:, 2] - yard.ground_at(ahead[:, :2])).max() < 0.03
-    assert np.abs(left[:, 2] - yard.ground_at(left[:, :2])).max() < 0.03
-
-
 @pytest.mark.parametrize(("name", "rate"), [("tracked", 120.0), ("tracked-harsh", 180.0)])
 def test_tracked_turns_on_the_spot(name, rate, yard):
     motion = motion_along_route(name, yard, seed=4)
@@ -114,30 +100,6 @@ def test_tracked_turns_on_the_spot(name, rate, yard):
     assert np.abs(turning[speed > 0.05]).max() < 10.0
     if name == "tracked-harsh":
         np.testing.assert_allclose([turning.min(), turning.max()], [-rate, rate], rtol=0.005)
-
-
-def test_legged_sways_with_its_gait(yard):
-    motion = motion_along_route("legged", yard, seed=4)
-    times = np.arange(10.0, 18.0, 0.01)
-    height = motion.pose_at(times)[:, 2, 3]
-    spectrum = np.abs(np.fft.rfft((height - np.poly1d(np.polyfit(times, height, 5))(times)) * np.hanning(len(times))))
-    assert 1.5 < np.fft.rfftfreq(len(times), 0.01)[spectrum.argmax()] < 2.5
-
-
-def test_an_agile_drone_banks_to_twenty_degrees_with_its_acceleration(yard):
-    motion = replace(motion_along_route("drone-agile", yard, seed=4), sway=Sway())
-    times = np.arange(0.0, motion.duration_s, STEP_S)
-    T = motion.pose_at(times)
-    acceleration = np.gradient(np.gradient(T[:, :2, 3], STEP_S, axis=0), STEP_S, axis=0)
-    up = T[:, :3, 2]
-    pitch, roll = np.rad2deg(-np.arcsin(T[:, 2, 0])), np.rad2deg(np.arctan2(T[:, 2, 1], T[:, 2, 2]))
-    for angle in (pitch, roll):
-        assert 15.0 < np.abs(angle).max() < 20.5
-    # Thrust along the body's z axis, smoothed in time, carries the acceleration.
-    leaning = np.linalg.norm(acceleration, axis=1) > 2.0
-    assert leaning.mean() > 0.1
-    assert np.corrcoef(up[leaning, 0] / up[leaning, 2], acceleration[leaning, 0])[0, 1] > 0.95
-    assert np.corrcoef(up[leaning, 1] / up[leaning, 2], acceleration[leaning, 1])[0, 1] > 0.95
 
 
 def test_what_keeps_going_never_halts(yard):
@@ -166,13 +128,6 @@ def test_a_speed_can_be_asked_for(speed_mps):
     assert limited.duration_s == pytest.approx(2.0 * np.pi * 400.0 / 14.0, rel=0.01)
 
 
-def test_what_keeps_going_is_not_sent_into_a_dead_end():
-    there = np.column_stack([np.linspace(0.0, 50.0, 11), np.zeros((11, 2))])
-    world = World("lane", 0, Route(np.concatenate([there, there[-2:0:-1]]), 2.0, 2.0, 4.0, 14.0))
-    with pytest.raises(InputError, match="car-fast does not stop, and the route of lane has a corner"):
-        motion_along_route("car-fast", world, seed=0)
-
-
 def test_a_given_trajectory_is_followed_on_the_ground(yard):
     stamps = 100.0 + 0.1 * np.arange(80)
     steps = exp(np.tile([0.0, 0.0, 0.01, 0.4, 0.0, 0.0], (80, 1)))
@@ -191,25 +146,6 @@ def test_a_given_trajectory_is_followed_on_the_ground(yard):
     assert flown.sensor_height_m == 0.0
 
 
-def test_a_given_trajectory_is_smoothed(yard, rng):
-    """Noise of 2 cm at 10 Hz would be accelerations of metres a second squared; the path itself stays."""
-    times = 0.1 * np.arange(300)
-    path = np.stack([-20.0 + 1.3 * times, 3.0 * np.sin(0.3 * times), np.zeros(300)], axis=-1)
-    noisy = path + rng.normal(scale=[0.02, 0.02, 0.0], size=path.shape)
-    yaw = np.arctan2(0.9 * np.cos(0.3 * times), 1.3)
-    trajectory = Trajectory(times, make_transform(rotations(np.zeros(300), np.zeros(300), yaw), noisy))
-    fine = np.arange(0.0, 29.9, 0.01)
-
-    def acceleration(smoothing_s):
-        xy = motion_along(trajectory, yard, smoothing_s=smoothing_s).pose_at(fine)[:, :2, 3]
-        return np.linalg.norm(np.gradient(np.gradient(xy, 0.01, axis=0), 0.01, axis=0), axis=1)[50:-50].max()
-
-    assert acceleration(0.0) > 5.0
-    assert acceleration(0.25) < 1.5
-    smooth = motion_along(trajectory, yard, smoothing_s=0.25).pose_at(times)[:, :2, 3]
-    assert np.linalg.norm(smooth - path[:, :2], axis=1).max() < 0.05
-
-
 def test_a_trajectory_of_a_camera_is_refused(yard):
     poses = make_transform(np.eye(3), np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 1.0]]))
     with pytest.raises(InputError, match="camera"):
@@ -219,40 +155,3 @@ def test_a_trajectory_of_a_camera_is_refused(yard):
     upwards = exp(np.array([[0.0, -1.5, 0.0, 0.0, 0.0, 0.0]] * 2))
     with pytest.raises(InputError, match="80 degrees"):
         motion_along(Trajectory(np.array([0.0, 1.0]), upwards), yard, on_ground=False)
-
-
-def test_rounded_path_matches_its_derivatives():
-    vertices = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 1.0], [10.0, 8.0, 1.0], [4.0, 12.0, 0.0]])
-    path = RoundedPath(vertices, corner_windows(vertices, corner_m=4.0, cut_m=0.5))
-    u = np.linspace(0.0, path.lengths[-1], 20_001)
-    points, first, second = path.at(u)
-    np.testing.assert_allclose(points[[0, -1]], vertices[[0, -1]], atol=1e-9)
-    np.testing.assert_allclose(np.gradient(points, u, axis=0)[1:-1], first[1:-1], atol=1e-4)
-    np.testing.assert_allclose(np.gradient(first, u, axis=0)[1:-1], second[1:-1], atol=2e-3)
-    corner = np.linalg.norm(points[:, :2] - [10.0, 0.0], axis=1).min()
-    np.testing.assert_allclose(corner, 0.5, atol=1e-3)  # the window is chosen to cut exactly that much
-
-
-def test_straightening_keeps_the_corners():
-    square = np.array([[0, 0, 0], [5, 0.1, 0], [10, 0, 0], [10, 10, 0], [4, 9.95, 0], [0, 10, 0]], dtype=float)
-    np.testing.assert_array_equal(straightened(square, 0.2), square[[0, 2, 3, 5]])
-    np.testing.assert_array_equal(straightened(square, 0.01), square)
-
-
-def test_speed_profile_keeps_its_limits():
-    positions = np.linspace(0.0, 50.0, 1001)
-    limits = np.where(np.abs(positions - 30.0) < 3.0, 1.0, 6.0)
-    travelled = rest_to_rest(positions, limits, acceleration=2.0, smoothing_s=0.3)
-    speeds = np.gradient(travelled, TIME_STEP_S)
-    assert travelled[0] == 0.0
-    np.testing.assert_allclose(travelled[-1], 50.0)
-    assert speeds[[0, -1]].max() < 1e-3
-    assert speeds.max() < 6.0 + 1e-9
-    assert np.abs(np.gradient(speeds, TIME_STEP_S)).max() < 2.0 + 1e-6
-    assert speeds[np.abs(travelled - 30.0) < 2.0].max() < 1.01
-
-
-def test_rotations_are_in_the_order_yaw_pitch_roll():
-    R = rotations(np.array([0.1]), np.array([0.2]), np.array([0.3]))[0]
-    turns = [exp([0, 0, 0.3, 0, 0, 0]), exp([0, 0.2, 0, 0, 0, 0]), exp([0.1, 0, 0, 0, 0, 0])]
-    np.testing.assert_allclose(R, (turns[0] @ turns[1] @ turns[2])[:3, :3], atol=1e-12)

@@ -2,20 +2,16 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.caster import Caster
-from lidarslam.simulation.motion import Sway, mount_pose
-from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.mesh import Caster
+from lidarslam.simulation.motion import Sway
 from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import World, build_world
-from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, SPEED_MPS, STANDING
-from lidarslam.simulation.worlds.paths import subdivide_loop
+from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, STANDING
 
 SEEDS = (0, 1, 2)
 RISE_M, TREAD_M = 0.17, 0.28
@@ -75,33 +71,6 @@ def test_a_corridor_opens_into_a_yard_and_recordings_begin_deep_in_it(seed: int)
 
 
 @each_seed
-def test_nothing_stands_on_the_way_through_the_corridor(seed: int) -> None:
-    world = world_of("corridor", seed)
-    points = subdivide_loop(world.route.waypoints, 0.1)
-    for height in np.linspace(0.2, world.route.free_height_m - 0.1, 6):
-        for angle in np.linspace(0.0, 2.0 * np.pi, 17)[:-1]:
-            level = np.array([np.cos(angle), np.sin(angle), 0.0])
-            assert cast("corridor", seed, points + height * UP, level).min() > world.route.free_side_m
-    assert (cast("corridor", seed, points + 0.2 * UP, UP) > world.route.free_height_m - 0.2).all()
-
-
-@each_seed
-def test_all_steps_of_the_stairs_are_equal(seed: int) -> None:
-    """Treads found by rays from above the way up, flight by flight."""
-    waypoints = world_of("stairs", seed).route.waypoints
-    climbs = [(a, b) for a, b in pairwise(waypoints) if b[2] > a[2] + 0.1]
-    assert len(climbs) in (8, 10, 12)
-    for foot, head in climbs:
-        steps = round((head[2] - foot[2]) / RISE_M)
-        middles = foot + (np.arange(steps + 1) / steps)[:, None] * (head - foot)
-        np.testing.assert_allclose(np.abs(middles[-1] - middles[0])[0], steps * TREAD_M)
-        middles[-1] -= 0.1 * TREAD_M * (head - foot) / np.linalg.norm(head - foot)
-        # The mean line crosses every tread in its middle.
-        treads = middles[:, 2] + 1.0 - cast("stairs", seed, middles + UP, DOWN)
-        np.testing.assert_allclose(treads - foot[2], RISE_M * np.arange(steps + 1), atol=2e-3)
-
-
-@each_seed
 def test_a_carrier_climbs_the_stairs_smoothly_and_comes_down_again(seed: int) -> None:
     world = world_of("stairs", seed)
     motion = replace(motion_along_route("handheld", world, seed), sway=Sway())
@@ -134,35 +103,3 @@ def test_a_crowd_is_around_the_start_and_half_of_it_goes_along(seed: int) -> Non
     assert np.ptp(beside, axis=1).max() < 1.0
     assert beside.max() < 8.5
     assert apart[:, times > 1.0].min() > world.route.free_side_m
-
-
-@each_seed
-def test_people_are_displaced_by_their_speed_times_the_time(seed: int) -> None:
-    movers = world_of("crowd", seed).movers
-    times = np.linspace(0.0, 30.0, 3001)
-    for number, mover in enumerate(movers):
-        steps = np.linalg.norm(np.diff(mover.pose_at(times)[:, :3, 3], axis=0), axis=1)
-        expected = SPEED_MPS if number < COMPANIONS else mover.speed_mps
-        np.testing.assert_allclose(np.median(steps), 0.01 * expected, atol=1e-9)
-        assert (steps.sum() == 0.0) == (COMPANIONS <= number < COMPANIONS + STANDING)
-        top = (mover.boxes.centres + mover.boxes.half_sizes)[:, 2].max()
-        assert 1.5 < top < 1.9
-
-
-def test_many_rays_of_a_crowds_first_scan_end_at_people() -> None:
-    world = world_of("crowd", 0)
-    motion = motion_along_route("handheld", world, 0)
-    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
-    sweep = Simulation(world, find_sensor("vlp-16"), motion, T_body_lidar, 2).scan(0)
-    assert sweep.moving is not None
-    assert 0.1 < sweep.moving.mean() < 0.7
-
-
-@pytest.mark.parametrize("name", ["mid-360", "avia"])
-def test_points_of_sensors_without_rings_carry_none(name: str) -> None:
-    world = world_of("crowd", 0)
-    motion = motion_along_route("legged", world, 0)
-    scan = Simulation(world, find_sensor(name), motion, mount_pose("upright", 0.75), 1).scan(0).scan
-    assert scan.rings is None
-    assert scan.time_offsets is not None
-    assert len(scan) > 10_000

@@ -6,7 +6,6 @@ import pytest
 from lidarslam.simulation.world import Route
 from lidarslam.simulation.worlds import paths
 from lidarslam.simulation.worlds.building import Builder
-from lidarslam.simulation.worlds.street import StreetNetwork
 
 RECTANGLE = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 10.0], [0.0, 10.0]])
 
@@ -30,11 +29,6 @@ def test_rounded_corners_are_arcs_of_their_radii():
     assert paths.loop_length(points) == pytest.approx(60.0 - (2.0 - 0.5 * np.pi) * radii.sum(), abs=0.01)
     near = points[(points[:, 0] > 17.0) & (points[:, 1] > 7.0)]
     np.testing.assert_allclose(np.linalg.norm(near - [17.0, 7.0], axis=1), 3.0)
-
-
-def test_left_and_right_turns_are_told_apart():
-    assert paths.turns_left(RECTANGLE).all()
-    assert not paths.turns_left(RECTANGLE[::-1]).any()
 
 
 def test_subdividing_keeps_the_corners_and_the_line():
@@ -70,18 +64,3 @@ def test_pruning_cuts_what_hangs_into_the_way_and_nothing_else():
     np.testing.assert_allclose(kept.boxes.centres[:, 1:], [[0.5, 4.0], [3.0, 1.0]])
     np.testing.assert_allclose(kept.cylinders.starts[:, 2], [3.0])
     assert len(paths.prune(Builder(), route).boxes) == 0
-
-
-def test_kerbs_run_where_the_road_ends():
-    nodes = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [-40.0, 0.0]])
-    network = StreetNetwork(nodes, ((0, 1), (0, 2), (0, 3)), 6.0, 4.0)
-    at = np.array(
-        [[20.0, 0.0], [20.0, 6.0], [20.0, 9.0], [10.0, 6.0], [6.8, 6.8], [8.0, 8.0], [0.0, -7.0], [43.0, 0.0]]
-    )
-    corner = 4.0 - np.hypot(3.2, 3.2), 4.0 - np.hypot(2.0, 2.0)
-    np.testing.assert_allclose(network.kerb_distance(at), [-6.0, 0.0, 3.0, 0.0, *corner, 1.0, -3.0], atol=1e-12)
-    stones = np.array(list(network.kerb_stones()))
-    np.testing.assert_allclose(network.kerb_distance(stones.mean(axis=1)), 0.35, atol=0.06)
-    straight, dead_ends, fillets = 80.0 + 4.0 * 30.0, 3.0 * np.pi * 6.35, np.pi * 3.65
-    length = np.linalg.norm(stones[:, 1] - stones[:, 0], axis=1).sum()
-    assert length == pytest.approx(straight + dead_ends + fillets, rel=0.01)

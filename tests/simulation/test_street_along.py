@@ -6,10 +6,9 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.caster import Caster
-from lidarslam.simulation.mesh import box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.mesh import Caster, box_mesh, cylinder_mesh, merge
 from lidarslam.simulation.motion import find_carrier, motion_along, rotations
-from lidarslam.simulation.record import check_clearance, given_path, is_inside, read_trajectory
+from lidarslam.simulation.record import check_clearance, given_path, read_trajectory
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.worlds.along import FREE_SIDE_M, build_along
@@ -55,12 +54,6 @@ def test_both_sides_are_built_up(eight):
     assert eight.movers
 
 
-def test_the_second_round_adds_nothing(eight):
-    twice = build_along(figure_of_eight(rounds=2), 3)
-    assert len(twice.boxes) < 1.3 * len(eight.boxes)
-    assert distances(twice, figure_of_eight(), 1.0).min() > FREE_SIDE_M - 0.02
-
-
 def test_the_ground_follows_given_heights():
     path = figure_of_eight()
     path = np.column_stack([path, 5.0 + 0.05 * path[:, 0]])
@@ -88,19 +81,6 @@ def test_a_way_through_a_house_is_refused_with_its_place(eight):
     straight = np.column_stack([np.linspace(0.0, 60.0, 120), np.zeros(120)])
     with pytest.raises(InputError, match=r"a\.tum: leads through something solid in street, seed 3, at x .* --world"):
         check_clearance(along(eight, straight), find_carrier("car"), "a.tum")
-
-
-def test_a_start_inside_something_is_refused(yard):
-    assert is_inside(yard, np.array([0.0, 0.0, 1.0]))
-    assert is_inside(yard, np.array([18.0, 4.05, 1.0]))
-    assert is_inside(yard, np.array([10.0, 10.0, -5.0]))
-    assert not is_inside(yard, np.array([10.0, 10.0, 3.0]))
-
-
-def test_a_way_off_the_ground_is_refused(yard):
-    beyond = np.column_stack([np.linspace(50.0, 60.0, 50), np.zeros(50)])
-    with pytest.raises(InputError, match="leads off the ground in yard"):
-        check_clearance(along(yard, beyond, "drone"), find_carrier("drone"), "a.tum")
 
 
 @pytest.mark.real_data

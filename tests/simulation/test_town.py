@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.mesh import Caster
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds import town

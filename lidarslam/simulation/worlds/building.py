@@ -94,16 +94,12 @@ class Builder:
     @property
     def boxes(self) -> Boxes:
         """All boxes so far."""
-        if not self._boxes:
-            return Boxes.empty()
-        return Boxes(*(np.stack(parts) for parts in zip(*self._boxes, strict=True)))
+        return Boxes(*map(np.stack, zip(*self._boxes, strict=True)))
 
     @property
     def cylinders(self) -> Cylinders:
         """All cylinders so far."""
-        if not self._cylinders:
-            return Cylinders.empty()
-        return Cylinders(*(np.stack(parts) for parts in zip(*self._cylinders, strict=True)))
+        return Cylinders(*map(np.stack, zip(*self._cylinders, strict=True)))
 
     @property
     def solids(self) -> tuple[Boxes, Cylinders]:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
@@ -53,10 +52,12 @@ def offset_loop(corners: FloatArray, right_m: float) -> FloatArray:
     return np.asarray(corners + right_m * mitre)
 
 
-def turns_left(corners: FloatArray) -> NDArray[np.bool_]:
-    """(M,) whether the closed polyline (M, 2) turns to the left at each corner."""
-    into, out = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
-    return np.asarray(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0] > 0.0)
+def turning_angles(vertices: FloatArray) -> FloatArray:
+    """(M,) change of heading at each vertex (M, >=2) of a closed polyline, in [-pi, pi]; counter-clockwise positive."""
+    xy = vertices[:, :2]
+    arriving, leaving = xy - np.roll(xy, 1, axis=0), np.roll(xy, -1, axis=0) - xy
+    cross = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
+    return np.asarray(np.arctan2(cross, (arriving * leaving).sum(axis=1)))
 
 
 def round_corners(corners: FloatArray, radii: FloatArray, step_m: float) -> FloatArray:

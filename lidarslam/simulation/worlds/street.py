@@ -315,7 +315,7 @@ def build(seed: int) -> World:
 def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
     """The middle (N, 2) of the right lane along a tour (M, 2)."""
     corners = paths.offset_loop(tour, 0.5 * _LANE_M)
-    radii = np.where(paths.turns_left(corners), _LEFT_RADIUS_M, _RIGHT_RADIUS_M)
+    radii = np.where(paths.turning_angles(corners) > 0.0, _LEFT_RADIUS_M, _RIGHT_RADIUS_M)
     return paths.subdivide_loop(paths.round_corners(corners, radii, step_m), 5.0)
 
 
