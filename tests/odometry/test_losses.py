@@ -7,8 +7,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lidarslam.odometry.network.torch_geometry import inverse, rotate, skew, transform_points
+from lidarslam.odometry.training import losses as correspondence
 from lidarslam.odometry.training.config import LossConfig
-from lidarslam.odometry.training.losses import Surfaces, geometric_loss
+from lidarslam.odometry.training.losses import Surfaces, geometric_loss, nearest
 
 EYE = torch.eye(4, dtype=torch.float64)[None]
 XI = torch.tensor([0.03, -0.04, 0.05, 0.12, -0.1, 0.08], dtype=torch.float64)
@@ -153,3 +154,53 @@ def test_items_of_a_batch_do_not_see_each_other(config: LossConfig) -> None:
         for name in ("total", "point_to_plane", "plane_to_plane", "matched_share"):
             torch.testing.assert_close(getattr(together, name)[item, None], getattr(alone, name))
     assert len(set(together.total.tolist())) == 3
+
+
+@pytest.fixture(params=["k-d tree", "all distances"])
+def search(request, monkeypatch):
+    """The search of the CPU, and that of other devices."""
+    if request.param == "all distances":
+        monkeypatch.setattr(correspondence, "_by_kd_tree", correspondence._by_all_distances)
+    return nearest
+
+
+def _clouds(offset: float = 0.0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(5)
+    query, reference = (offset + 10.0 * torch.rand(3, n, 3, generator=g) for n in (70, 90))
+    return query, reference, torch.rand(3, 90, generator=g) < 0.5
+
+
+@pytest.mark.parametrize("offset", [0.0, 100.0])
+def test_finds_the_nearest_of_the_valid(search, offset: float) -> None:
+    query, reference, valid = _clouds(offset)
+    index, distance = search(query, reference, valid)
+    q, r = query.double().numpy(), reference.double().numpy()
+    all_distances = np.linalg.norm(q[:, :, None] - r[:, None], axis=-1)
+    all_distances[np.broadcast_to(~valid.numpy()[:, None], all_distances.shape)] = np.inf
+    assert index.dtype == torch.int64
+    np.testing.assert_array_equal(index.numpy(), all_distances.argmin(-1))
+    np.testing.assert_allclose(distance.numpy(), all_distances.min(-1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("max_distances", [1, 90, 200, 10**6])
+def test_all_distances_and_tree_agree_however_they_are_split(max_distances: int, monkeypatch) -> None:
+    clouds = _clouds(50.0)
+    tree_index, tree_distance = nearest(*clouds)
+    monkeypatch.setattr(correspondence, "_MAX_DISTANCES", max_distances)
+    monkeypatch.setattr(correspondence, "_by_kd_tree", correspondence._by_all_distances)
+    index, distance = nearest(*clouds)
+    assert torch.equal(index, tree_index)
+    torch.testing.assert_close(distance, tree_distance, rtol=1e-6, atol=0)
+
+
+def test_what_is_not_finite_is_not_found(search) -> None:
+    query, reference, valid = _clouds()
+    expected = search(query, reference, valid)
+    query[0, 3], query[1, 4] = torch.nan, torch.inf
+    index, distance = search(query, reference, valid)
+    for item, point in ((0, 3), (1, 4)):
+        assert index[item, point] == 0
+        assert distance[item, point].isinf()
+        expected[0][item, point], expected[1][item, point] = 0, torch.inf
+    assert torch.equal(index, expected[0])
+    assert torch.equal(distance, expected[1])
