@@ -336,7 +336,8 @@ def _on_the_ground(carrier: Carrier, world: World, way: FloatArray) -> FloatArra
     z = ground.height + lift + flight
     roll, pitch = np.zeros(len(z)), np.zeros(len(z))
     if carrier.leans_with_ground:
-        pitch, roll = ground.pitch_and_roll(yaw, rise)
+        slope_pitch, slope_roll = ground.pitch_and_roll(yaw, rise)
+        pitch, roll = pitch + slope_pitch, roll + slope_roll
     velocity = np.gradient(xy, TIME_STEP_S, axis=0)
     if carrier.banks:
         c, s = np.cos(yaw), np.sin(yaw)
