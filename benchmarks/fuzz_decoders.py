@@ -30,8 +30,8 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.datasets.registry import open_recording
     from lidarslam.live.clouds import CloudDecoder
     from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-    from lidarslam.simulation.writers import FORMATS
     from lidarslam.simulation.recorder import Rig, SimulatedScan
+    from lidarslam.simulation.writers import FORMATS
     from lidarslam.storage.finished_run import read_summary
     from lidarslam.storage.unfinished import About
 
