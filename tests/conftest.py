@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 from hypothesis import settings
 
 from lidarslam.core.geometry import FloatArray, exp
@@ -27,6 +28,13 @@ os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.envir
 # The first call of a compiled loop takes as long as compiling it.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
+
+
+def lidarslam(*arguments: object) -> Result:
+    """A command, carried out in this process."""
+    from lidarslam.cli import main
+
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
 from lidarslam.commands.options import take_config
@@ -23,9 +22,7 @@ from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.run.summary import WrittenMap
 
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+from .conftest import lidarslam
 
 
 @pytest.fixture

@@ -4,9 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
@@ -23,11 +21,9 @@ from lidarslam.evaluation.comparison.gates import (
     require_methods,
 )
 
+from ..conftest import lidarslam
+
 LOST = 2
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 @pytest.fixture

@@ -12,19 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import Result
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from lidarslam.cli import main
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights
 
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+from ..conftest import lidarslam
 
 
 def one_line_of(result: Result) -> str:

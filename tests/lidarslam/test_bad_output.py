@@ -14,9 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
@@ -25,11 +23,9 @@ from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.directory import FILES, RunDirectory
 
+from ..conftest import lidarslam
+
 FAST = ("--odometry", "constant-velocity")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def shell(*arguments: object, **options: object) -> "subprocess.CompletedProcess[str]":

@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.compare.comparison import CompareOutcome, Counter, Narrator, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import CompareRequest, RecordingEntry
@@ -24,6 +22,8 @@ from lidarslam.compare.text import format_comparison
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
+
+from ..conftest import lidarslam
 
 METRICS = {"association", "trajectory", "kitti", "segments", "map"}
 
@@ -288,10 +288,6 @@ def test_mistakes_are_found_before_anything_is_run(recording: Path, tmp_path: Pa
     with pytest.raises(InputError, match="none of the 1 recordings can be read"):
         compare(_request(recording, out, "kiss-icp", recordings=(lost,), skip_missing=True), told.narrator)
     assert not out.exists()
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def test_a_bound_that_is_not_met_has_a_status_of_its_own(recording: Path, tmp_path: Path) -> None:

@@ -6,23 +6,19 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.core.errors import InputError
 from lidarslam.storage import default_places
 from lidarslam.storage.default_places import latest_run, source_name, unfinished_run
 from lidarslam.storage.unfinished import About, Unfinished
+
+from ..conftest import lidarslam
 
 TIME = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d"
 FAST = ("--odometry", "constant-velocity", "--stop", "3")
 
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def only(folder: str) -> Path:

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.scan import PointAttributes
@@ -20,14 +18,12 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.exports.source import read_run_scans
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
+from ..conftest import lidarslam
+
 SCANS = 6
 FIRST_STAMP = 1_700_000_000.123456789
 VELOCITY = np.array([0.0, 0.0, 0.4, 6.0, 0.3, 0.0])
 SIGMAS = (0.001, 0.002, 0.003, 0.01, 0.02, 0.05)
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 @pytest.fixture

@@ -8,10 +8,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from rosbags.rosbag1 import Writer
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
@@ -21,7 +19,7 @@ from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
 from lidarslam.exports.bag import RosMessages, nanoseconds
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
-from ..conftest import Room
+from ..conftest import Room, lidarslam
 
 pyproj = pytest.importorskip("pyproj")
 
@@ -29,10 +27,6 @@ ANTENNA = np.array([-0.5, 0.2, 1.0])
 PLACE = (-33.8568, 151.2153, 25.0)  # Sydney, zone 56 south
 FIRST_STAMP = 1_700_000_000.0
 SCANS = 120
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 @pytest.fixture(scope="module")

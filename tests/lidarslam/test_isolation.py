@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
+from ..conftest import lidarslam
 
 REPOSITORY = Path(__file__).parents[2]
 PACKAGES = ("lidarslam", "odometry", "mapping", "evaluation")
@@ -74,10 +73,6 @@ def test_nothing_in_the_sources_runs_what_a_file_says() -> None:
 )
 def test_a_planted_breach_is_found(planted: str, breach: str) -> None:
     assert breach in list(breaches(ast.parse(planted)))
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 @pytest.fixture

@@ -5,20 +5,16 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.compare.method_run import LOG, clear
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import make_own_folder, open_own
 from lidarslam.merge.parts import remove_part
 from lidarslam.storage.unfinished import Unfinished
 
+from ..conftest import lidarslam
+
 FAST = ("--odometry", "constant-velocity", "--no-report", "--pose-graph", "--set", "global_map.most_points=2000")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -4,9 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import PointAttributes
@@ -15,14 +13,12 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.products.edits import moved
 from lidarslam.storage.finished_run import load_map
 
+from ..conftest import lidarslam
+
 TILT = exp([np.deg2rad(7.0), 0.0, 0.0, 0.0, 0.0, 0.0])
 GROUND_M = -1.5
 FLOATERS = 40
 BACKWARDS, OUTSIDE = ("1", "-1", "0", "1", "0", "1"), ("90", "91", "0", "1", "0", "1")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def edited(out: Path, *arguments: object) -> tuple[PointCloud, str]:

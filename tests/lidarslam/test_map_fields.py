@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map import point_cloud
 from lidarslam.storage.directory import MAPS
 from lidarslam.storage.finished_run import load_map, load_run
 
@@ -134,18 +133,6 @@ def test_further_formats(source: Path, tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png", *MAPS.values()}
     run(source, out, *WAYS["true poses"], "--overwrite")
     assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png"}
-
-
-@pytest.mark.parametrize("command", ["run", "merge"])
-def test_a_missing_library_is_said_before_the_run(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    monkeypatch.setattr(point_cloud, "find_spec", lambda _name: None)
-    out = tmp_path / "run"
-    result = CliRunner().invoke(main, [command, str(source), "--out", str(out), "--map-format", "e57"])
-    assert result.exit_code != 0
-    assert "pip install 'lidarslam[e57]'" in f"{result.output}{result.exception}"
-    assert not out.exists()
 
 
 def test_info_says_what_the_map_will_have(source: Path, small_recording: Path) -> None:

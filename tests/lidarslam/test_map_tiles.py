@@ -7,20 +7,16 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from scipy.spatial import cKDTree
 
-from lidarslam.cli import main
 from lidarslam.storage.directory import remove_run
 from lidarslam.storage.finished_run import load_map
+
+from ..conftest import lidarslam
 
 FAST = ("--no-report", "--odometry", "constant-velocity", "--set", "global_map.voxel_size_m=0.1")
 MOST = 2_000
 BOUND = ("--set", f"global_map.most_points={MOST}")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

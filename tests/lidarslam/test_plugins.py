@@ -11,9 +11,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.commands.options import take_config
 from lidarslam.commands.run import run
 from lidarslam.compare.methods import parse_methods
@@ -22,6 +20,8 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_tum, write_tum
 from lidarslam.datasets.registry import choose_reader
+
+from ..conftest import lidarslam
 
 GUIDE = Path(__file__).parents[2] / "CONTRIBUTING.md"
 
@@ -80,10 +80,6 @@ def broken(example: Path, tmp_path: Path) -> Iterator[Path]:
     _install(tmp_path / "other", "lidarslam-broken", groups)
     with _on_path(tmp_path / "other") as folder:
         yield folder
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def test_a_run_takes_odometry_mapping_and_metric(example: Path, recording: Path, tmp_path: Path) -> None:

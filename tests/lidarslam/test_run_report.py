@@ -12,20 +12,16 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.storage.comparison_folder import run_directories
 from lidarslam.viewer.run_report import Accuracy, changed_settings, leave_report
 
+from ..conftest import lidarslam
+
 PAGE = ("report.html", "map.png", "trajectory.png")
 FAST = ("--odometry", "constant-velocity")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def there(run: Path) -> list[str]:

@@ -4,21 +4,17 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml, load_config
 from lidarslam.config.shipped import BENCHMARKS, CONFIGS, headline, shipped_files
+
+from ..conftest import lidarslam
 
 ROOT = Path(__file__).parents[2]
 FILES = [*shipped_files(CONFIGS).values(), *shipped_files(BENCHMARKS).values()]
 
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
-
-
-def lidarslam(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def test_every_file_of_the_repository_has_a_name() -> None:
