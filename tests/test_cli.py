@@ -1,4 +1,4 @@
-"""The command line as a stranger meets it: help, exit statuses, one-line errors."""
+"""The command line as a stranger meets it: help, completion, exit statuses, one-line errors."""
 
 import json
 import os
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.shell_completion import BashComplete, ShellComplete
 
 from lidarslam.cli import main
 from lidarslam.commands.options import take_config
@@ -16,11 +17,9 @@ from lidarslam.commands.run import run
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.merge.writing import MergedRecording, MergeOutcome, MergeSummary
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.run.summary import WrittenMap
 
 from .conftest import lidarslam
 
@@ -172,29 +171,6 @@ def test_merge_says_who_is_left_out(recording: Path, tmp_path: Path) -> None:
     assert pictured.exit_code == 0
 
 
-@pytest.mark.parametrize(
-    ("joined", "lost", "stopped", "status"),
-    [(True, 0, (), 0), (True, 2, (), 3), (False, 2, (), 1), (True, 2, ("room: not begun",), 1)],
-)
-def test_merge_exits_as_run_does(
-    recording: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    joined: bool,
-    lost: int,
-    stopped: tuple[str, ...],
-    status: int,
-) -> None:
-    entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
-    summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
-    outcome = MergeOutcome(summary, (None, None), stopped)
-    monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
-    assert (
-        lidarslam("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder").exit_code
-        == status
-    )
-
-
 def test_config_prints_yaml_that_loads_again(tmp_path: Path) -> None:
     result = lidarslam("config", "--set", "odometry.kiss_icp.voxel_size_m=0.5")
     assert "voxel_size_m: 0.5" in result.output
@@ -307,3 +283,30 @@ def test_verbose_says_what_is_chosen_before_the_command_or_after(
     caplog.clear()
     lidarslam(*command, "--stop", 3, "--overwrite")
     assert not caplog.records
+
+
+def completed(line: str, shell: type[ShellComplete] = BashComplete) -> list[str]:
+    """Type and value of each completion of the last word."""
+    *words, last = line.split(" ")
+    completions = shell(main, {}, "lidarslam", "_LIDARSLAM_COMPLETE").get_completions(words, last)
+    return [f"{item.type} {item.value}" for item in completions]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("ru", ["plain run"]),
+        ("ev", ["plain evaluate"]),
+        ("run --res", ["plain --resume"]),
+        ("run --odometry k", ["plain kiss-icp"]),
+        ("run --mapping ", ["plain surfels", "plain loam", "plain off"]),
+        ("run x --reader kitti", ["plain kitti-odometry", "plain kitti-360", "plain kitti-raw"]),
+        ("simulate --world t", ["plain tunnel", "plain terrace", "plain town"]),
+        ("run -c ind", ["file ind", "plain indoor"]),
+        ("compare --benchmark sim", ["file sim", "plain simulated"]),
+        ("run -c ./x", ["file ./x"]),
+        ("run x -o r", ["file r"]),
+    ],
+)
+def test_words_are_completed(line: str, expected: list[str]) -> None:
+    assert completed(line) == expected

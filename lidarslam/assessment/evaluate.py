@@ -125,7 +125,10 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
     written = [*([] if out is None else [out]), *request.errors]
     if request.evo is not None:
-        written += _write_evo(request.evo, request.run, metrics)
+        if metrics is None:
+            raise InputError("--evo saves the errors of a trajectory, and there is no reference for it")
+        name = "estimate" if isinstance(request.run, Trajectory) else request.run.resolve().stem
+        written += write_evo_files(request.evo, name, metrics)
     label = None if reference is None else reference.label
     evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
     if out is not None:
@@ -136,12 +139,6 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     if request.report and estimate.run is not None and request.out is None:
         _draw_report(request, estimate.run, evaluation, trajectory if in_camera else None)
     return evaluation
-
-
-def _write_evo(folder: Path, run: Path | Trajectory, metrics: TrajectoryMetrics | None) -> list[Path]:
-    if metrics is None:
-        raise InputError("--evo saves the errors of a trajectory, and there is no reference for it")
-    return write_evo_files(folder, "estimate" if isinstance(run, Trajectory) else run.resolve().stem, metrics)
 
 
 def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:

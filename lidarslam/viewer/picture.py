@@ -134,12 +134,8 @@ def draw_runs(
     One run is coloured by the frame's quantity, by height without a frame, and its path by status. Several have a
     colour each; where maps cover each other, their colours mix. Their paths are the narrower the later in order.
 
-    Args:
-        runs: in one world.
-        elevation_deg: of the camera above the horizon; the projection is orthographic.
-        reference: positions (K, 3) of a true trajectory, drawn below the others.
-        width: of the picture, pixels.
-        frame: the view and colours, instead of those that suit the runs.
+    The projection is orthographic, from an elevation above the horizon; a true trajectory (K, 3) is drawn below the
+    others. A frame is taken instead of the one that suits the runs.
     """
     frame = frame or fit_frame(runs, elevation_deg, reference, width)
     fine = frame.view.enlarged(_SUPERSAMPLING)

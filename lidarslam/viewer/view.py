@@ -89,13 +89,8 @@ def fit_view(
 ) -> View:
     """The view that holds points (N, 3), but for strays, and the whole path (M, 3).
 
-    Args:
-        points: of all clouds; may be empty.
-        path: positions of all trajectories; may be empty.
-        elevation_deg: of the camera above the horizon.
-        turn_deg: of the picture about z; None: the turn that leaves the least empty space seen from above, whatever the
-            elevation; 0 unless it saves much.
-        width: of the picture, pixels; its height follows the scene.
+    Without a turn about z, it is the one that leaves the least empty space seen from above, whatever the elevation of
+    the camera above the horizon; 0 unless it saves much. The height of the picture follows the scene.
     """
     if turn_deg is None:
         sample = points[:: max(1, len(points) // _SAMPLED)]

@@ -11,19 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from lidarslam.core.tracking import Status
-from lidarslam.evaluation.comparison.comparison import ScanSeries, SequenceComparison
-from lidarslam.evaluation.report.report import RunPage, render_html, render_run
+from lidarslam.evaluation.report.report import render_html
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 DEADLINE_S = 60.0
 
-# Plots are drawn as they come near the view, and all of them before printing.
-# A PNG file of one white pixel.
-ONE_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGP4DwABAQEAsTj2FAAAAABJRU5ErkJggg=="
 DRAW_ALL = """
 (async () => {
   dispatchEvent(new Event('beforeprint'));
@@ -176,26 +170,6 @@ def test_the_report_opens_without_complaint_from_its_own_file_alone(width, theme
     assert browser.evaluate("document.documentElement.scrollWidth") <= width
     assert browser.evaluate("[...document.querySelectorAll('.plot')].every(p => p.getBoundingClientRect().width > 250)")
     assert browser.evaluate(OUTSIDE) == []
-
-
-@pytest.mark.parametrize(("width", "theme"), [(1200, "dark"), (420, "light")])
-def test_the_page_of_a_run_opens_without_complaint(width, theme, random_drive, finished, tmp_path, browser):
-    reference = random_drive(1, scans=300)
-    series = ScanSeries(
-        reference.stamps - reference.stamps[0],
-        [Status.OK] * 100 + [Status.DEGRADED] * 50 + [Status.LOST] * 150,
-        *(np.where(np.arange(300) < 5, np.nan, scale) for scale in (0.02, 0.9, 2000.0)),
-    )
-    sequence = SequenceComparison("run", "a.mcap", reference, "truth", [finished("run", reference, 2, series=series)])
-    path = tmp_path / "report.html"
-    path.write_text(render_run(RunPage("run", ["Source: a.mcap"], sequence, ONE_PIXEL)), encoding="utf-8")
-    browser.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
-    visit = browser.visit(path, width)
-    plots, drawn = browser.evaluate(DRAW_ALL)
-    assert plots == drawn > 10
-    assert visit.complaints == []
-    assert browser.evaluate("document.querySelector('.picture img').naturalWidth") == 1
-    assert browser.evaluate("document.documentElement.scrollWidth") <= width
 
 
 def test_the_legend_hides_a_method_in_all_plots_and_the_axis_turns_logarithmic(page, browser):

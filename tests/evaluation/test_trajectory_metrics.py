@@ -76,15 +76,6 @@ def test_scale_error_on_a_straight_line(straight_drive):
     assert errors.ate_rotation_rmse_deg == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_time_shift_along_a_straight_line(straight_drive):
-    # 0.02 s at 10 m/s is 0.2 m all along; the alignment takes it away, as it is one shift of the world.
-    reference = straight_drive(300)
-    estimate = Trajectory(reference.stamps[:-1] + 0.02, reference.T_world_lidar[:-1])
-    metrics = evaluate_trajectory(estimate, reference)
-    assert metrics.T_reference_estimate[:3, 3] == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
-    assert metrics.errors.ate_rmse_m == pytest.approx(0.0, abs=1e-6)
-
-
 def test_steps_across_unmatched_scans_are_left_out_of_the_rpe(straight_drive):
     estimate = straight_drive(100, (0.0, 0.0, 0.0, 1.01, 0.0, 0.0))
     reference = straight_drive(100)
@@ -234,15 +225,6 @@ def test_yaw_is_turned_first_then_pitch_then_roll(random_drive):
     estimate = Trajectory(reference.stamps, reference.T_world_lidar @ yaw @ pitch @ roll)
     _, rotation_deg = deviations(associate(estimate, reference), np.eye(4))
     np.testing.assert_allclose(rotation_deg, np.tile([-10.0, 20.0, 40.0], (50, 1)), atol=1e-6)
-
-
-def test_looking_straight_up_is_answered_with_numbers(straight_drive):
-    reference = straight_drive(5)
-    up = exp([0.0, -np.pi / 2.0, 0.0, 0.0, 0.0, 0.0])
-    estimate = Trajectory(reference.stamps, reference.T_world_lidar @ up)
-    _, rotation_deg = deviations(associate(estimate, reference), np.eye(4))
-    np.testing.assert_allclose(rotation_deg[:, 1], -90.0, atol=1e-4)
-    assert np.isfinite(rotation_deg).all()
 
 
 def along(positions: FloatArray) -> Trajectory:

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.compare.method_run import LOG, clear
 from lidarslam.core.errors import OutputError
-from lidarslam.core.files import make_own_folder, open_own
-from lidarslam.merge.parts import remove_part
+from lidarslam.core.files import open_own
 from lidarslam.storage.unfinished import Unfinished
 
 from ..conftest import lidarslam
@@ -96,23 +94,6 @@ def test_a_file_is_opened_without_following_links(tmp_path: Path) -> None:
             file.write(b"ours")
     assert (tmp_path / "outside").read_text() == "precious"
     assert not (tmp_path / "nowhere").exists()
-
-
-def test_folders_of_methods_and_of_parts_are_no_links(tmp_path: Path) -> None:
-    outside, out = tmp_path / "outside", tmp_path / "out"
-    outside.mkdir()
-    out.mkdir()
-    for name in (LOG, "map.ply", "config.yaml"):
-        (outside / name).write_text("run:\n")
-    (out / "01_room").symlink_to(outside)
-    remove_part(out / "01_room")
-    clear(out / "01_room")
-    (out / "room").symlink_to(tmp_path)
-    clear(out / "room" / "outside")
-    make_own_folder(out / "room")
-    assert sorted(content(outside)) == sorted((LOG, "map.ply", "config.yaml"))
-    assert not (out / "01_room").is_symlink()
-    assert not (out / "room").is_symlink()
 
 
 @pytest.mark.parametrize("link", ["recordings", "recordings/a"])

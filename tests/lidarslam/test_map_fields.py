@@ -133,18 +133,3 @@ def test_further_formats(source: Path, tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png", *MAPS.values()}
     run(source, out, *WAYS["true poses"], "--overwrite")
     assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png"}
-
-
-def test_info_says_what_the_map_will_have(source: Path, small_recording: Path) -> None:
-    lines = CliRunner().invoke(main, ["info", str(source)]).output.splitlines()
-    assert [line.split()[1:] for line in lines if line.startswith(("intensity", "colour"))] == [["no"], ["no"]]
-    (source.parent / "rest").mkdir()
-    for file in sorted(source.glob("*.npy"))[1:3]:
-        (source.parent / "rest" / file.name).symlink_to(file)
-    lines = CliRunner().invoke(main, ["info", str(source.parent / "rest")]).output.splitlines()
-    (intensity,) = (line.split(maxsplit=1)[1] for line in lines if line.startswith("intensity"))
-    assert intensity.endswith("in the first scan")
-    low, high = (float(word) for word in intensity.split()[:3:2])
-    assert 1_000.0 < low < 20_000.0
-    assert 40_000.0 < high < 65_535.0
-    assert any(line.split() == ["colour", "yes"] for line in lines)

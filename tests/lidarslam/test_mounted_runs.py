@@ -1,15 +1,19 @@
-"""Runs over a recording of a sensor on its side come to the results of the upright one."""
+"""Whatever reads a recording of a sensor on its side comes to the results of the upright one."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
+from lidarslam import Slam
 from lidarslam.assessment.inputs import truth_of_run
+from lidarslam.cli import main
 from lidarslam.config.settings import load_config
-from lidarslam.core.geometry import make_transform
+from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.exports.source import read_run_scans
 from lidarslam.run.request import RunRequest
@@ -19,19 +23,28 @@ from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
+from lidarslam.storage.finished_run import load_map
 
-SCANS = 17  # of which the guess looks at every fourth
-ROLL = np.round(Rotation.from_euler("x", 90, degrees=True).as_matrix())
+STREET_SCANS = 17  # of which the guess looks at every fourth
+
+SCANS = 22  # of which the guess looks at every fourth
+TURNS = {
+    "upright": np.eye(3),
+    "rolled": np.round(Rotation.from_euler("x", 90, degrees=True).as_matrix()),
+    "camera": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+}
+FAST = ["--no-report", "--set", "mapping.keypoints=800", "--set", "global_map.voxel_size_m=0.2"]
+CONSTANT = ["--odometry", "constant-velocity"]
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def streets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A street as an HDL-32E sees it, upright and rolled by 90 degrees."""
     world = build_world("street", 3)
     motion = motion_along_route("car", world, 3)
     T_body_lidar = mount_pose("upright", motion.sensor_height_m)
-    simulation = Simulation(world, find_sensor("hdl-32e"), motion, T_body_lidar, SCANS, 3)
-    folders = {"upright": np.eye(3), "rolled": ROLL}
+    simulation = Simulation(world, find_sensor("hdl-32e"), motion, T_body_lidar, STREET_SCANS, 3)
+    folders = {"upright": np.eye(3), "rolled": TURNS["rolled"]}
     paths = {name: tmp_path_factory.mktemp(name) for name in folders}
     truth = simulation.ground_truth
     for number, scan in enumerate(simulation.scans()):
@@ -59,32 +72,142 @@ def files(run: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def upright(recordings, tmp_path_factory) -> Path:
-    return begun(recordings["upright"], tmp_path_factory.mktemp("runs") / "upright")
+def upright_street(streets, tmp_path_factory) -> Path:
+    return begun(streets["upright"], tmp_path_factory.mktemp("runs") / "upright")
 
 
 @pytest.mark.parametrize("mounting", ["auto", "left"])
-def test_results_are_those_of_the_upright_recording(recordings, upright, tmp_path, mounting):
-    run = begun(recordings["rolled"], tmp_path / "run", mounting)
-    assert files(run) == files(upright)
-    metrics, expected = (json.loads((one / "metrics.json").read_text())["trajectory"] for one in (run, upright))
+def test_results_are_those_of_the_upright_recording(streets, upright_street, tmp_path, mounting):
+    run = begun(streets["rolled"], tmp_path / "run", mounting)
+    assert files(run) == files(upright_street)
+    metrics, expected = (json.loads((one / "metrics.json").read_text())["trajectory"] for one in (run, upright_street))
     assert metrics == pytest.approx(expected, abs=1e-6)
     warned = any("reader.mounting=left" in one for one in json.loads((run / "summary.json").read_text())["warnings"])
     assert warned == (mounting == "auto")
     # What reads the recording again finds the same axes.
-    truth, own = truth_of_run(run), truth_of_run(upright)
+    truth, own = truth_of_run(run), truth_of_run(upright_street)
     np.testing.assert_allclose(truth.T_world_lidar, own.T_world_lidar, atol=1e-6)
-    exported, scans = (next(read_run_scans(one).deskewed())[1].points for one in (run, upright))
+    exported, scans = (next(read_run_scans(one).deskewed())[1].points for one in (run, upright_street))
     np.testing.assert_array_equal(exported, scans)
 
 
-def test_nothing_is_said_of_an_upright_recording(recordings, upright, tmp_path):
-    assert "mounting" not in (upright / "summary.json").read_text()
-    assert files(begun(recordings["upright"], tmp_path / "run", "upright")) == files(upright)
+def test_nothing_is_said_of_an_upright_recording(streets, upright_street, tmp_path):
+    assert "mounting" not in (upright_street / "summary.json").read_text()
+    assert files(begun(streets["upright"], tmp_path / "run", "upright")) == files(upright_street)
 
 
-def test_a_resumed_run_guesses_the_same(recordings, upright, tmp_path):
+def test_a_resumed_run_guesses_the_same(streets, upright_street, tmp_path):
     out = tmp_path / "run"
-    begun(recordings["rolled"], out, stop_after=10)
-    assert len(read_tum(out / "trajectory.tum")) < SCANS
-    assert files(begun(recordings["rolled"], out, resume=True)) == files(upright)
+    begun(streets["rolled"], out, stop_after=10)
+    assert len(read_tum(out / "trajectory.tum")) < STREET_SCANS
+    assert files(begun(streets["rolled"], out, resume=True)) == files(upright_street)
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    """A walk along a street with a VLP-16."""
+    world = build_world("street", 3)
+    motion = motion_along_route("handheld", world, 3)
+    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
+    return Simulation(world, find_sensor("vlp-16"), motion, T_body_lidar, SCANS, 3)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory, simulation: Simulation) -> dict[str, Path]:
+    """Two of it, of other noise, with an IMU, as recorded in each of the axes: `upright`, `upright again`, ..."""
+    root, paths = tmp_path_factory.mktemp("recordings"), dict[str, Path]()
+    for again, seed in (("", 3), (" again", 4)):
+        for name in TURNS:
+            paths[name + again] = root / (name + again).replace(" ", "_")
+            paths[name + again].mkdir()
+        made = replace(simulation, seed=seed)
+        stamps = []
+        for number, scan in enumerate(made.scans()):
+            stamps.append(scan.stamp)
+            for name, R in TURNS.items():
+                table = np.empty(len(scan), dtype=[("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
+                table["x"], table["y"], table["z"] = (scan.points @ R.T).T
+                table["time"] = scan.time_offsets
+                np.save(paths[name + again] / f"{number:06d}.npy", table)
+        imu = made.imu
+        rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])
+        for name, R in TURNS.items():
+            T_recorded_imu = make_transform(R, np.zeros(3)) @ imu.T_lidar_imu
+            header = "T_lidar_imu: " + " ".join(map(str, T_recorded_imu[:3].ravel()))
+            np.savetxt(paths[name + again] / "imu.csv", rows, delimiter=",", header=header)
+            np.savetxt(paths[name + again] / "timestamps.txt", stamps, fmt="%.9f")
+    return paths
+
+
+def call(*words: str | Path) -> str:
+    result = CliRunner().invoke(main, [*map(str, words)])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def run(source: Path, out: Path, *words: str) -> Path:
+    call("run", source, "-o", out, *FAST, *words)
+    return out
+
+
+def poses(directory: Path) -> FloatArray:
+    return read_tum(directory / "trajectory.tum").T_world_lidar
+
+
+def points(directory: Path) -> FloatArray:
+    return load_map(directory).points
+
+
+@pytest.fixture(scope="module")
+def upright(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run(recordings["upright"], tmp_path_factory.mktemp("runs") / "upright", *CONSTANT)
+
+
+@pytest.mark.parametrize(
+    ("method", "turn"),
+    [("imu", "rolled"), ("imu", "camera"), pytest.param("learned+imu", "rolled", marks=pytest.mark.slow)],
+)
+def test_with_the_imu(recordings, tmp_path, method, turn):
+    odometry = ["--odometry", method]
+    mounting = ["--set", f"reader.mounting={'left' if turn == 'rolled' else 'camera'}"]
+    expected = run(recordings["upright"], tmp_path / "upright", *odometry)
+    turned = run(recordings[turn], tmp_path / "turned", *odometry, *mounting)
+    np.testing.assert_allclose(poses(turned), poses(expected), atol=1e-6)
+    np.testing.assert_allclose(points(turned), points(expected), atol=1e-5)
+
+
+def test_the_python_interface(recordings, simulation, upright):
+    settings = {
+        "odometry.method": "constant-velocity",
+        "mapping.keypoints": 800,
+        "global_map.voxel_size_m": 0.2,
+        "reader.mounting": "camera",
+    }
+    with Slam(settings) as slam:
+        for scan in simulation.scans():
+            slam.register_frame(scan.points @ TURNS["camera"].T, scan.time_offsets, scan.stamp)
+        T_world_lidar = slam.trajectory().T_world_lidar
+    np.testing.assert_allclose(T_world_lidar, poses(upright), atol=1e-6)
+
+
+def test_localisation(recordings, upright, tmp_path):
+    found = {}
+    for name in ("upright again", "rolled again"):
+        out = tmp_path / name
+        assert "found at scan" in call("localise", recordings[name], "--map", upright, "-o", out, *CONSTANT)
+        found[name] = poses(out)
+    np.testing.assert_allclose(found["rolled again"], found["upright again"], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("command", "file"), [("export-bag", "run.mcap"), ("export-mesh", "mesh.ply"), ("export-grid", "grid.yaml")]
+)
+def test_exports(recordings, upright, tmp_path, command, file):
+    turned = run(recordings["rolled"], tmp_path / "turned", *CONSTANT)
+    written = {}
+    for one in (turned, upright):
+        folder = tmp_path / f"of_{one.name}"
+        folder.mkdir()
+        call(command, one, "-o", folder / file)
+        written[one] = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert written[turned] == written[upright]

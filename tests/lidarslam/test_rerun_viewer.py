@@ -1,17 +1,19 @@
-"""Finished runs in Rerun: files written through a pipe, windows on this machine alone, one line where it cannot be."""
+"""Finished runs in Rerun: files written through a pipe, windows and pages on this machine alone."""
 
 import ast
+import http.client
 import os
+import re
 import resource
 import signal
 import socket
-import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
 from lidarslam.config.settings import ViewerConfig, load_config
 from lidarslam.core.errors import InputError, OutputError
@@ -19,13 +21,14 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.storage.finished_run import FinishedRun
-from lidarslam.viewer import rerun_environment
+from lidarslam.viewer import rerun_environment, web_page
 from lidarslam.viewer.rerun_output import save, show_file_in_window, show_in_window
-from lidarslam.viewer.rerun_program import is_taken, open_window
+from lidarslam.viewer.rerun_program import is_taken, open_window, served_page
 from lidarslam.viewer.rerun_recording import IncompleteRecordingError
 from lidarslam.viewer.rerun_recording import _PipedFile as PipedFile
 from lidarslam.viewer.rerun_runs import show_runs
 from lidarslam.viewer.rerun_viewer import rerun_viewer
+from lidarslam.viewer.web_page import WebPage
 
 LISTENER = """#!/usr/bin/env python3
 import os, socket, sys, time
@@ -35,21 +38,18 @@ Path(__file__).with_name("pid").write_text(str(os.getpid()))
 with socket.create_server((given["--bind"], int(given["--port"]))):
     time.sleep(60)
 """
+INDEX = b"""<html><link rel="icon" href="favicon.ico" />
+<link rel="preconnect" href="https://fonts.gstatic.com" crossorigin />
+<link
+  href="//fonts.googleapis.com/css2?family=Inter"
+  rel="stylesheet"
+/><script src="re_viewer.js"></script></html>"""
 
 
 @pytest.fixture
 def finished() -> FinishedRun:
     trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     return FinishedRun("my run", trajectory, np.zeros(3, dtype=np.bool_), np.eye(3), np.array([[0, 2]]))
-
-
-def test_a_name_with_a_space_is_one_entity(
-    finished: FinishedRun, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
-    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "runs.rrd").stream()}
-    assert r"/world/my\ run/map" in entities
-    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("size", [0, 1_000, 100_000])
@@ -135,36 +135,6 @@ def test_a_write_that_fails_empties_the_file_and_swallows_the_rest(
     assert (tmp_path / "file").stat().st_size == 0
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_a_file_that_cannot_even_be_emptied_holds_no_writer() -> None:
-    """As on a disk that fails."""
-    file = PipedFile(Path("/dev/full"))
-
-    def write() -> None:
-        with file.entrance.open("wb") as entrance:
-            opened.set()
-            entrance.write(bytes(1_000_000))
-
-    opened = threading.Event()
-    writer = threading.Thread(target=write, daemon=True)
-    writer.start()
-    assert opened.wait(10.0)
-    file.close_entrance()
-    writer.join(10.0)
-    assert not writer.is_alive()
-    assert file.finish()
-
-
-def test_a_writer_that_never_lets_go_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidarslam.viewer.rerun_recording._PIPE_S", 0.1)
-    file = PipedFile(tmp_path / "file")
-    with file.entrance.open("wb"):
-        file.close_entrance()
-        assert not file.finish()
-    monkeypatch.undo()  # what follows is waited for, however busy the machine is
-    assert file.finish()
-
-
 @pytest.fixture
 def port() -> int:
     with socket.socket() as probe:
@@ -214,3 +184,93 @@ def test_a_window_that_never_listens_is_ended(tmp_path: Path, monkeypatch: pytes
     assert time.monotonic() - begun < 20
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+@pytest.fixture
+def page() -> Iterator[WebPage]:
+    page = WebPage({"/": INDEX, "/re_viewer.js": b"// viewer"})
+    yield page
+    page.close()
+
+
+def get(page: WebPage, path: str, host: str | None = None) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", urlsplit(page.address).port or 0, timeout=20)
+    connection.request("GET", path, headers={} if host is None else {"Host": host})
+    return connection.getresponse()
+
+
+def allowed(response: http.client.HTTPResponse) -> dict[str, list[str]]:
+    """The sources that the page's policy allows, for each kind of content."""
+    policy = response.headers["Content-Security-Policy"]
+    return {words[0]: words[1:] for words in (part.split() for part in policy.split(";"))}
+
+
+def test_the_page_may_load_from_its_own_server_alone(page: WebPage) -> None:
+    for path in ("/?url=there", "/re_viewer.js", "/"):
+        kinds = allowed(get(page, path))
+        assert kinds["default-src"] == ["'none'"]
+        assert kinds["connect-src"] == ["'self'"]
+        words = {word for sources in kinds.values() for word in sources}
+        assert not {word for word in words if "*" in word or "http" in word}, words
+    # A policy does not keep a browser from connecting in advance.
+    body = get(page, "/?url=there").read()
+    assert b"gstatic" not in body
+    assert b"googleapis" not in body
+    assert b'href="favicon.ico"' in body
+    assert b"re_viewer.js" in body
+
+
+def test_the_viewer_is_reruns_own() -> None:
+    """Whatever its page names of elsewhere is not loaded, or only when clicked."""
+    with served_page(lambda _: None) as page:
+        body = get(page, "/?url=there").read().decode()
+        assert not re.search(r"<link[^>]*(https?:)?//", body)
+        for script in re.findall(r"<script[^>]*src=\"([^\"]+)\"", body):
+            assert get(page, f"/{script}").status == 200
+        assert get(page, "/re_viewer_bg.wasm").read(4) == b"\0asm"
+
+
+def test_a_recording_is_shown_while_it_is_written(page: WebPage, tmp_path: Path) -> None:
+    announced: list[str] = []
+    page._announce = announced.append
+    path = tmp_path / "recording.rrd"
+    with path.open("wb", buffering=0) as file, page.showing(path):
+        assert announced == [page.address]
+        file.write(b"begun, ")
+        early = get(page, "/recording.rrd")
+        assert early.read(7) == b"begun, "
+        file.write(b"continued, ")
+        assert early.read(11) == b"continued, "
+        path.rename(tmp_path / "renamed.rrd")  # as a run does at its end
+        file.write(b"ended")
+    assert early.read() == b"ended"
+    assert get(page, "/recording.rrd").read() == b"begun, continued, ended"
+
+
+def test_the_recording_is_found_at_the_end_of_a_tunnel_too(page: WebPage) -> None:
+    response = get(page, "/", "localhost:1234")
+    assert response.status == 302
+    asked = parse_qs(urlsplit(response.headers["Location"]).query)
+    assert asked["url"] == ["http://localhost:1234/recording.rrd"]
+
+
+def test_a_name_that_was_made_to_point_here_is_refused(page: WebPage) -> None:
+    """Otherwise any page in the browser could read the recording."""
+    assert get(page, "/recording.rrd", "elsewhere.example:9090").status == 403
+    assert get(page, "/", "elsewhere.example").status == 403
+
+
+def test_a_port_in_use_is_passed_over(page: WebPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = urlsplit(page.address).port
+    other = WebPage({"/": INDEX})
+    other.close()
+    assert urlsplit(other.address).port != taken
+    monkeypatch.setattr(web_page, "_PORTS", [taken])
+    with pytest.raises(OutputError, match=f"{taken}.* in use"):
+        WebPage({"/": INDEX})
+
+
+def test_this_machine_alone_is_served(page: WebPage) -> None:
+    """A server on all interfaces would be there on each address of the loopback; one on 127.0.0.1 is on that alone."""
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.2", urlsplit(page.address).port or 0)) != 0

@@ -193,26 +193,3 @@ def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
     )
     assert len(one) == 26
     assert one == two
-
-
-@pytest.mark.slow
-def test_prepared_recordings_are_the_same(small_recording: Path, tmp_path: Path) -> None:
-    """To the byte, but for the order in which safetensors lists what describes the file."""
-    data = pytest.importorskip("lidarslam.train.data")
-    side_by_side = pytest.importorskip("lidarslam.train.data")
-    config = data.TrainingConfig(images={"columns": 96}, teacher="map")
-    stretches = [
-        data.recorded(small_recording, data.ReaderConfig()),
-        *data.simulated(data.SimulatedConfig(recordings=1, scans=3)),
-    ]
-    data.prepared(stretches, config, tmp_path / "one", lambda _: None)
-    side_by_side.prepare_side_by_side(stretches, config, tmp_path / "two", Where(2))
-    one, two = ({path.name: _header_and_rest(path) for path in (tmp_path / name).iterdir()} for name in ("one", "two"))
-    assert len(one) == 2
-    assert one == two
-
-
-def _header_and_rest(path: Path) -> tuple[Any, int]:
-    content = path.read_bytes()
-    start = 8 + int.from_bytes(content[:8], "little")
-    return json.loads(content[8:start]), hash(content[start:])

@@ -126,10 +126,8 @@ def estimate(
 ) -> Estimate:
     """Register all scans, in the order of time; those without times are taken for motion compensated.
 
-    Args:
-        imu: for the peers that need it.
-        progress: called after every scan with its number from 1.
-        range_m: maximum range by the size of the scene, for the peers with voxels; None: their defaults.
+    `progress` is called after every scan with its number from 1; `range_m` is the maximum range by the size of the
+    scene, for the peers with voxels.
 
     Raises:
         PeerError: it cannot run, or has no usable poses.

@@ -153,9 +153,6 @@ def elastic_instants(starts: FloatArray, middles: FloatArray, ends: FloatArray) 
     - Sweeps with times: a pose belongs to the start of its sweep. The first sweep is taken rigidly, so that its pose
       belongs to the middle; the pose saved with the second is the first one's again and is left out.
     - Compensated scans, the last of them registered twice: a pose belongs to the scan before.
-
-    Args:
-        starts, middles, ends: (N,) of the registered sweeps.
     """
     if bool((ends <= starts).all()):
         return np.arange(1, len(starts) + 1), starts
