@@ -17,9 +17,11 @@ from lidarslam.commands.run import run
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.merge.writing import MergedRecording, MergeOutcome, MergeSummary
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
+from lidarslam.run.summary import WrittenMap
 
 from .conftest import lidarslam
 
@@ -169,6 +171,29 @@ def test_merge_says_who_is_left_out(recording: Path, tmp_path: Path) -> None:
     assert shown.exit_code == 0
     pictured = lidarslam("view", out, "--picture", tmp_path / "map.png")
     assert pictured.exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("joined", "lost", "stopped", "status"),
+    [(True, 0, (), 0), (True, 2, (), 3), (False, 2, (), 1), (True, 2, ("room: not begun",), 1)],
+)
+def test_merge_exits_as_run_does(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    joined: bool,
+    lost: int,
+    stopped: tuple[str, ...],
+    status: int,
+) -> None:
+    entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
+    summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
+    outcome = MergeOutcome(summary, (None, None), stopped)
+    monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
+    assert (
+        lidarslam("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder").exit_code
+        == status
+    )
 
 
 def test_config_prints_yaml_that_loads_again(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -162,10 +162,6 @@ def judge_comparison(
 
 def format_gates(judged: Sequence[JudgedGate]) -> str:
     """A line for each gate, and how many failed."""
-    return "\n".join(_lines(judged))
-
-
-def _lines(judged: Sequence[JudgedGate]) -> Iterator[str]:
     rows = []
     for each in judged:
         sign = "<=" if each.gate.kind == "max" else ">="
@@ -173,8 +169,7 @@ def _lines(judged: Sequence[JudgedGate]) -> Iterator[str]:
         bound = f"{sign} {each.gate.bound:.6g}"
         rows.append((each.where, each.gate.figure, value, bound, "pass" if each.passed else "FAIL"))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    yield "GATES"
-    for row in rows:
-        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True) if width).rstrip()
+    lines = ("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True) if width) for row in rows)
     failed = sum(not each.passed for each in judged)
-    yield f"{failed} of {len(judged)} failed" if failed else f"all {len(judged)} passed"
+    last = f"{failed} of {len(judged)} failed" if failed else f"all {len(judged)} passed"
+    return "\n".join(["GATES", *(line.rstrip() for line in lines), last])
