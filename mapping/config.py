@@ -18,10 +18,12 @@ BudgetMs = Annotated[float, Field(ge=1.0, le=1e6)] | Literal["auto"] | None
 """Milliseconds that a scan may take; auto: half of the time between scans; None: not bounded."""
 
 
-class TrackingConfig(BaseModel):
-    """Inlier ratios that a registered scan needs; see `mapping.tracking.fit`."""
-
+class _Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TrackingConfig(_Settings):
+    """Inlier ratios that a registered scan needs; see `mapping.tracking.fit`."""
 
     degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio below which a scan is degraded")
     lost_below: float = Field(0.45, ge=0.0, le=1.0, description="inlier ratio below which a scan is lost")
@@ -32,10 +34,8 @@ class TrackingConfig(BaseModel):
         return self
 
 
-class MappingConfig(BaseModel):
+class MappingConfig(_Settings):
     """Scan-to-map registration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     method: Annotated[str, BeforeValidator(MAPPINGS.check)] = Field(
         "surfels", description="surfels, loam (LOAM's mapping), off (the odometry alone), or another package's"
@@ -94,10 +94,8 @@ class MappingConfig(BaseModel):
 # The global map, keyframes, loop closures.
 
 
-class GlobalMapConfig(BaseModel):
+class GlobalMapConfig(_Settings):
     """The merged map that a run leaves behind."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     voxel_size_m: float | None = Field(
         None, ge=0.01, le=10.0, description="one point a voxel; null: follows the median range of the first scan"
@@ -128,10 +126,8 @@ class GlobalMapConfig(BaseModel):
         return self
 
 
-class KeyframeConfig(BaseModel):
+class KeyframeConfig(_Settings):
     """When a scan becomes a keyframe; see `mapping.pose_graph.keyframes`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     distance_m: float | None = Field(
         None, ge=0.1, le=100.0, description="way from one to the next; null: a quarter of the median range, 0.5 to 4 m"
@@ -139,10 +135,8 @@ class KeyframeConfig(BaseModel):
     turn_deg: float = Field(25.0, ge=1.0, le=180.0, description="turn from one to the next")
 
 
-class LoopConfig(BaseModel):
+class LoopConfig(_Settings):
     """Loop detection and verification; see `mapping.loops.detection`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     max_range_m: float = Field(60.0, ge=1.0, le=10_000.0, description="farther points of a keyframe are left out")
     drift_percent: float = Field(
@@ -162,10 +156,8 @@ class LoopConfig(BaseModel):
         return math.radians(0.02 * self.drift_percent), 0.01 * self.drift_percent
 
 
-class PoseGraphConfig(BaseModel):
+class PoseGraphConfig(_Settings):
     """Keyframes, loop closures and their optimisation; see `mapping.pose_graph.slam_graph`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     enabled: bool = Field(False, description="build a pose graph, close loops, and correct trajectory and map")
     corrects_local_map: bool = Field(

@@ -9,7 +9,8 @@ votes from one or two blocks, does not outvote static structure.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -67,10 +68,6 @@ class Surfels:
     points: Annotated[FloatArray, Shape(None, 3)]
     normals: Annotated[FloatArray, Shape(None, 3)]
     radii: Annotated[FloatArray, Shape(None)]
-
-    def __post_init__(self) -> None:
-        if not len(self.points) == len(self.normals) == len(self.radii):
-            raise ValueError("points, normals and radii differ in length")
 
     @classmethod
     def of(cls, points: FloatArray) -> "Surfels":
@@ -268,34 +265,29 @@ class _Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class PairTests:
-    """Tests of pairs of scans along a direction, a row each."""
+class PairTest:
+    """Votes of a pair of scans for shifts along a direction."""
 
-    numbers: FloatArray  # (P, 2) of the scans
-    directions: FloatArray  # (P, 3) unit vectors in the first one's frame
-    translations: FloatArray  # (P, 3) of the second in the first one's frame, at the tested poses
-    peaks: FloatArray  # (P, 2) the shift with most votes, metres, and its votes
-    near: FloatArray  # (P, 41) votes for the shifts around zero
+    # first, second: numbers of the scans
+    first: int
+    second: int
+    direction: Annotated[FloatArray, Shape(3)]  # unit vector in the first one's frame
+    translation: Annotated[FloatArray, Shape(3)]  # of the second in the first one's frame, at the tested pose
+    # shift_m, votes: of the shift with most votes
+    shift_m: float
+    votes: float
+    near: Annotated[FloatArray, Shape(2 * _NEAR + 1)]  # votes for the shifts around zero
 
-    @classmethod
-    def of(cls, rows: FloatArray) -> "PairTests":
-        """From rows (P, 51) of `_row`."""
-        return cls(*np.split(rows, (2, 5, 8, 10), axis=1))
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def at(self, T_world_lidar: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Votes (P,) for the final poses (N, 4, 4) of all scans, and the distance (P,) of the peaks from them."""
-        first, second = self.numbers.astype(np.intp).T
-        relative = (inverse(T_world_lidar[first]) @ T_world_lidar[second])[:, :3, 3]
-        moved = np.einsum("ij,ij->i", relative - self.translations, self.directions)
-        bins = np.rint(moved / BIN_M).astype(np.intp)[:, None] + np.arange(-_TOLERANCE_BINS, _TOLERANCE_BINS + 1)
-        votes = np.take_along_axis(self.near, np.clip(bins + _NEAR, 0, 2 * _NEAR), axis=1)
-        fitting = np.where(np.abs(bins) <= _NEAR, votes, 0.0).max(axis=1)
-        left = self.peaks[:, 0] - moved
-        at_peak = np.abs(left) <= (_TOLERANCE_BINS + 0.5) * BIN_M
-        return np.where(at_peak, np.maximum(fitting, self.peaks[:, 1]), fitting), left
+    def at(self, T_world_lidar: FloatArray) -> "Contradiction":
+        """The test at the final poses (N, 4, 4) of all scans, whether they are contradicted or not."""
+        T_first_second = inverse(T_world_lidar[self.first]) @ T_world_lidar[self.second]
+        moved = float((T_first_second[:3, 3] - self.translation) @ self.direction)
+        bins = round(moved / BIN_M) + np.arange(-_TOLERANCE_BINS, _TOLERANCE_BINS + 1)
+        fitting = float(self.near[bins[np.abs(bins) <= _NEAR] + _NEAR].max(initial=0.0))
+        left_m = self.shift_m - moved
+        if abs(left_m) <= (_TOLERANCE_BINS + 0.5) * BIN_M:
+            fitting = max(fitting, self.votes)
+        return Contradiction(self.first, self.second, round(left_m, 3), self.votes, fitting, 1)
 
 
 @dataclass(frozen=True)
@@ -315,25 +307,17 @@ class Contradiction:
 class ConsistencyCheck(Stateful):
     """Tests pairs of scans as they come; memory grows with the number of pairs, 0.4 kB each."""
 
+    tests: list[PairTest]
     _kept: list[_Kept]
     _latest: _Candidate | None
     _since_due: int
     _due: int
     _T_due: Annotated[FloatArray, TRANSFORM] | None
-    _rows: list[Annotated[FloatArray, Shape(11 + 2 * _NEAR)]]
 
     def __init__(self) -> None:
-        self._kept = []
+        self.tests, self._kept = [], []
         self._latest = None  # unless it was kept
-        self._since_due = 0
-        self._due = 0
-        self._T_due = None
-        self._rows = []
-
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """Of the scans that were kept last."""
-        return tuple(one.number for one in (*self._kept, self._latest) if one is not None)
+        self._since_due, self._due, self._T_due = 0, 0, None
 
     def add(self, points: FloatArray, number: int, T_world_lidar: FloatArray) -> None:
         """Add the next scan of the map; some are kept and paired with the ones before.
@@ -362,7 +346,7 @@ class ConsistencyCheck(Stateful):
             return
         new = _Kept(latest.number, latest.T_world_lidar, Surfels.of(latest.points))
         for kept in self._kept:
-            self._rows.extend(_tests(kept, new))
+            self.tests += _tests(kept, new)
         self._kept = [*self._kept, new][-_PARTNERS:]
 
     def _is_skipped(self) -> bool:
@@ -370,26 +354,24 @@ class ConsistencyCheck(Stateful):
         every = 1 << int(math.log2(max(1.0, (self._due - 1) / _MANY + 1.0)))
         return (self._due - 1) // _BURST % every != 0
 
-    @property
-    def tests(self) -> PairTests:
-        """All tests."""
-        return PairTests.of(np.array(self._rows).reshape(-1, 11 + 2 * _NEAR))
 
-
-def _tests(first: _Kept, second: _Kept) -> list[FloatArray]:
-    """A row for each direction with enough evidence."""
+def _tests(first: _Kept, second: _Kept) -> list[PairTest]:
+    """A test for each direction with enough evidence."""
     T_first_second = inverse(first.T_world_lidar) @ second.T_world_lidar
     way = T_first_second[:3, 3]
     length_m = float(np.linalg.norm(way))
-    rows = []
+    tests = []
     for direction in [way / length_m] if length_m > _LEAST_WAY_M else [np.eye(3)[0], np.eye(3)[1]]:
         profile = shift_profile(first.surfels, second.surfels, T_first_second, direction)
         if profile is None or profile.max() < LEAST_VOTES:
             continue
         profile = _unambiguous(profile, shift_profile(first.surfels, first.surfels, np.eye(4), direction))
         if profile.max() >= LEAST_VOTES:
-            rows.append(_row(first.number, second.number, direction, way, profile))
-    return rows
+            middle, peak = len(profile) // 2, int(profile.argmax())
+            shift_m, votes = (peak - middle) * BIN_M, float(profile[peak])
+            near = profile[middle - _NEAR : middle + _NEAR + 1].copy()
+            tests.append(PairTest(first.number, second.number, direction, way, shift_m, votes, near))
+    return tests
 
 
 def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArray:
@@ -406,37 +388,20 @@ def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArra
     return np.where(2 * shifts < shifts[alike].min(initial=2 * len(profile)), profile, 0.0)
 
 
-def _row(first: int, second: int, direction: FloatArray, way: FloatArray, profile: FloatArray) -> FloatArray:
-    middle, peak = len(profile) // 2, int(profile.argmax())
-    near = profile[middle - _NEAR : middle + _NEAR + 1]
-    return np.array([first, second, *direction, *way, (peak - middle) * BIN_M, profile[peak], *near])
-
-
-def find_contradictions(tests: PairTests, T_world_lidar: FloatArray) -> tuple[Contradiction, ...]:
+def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) -> tuple[Contradiction, ...]:
     """The stretches where scans clearly fit better at a shift along the way than at their final poses (N, 4, 4)."""
-    known = (tests.numbers < len(T_world_lidar)).all(axis=1)
-    tests = PairTests(*(values[known] for values in vars(tests).values()))
-    if not len(tests):
-        return ()
-    fitting, left_m = tests.at(T_world_lidar)
-    bad = np.flatnonzero((tests.peaks[:, 1] >= LEAST_VOTES) & (fitting < LARGEST_SHARE * tests.peaks[:, 1]))
-    stretches: list[list[int]] = []
-    for row in bad[np.argsort(tests.numbers[bad, 0], kind="stable")]:
-        if stretches and tests.numbers[row, 0] < max(tests.numbers[stretches[-1], 1]):
-            stretches[-1].append(int(row))
+    known = [test.at(T_world_lidar) for test in tests if max(test.first, test.second) < len(T_world_lidar)]
+    bad = [one for one in known if one.votes >= LEAST_VOTES and one.votes_at_pose < LARGEST_SHARE * one.votes]
+    stretches: list[list[Contradiction]] = []
+    for one in sorted(bad, key=lambda one: one.first):
+        if stretches and one.first < max(before.last for before in stretches[-1]):
+            stretches[-1].append(one)
         else:
-            stretches.append([int(row)])
-    least = _LEAST_PAIRS if len(tests) >= _FEW_PAIRS else 1
-    return tuple(_contradiction(tests, rows, fitting, left_m) for rows in stretches if len(rows) >= least)
+            stretches.append([one])
+    least = _LEAST_PAIRS if len(known) >= _FEW_PAIRS else 1
+    return tuple(_together(stretch) for stretch in stretches if len(stretch) >= least)
 
 
-def _contradiction(tests: PairTests, rows: list[int], fitting: FloatArray, left_m: FloatArray) -> Contradiction:
-    clearest = rows[int(np.argmax(tests.peaks[rows, 1] - fitting[rows]))]
-    return Contradiction(
-        first=int(tests.numbers[rows, 0].min()),
-        last=int(tests.numbers[rows, 1].max()),
-        shift_m=round(float(left_m[clearest]), 3),
-        votes=float(tests.peaks[clearest, 1]),
-        votes_at_pose=float(fitting[clearest]),
-        pairs=len(rows),
-    )
+def _together(pairs: list[Contradiction]) -> Contradiction:
+    clearest = max(pairs, key=lambda one: one.votes - one.votes_at_pose)
+    return replace(clearest, first=pairs[0].first, last=max(one.last for one in pairs), pairs=len(pairs))

@@ -78,11 +78,11 @@ class ElevationBias:
         return float(np.hypot(self.scatter, self.systematic))
 
 
-def combined(found: FloatArray) -> ElevationBias | None:
-    """The weighted mean of rows (N, 3) of angle, scatter and systematic deviation; None of none."""
-    if not len(found):
+def combined(biases: Sequence[ElevationBias]) -> ElevationBias | None:
+    """The weighted mean; None of none."""
+    if not biases:
         return None
-    angles, scatters, systematic = found.T
+    angles, scatters, systematic = np.array([(one.angle, one.scatter, one.systematic) for one in biases]).T
     weights = 1.0 / (scatters**2 + systematic**2)
     weights /= weights.sum()
     return ElevationBias(
@@ -206,22 +206,22 @@ def _means(values: FloatArray, group: IntArray) -> FloatArray:
 class ElevationEstimator(Stateful):
     """Takes registered scans, and adjusts those of a stretch once it is complete."""
 
-    _found: Annotated[FloatArray, Shape(None, 3)]  # angle and standard deviations of each stretch
+    _biases: list[ElevationBias]  # of each stretch that shows one
     _scans: list[PlacedPoints]  # of the present stretch
     _edge_m: float
     _one_in: int
 
     def __init__(self) -> None:
-        self._found, self._scans, self._edge_m, self._one_in = np.zeros((0, 3)), [], 1.0, 1
+        self._biases, self._scans, self._edge_m, self._one_in = [], [], 1.0, 1
 
     @property
     def stretches(self) -> int:
         """Number of stretches that show the bias."""
-        return len(self._found)
+        return len(self._biases)
 
     def add(self, scan: SampledScan, mapped: MappedScan) -> None:
         """Add the next scan; a stretch ends where one is not registered."""
-        if len(self._found) == _MOST_STRETCHES:
+        if len(self._biases) == _MOST_STRETCHES:
             return
         if mapped.status is not Status.OK or not mapped.registered:
             self._end()
@@ -242,14 +242,12 @@ class ElevationEstimator(Stateful):
 
     def bias(self) -> ElevationBias | None:
         """The bias by all scans so far; None where they show none."""
-        latest = _row(self._scans, self._edge_m)
-        return combined(np.concatenate([self._found, latest]))
+        return combined(self._with_latest())
 
     def _end(self) -> None:
-        self._found, self._scans = np.concatenate([self._found, _row(self._scans, self._edge_m)]), []
+        self._biases, self._scans = self._with_latest(), []
 
-
-def _row(scans: Sequence[PlacedPoints], edge_m: float) -> FloatArray:
-    """A stretch as a row (1, 3), or none (0, 3)."""
-    bias = estimate_bias(scans, edge_m) if len(scans) >= _FEWEST_OF_STRETCH else None
-    return np.zeros((0, 3)) if bias is None else np.array([[bias.angle, bias.scatter, bias.systematic]])
+    def _with_latest(self) -> list[ElevationBias]:
+        enough = len(self._scans) >= _FEWEST_OF_STRETCH
+        latest = estimate_bias(self._scans, self._edge_m) if enough else None
+        return self._biases if latest is None else [*self._biases, latest]

@@ -21,7 +21,7 @@ from lidarslam.datasets.published.evalio import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat
-from lidarslam.mapping.consistency import PairTests
+from lidarslam.mapping.consistency import PairTest
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.run.checkpoints import describe_computed
@@ -132,7 +132,7 @@ class TrackedPart:
     asked: int
     faults: Faults
     views: Views
-    slides: PairTests
+    slides: list[PairTest]
     stopped: str | None  # why it ended before its last scan
     interrupted: bool  # whether that was an interruption
 

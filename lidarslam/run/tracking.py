@@ -18,7 +18,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
-from lidarslam.mapping.consistency import PairTests
+from lidarslam.mapping.consistency import PairTest
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
@@ -61,7 +61,7 @@ class Tracked:
     faults: Faults  # what was left out of them, and what is wrong with them
     global_map: GlobalMap | None  # of the poses before loop closure; None when no scan was added
     views: Views  # range images of some scans, for the removal of moving objects
-    slides: PairTests  # pairs of scans, for the detection of slips
+    slides: list[PairTest]  # pairs of scans, for the detection of slips
     error: InputError | KeyboardInterrupt | None  # what ended it before its last scan, None when nothing did
     elevation: Elevation | None = None  # the error of the sensor's elevations; None where nothing shows it
 

@@ -99,11 +99,6 @@ class Views(Stateful):
     def __len__(self) -> int:
         return len(self._images)
 
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """Of the scans that the images are of."""
-        return tuple(self._numbers)
-
     def add(self, points: FloatArray, number: int) -> None:
         """Offer the next scan that belongs in the map; one in k becomes an image.
 

@@ -122,10 +122,6 @@ class Voxels:
     sums: Annotated[NDArray[np.float32], Shape(None, None)]  # the earliest point of none is at infinity
     layout: Layout
 
-    def __post_init__(self) -> None:
-        if self.sums.shape != (len(self.keys), self.layout.width):
-            raise ValueError(f"expected sums ({len(self.keys)}, {self.layout.width}), got {self.sums.shape}")
-
     def __len__(self) -> int:
         return len(self.keys)
 

@@ -80,11 +80,6 @@ class Track:
     # standard deviations of attitude and position for each metre of the way, radians and metres
     drift_rates: tuple[float, float]
 
-    def __post_init__(self) -> None:
-        count = len(self.way_m)
-        if self.T_world_lidar.shape != (count, 4, 4) or self.segment.shape != (count,):
-            raise ValueError(f"expected {count} poses and segments, got {len(self.T_world_lidar)}, {len(self.segment)}")
-
     @cached_property
     def _sums(self) -> tuple[FloatArray, FloatArray]:
         """Positions (K + 1, 3) and their squared lengths (K + 1,), summed up from the start."""
@@ -96,10 +91,6 @@ class Track:
     def between(self, first: int, second: int) -> FloatArray:
         """`T_first_second` (4, 4)."""
         return np.asarray(inverse(self.T_world_lidar[first]) @ self.T_world_lidar[second], dtype=np.float64)
-
-    def joins_segments(self, link: RelativePose) -> bool:
-        """Whether the two keyframes are of different segments."""
-        return bool(self.segment[link.first] != self.segment[link.second])
 
     def drift(self, first: NDArray[np.intp], second: int) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (N,) of the second keyframe's attitude and position relative to others (N,).
@@ -132,7 +123,7 @@ class Track:
 
         0 between segments, where no drift model holds.
         """
-        if self.joins_segments(link):
+        if self.segment[link.first] != self.segment[link.second]:
             return 0.0
         xi = log(inverse(self.between(link.first, link.second)) @ link.T_first_second)
         covariance = link.covariance + self.drift_covariance(link.first, link.second)

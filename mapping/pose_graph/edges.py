@@ -121,10 +121,6 @@ class Attitude:
     world: Annotated[FloatArray, Shape(3)]  # (3,) in the world of its recording
     sigma: float  # radians
 
-    def __post_init__(self) -> None:
-        if not self.sigma > 0.0:
-            raise ValueError(f"an attitude has the standard deviation {self.sigma:g}")
-
 
 def measured_attitude(
     scan: GraphScan, keyframes: Sequence[Keyframe], scan_poses: Sequence[FloatArray]

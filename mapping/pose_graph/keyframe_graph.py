@@ -133,16 +133,13 @@ class KeyframeGraph(Stateful):
         """Keep the submap of the last keyframe."""
         self.store.append(means)
 
-    def _begin_keyframe(self, scan: GraphScan) -> None:
+    def _begin_keyframe(self, scan: GraphScan, one_map: bool = True) -> None:
+        """The latest scan becomes a keyframe; with `one_map` it was registered to the same one as the last keyframe."""
         motion, self._motion = self._motion, MotionSinceKeyframe.none()
         if self.keyframes:
             last = self.keyframes[-1]
             T_first_second = inverse(self.scan_poses[last.scan]) @ scan.T_world_lidar
-            key, one_map = len(self.keyframes), self._is_one_map(last.scan, len(self.scan_poses) - 1)
-            self.edges += trajectory_edges(key, T_first_second, motion, last.covariance, scan.covariance, one_map)
+            covariances = last.covariance, scan.covariance
+            self.edges += trajectory_edges(len(self.keyframes), T_first_second, motion, *covariances, one_map)
             self._segment += motion.lost  # the drift model does not hold across
         self.keyframes.append(Keyframe(len(self.scan_poses) - 1, self._segment, self._path_m, scan.covariance))
-
-    def _is_one_map(self, first: int, second: int) -> bool:  # noqa: ARG002
-        """Whether two scans were registered to the same local map, which is drawn anew after loop closures alone."""
-        return True

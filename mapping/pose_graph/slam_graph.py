@@ -13,7 +13,7 @@ import logging
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -31,10 +31,10 @@ from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.edges import ProjectedTrack, drift_covariance, first_connected, squared_error
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph, SubmapStore
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
 from lidarslam.mapping.pose_graph.optimizer import Optimised, RelaxSchedule, optimise, relax
-from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, connected_with_last
+from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, as_registered, connected_with_last
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 logger = logging.getLogger(__name__)
@@ -218,13 +218,11 @@ class SlamGraph(KeyframeGraph):
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
 
-    def _begin_keyframe(self, scan: GraphScan) -> None:
-        super()._begin_keyframe(scan)
+    def _begin_keyframe(self, scan: GraphScan, one_map: bool = True) -> None:
+        last = self.keyframes[-1].scan if self.keyframes else 0
+        super()._begin_keyframe(scan, one_map and not self._laid.is_exchanged(last, len(self.scan_poses) - 1))
         self._chain(self.scan_poses, self.keyframes[-2:-1], self.keyframes[-1])
         self._laid.follow(scan.T_world_lidar)
-
-    def _is_one_map(self, first: int, second: int) -> bool:
-        return not self._laid.is_exchanged(first, second)
 
     def _chain(self, scan_poses: Sequence[FloatArray], before: Sequence[Keyframe], keyframe: Keyframe) -> None:
         """Add the pose of the next keyframe, from the one before it in its recording where there is one."""
@@ -256,45 +254,41 @@ class SlamGraph(KeyframeGraph):
         return [self._closures[row] for row in rows]
 
     def _refined(self, closure: LoopClosure) -> LoopClosure:
-        """A closure registered on all points of both submaps and their neighbours."""
-        cell_m = max(self._detector.cell_m(key) for key in (closure.first, closure.second))
-        near, ends = Neighbourhoods(self.keyframes, self._poses, self.store), (closure.first, closure.second)
-        target, source = (near.submap(key, self._config.loops.max_range_m, cell_m) for key in ends)
-        closure = refine(target, source, closure, near.drift(closure.first) + near.drift(closure.second)) or closure
+        """A closure registered on all points of both submaps and their neighbours, or as registration measured it."""
+        ends = closure.first, closure.second
+        cell_m = max(self._detector.cell_m(key) for key in ends)
+        target, source = (self._dense_submap(key, cell_m) for key in ends)
+        closure = refine(target, source, closure, self._bend(closure.first) + self._bend(closure.second)) or closure
         first, second = self.keyframes[closure.first], self.keyframes[closure.second]
         if first.segment != second.segment:
             return closure
         # Of a recording that was added, it is not known what lay where in the maps that were drawn anew.
         if self._first_scans and any(closure.first < count <= closure.second for count in self.redraws):
             return closure
-        return self._laid.measured(closure, first, second, self.scan_poses)
+        place = self._laid.place(closure.first, first.scan, self.scan_poses[first.scan], second.scan)
+        if place is None:
+            return closure
+        T_odom_first, since = place
+        way = np.array(self.scan_poses[since : second.scan + 1])
+        return as_registered(closure, T_odom_first, way, first.covariance, second.covariance, self._laid.radius_m)
 
+    def _dense_submap(self, key: int, cell_m: float) -> DenseSubmap:
+        """A keyframe's submap united with its neighbours'."""
+        T_keyframe_world = inverse(self._poses[key])
+        submaps = [(T_keyframe_world @ self._poses[k], means_points(self.store[k])) for k in self._around(key)]
+        return DenseSubmap.join(submaps, self._config.loops.max_range_m, cell_m)
 
-def _by_key(items: Sequence[T], key: Callable[[T], int]) -> dict[int, list[T]]:
-    """Items of keyframes, in their order."""
-    return {one: list(group) for one, group in groupby(items, key)}
-
-
-@dataclass(frozen=True, eq=False)
-class Neighbourhoods:
-    """The keyframes with submaps, their poses and submaps."""
-
-    keyframes: Sequence[Keyframe]
-    poses: Sequence[FloatArray]  # (4, 4) of keyframes, as estimated now
-    submaps: SubmapStore
-
-    def submap(self, key: int, max_range_m: float, cell_m: float) -> DenseSubmap:
-        """A keyframe's submap united with its neighbours' of the same segment."""
-        T_keyframe_world = inverse(self.poses[key])
-        submaps = [(T_keyframe_world @ self.poses[k], means_points(self.submaps[k])) for k in self._around(key)]
-        return DenseSubmap.join(submaps, max_range_m, cell_m)
-
-    def drift(self, key: int) -> FloatArray:
-        """(6, 6) of a keyframe's neighbours relative to it; each axis has a third of the squared error."""
+    def _bend(self, key: int) -> FloatArray:
+        """(6, 6) drift of a keyframe's neighbours relative to it; each axis has a third of the squared error."""
         path_m = self.keyframes[key].path_m
         return drift_covariance(max(abs(self.keyframes[k].path_m - path_m) for k in self._around(key))) / 3.0
 
     def _around(self, key: int) -> list[int]:
         """A keyframe with those beside it in its segment that have submaps by now."""
-        near = range(max(0, key - REACH), min(len(self.submaps), key + REACH + 1))
+        near = range(max(0, key - REACH), min(len(self.store), key + REACH + 1))
         return [k for k in near if self.keyframes[k].segment == self.keyframes[key].segment]
+
+
+def _by_key(items: Sequence[T], key: Callable[[T], int]) -> dict[int, list[T]]:
+    """Items of keyframes, in their order."""
+    return {one: list(group) for one, group in groupby(items, key)}

@@ -65,7 +65,7 @@ class SubmapPlacement(Stateful):
     _drawn: list[Drawn]
 
     def __init__(self, radius_m: float) -> None:
-        self._radius_m = radius_m
+        self.radius_m = radius_m
         self._poses, self._held, self._drawn = [], [], []
 
     def __len__(self) -> int:
@@ -75,7 +75,7 @@ class SubmapPlacement(Stateful):
         """The next keyframe begins; what is beyond the radius is forgotten."""
         self._held.append(len(self._poses))
         self._poses.append(T_odom_keyframe)
-        near = self._distances(np.array([self._poses[key] for key in self._held])) < self._radius_m
+        near = self._distances(np.array([self._poses[key] for key in self._held])) < self.radius_m
         self._held = [key for key, is_near in zip(self._held, near, strict=True) if is_near]
 
     def redrawn(
@@ -95,7 +95,7 @@ class SubmapPlacement(Stateful):
             submap: of a keyframe.
             scan: the latest one, which is not in the map.
         """
-        relative = np.where(members, self._distances(targets) / self._radius_m, np.inf)
+        relative = np.where(members, self._distances(targets) / self.radius_m, np.inf)
         is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()
         if not is_missing and not self._is_off(targets, np.flatnonzero(relative < _RIGHT_WITHIN), cell_m):
             return None
@@ -105,7 +105,7 @@ class SubmapPlacement(Stateful):
         held = [submap(key).rows for key in self._held]
         step = 1 + sum(map(len, held)) // _MOST_POINTS
         submaps = [(targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True)]
-        return draw_local_map(submaps, cell_m, max(self._radius_m, *(_reach_m(rows) for rows in held)))
+        return draw_local_map(submaps, cell_m, max(self.radius_m, *(_reach_m(rows) for rows in held)))
 
     def _is_off(self, targets: FloatArray, near: NDArray[np.intp], cell_m: float) -> bool:
         """Whether one of the submaps of keyframes (N,) lies elsewhere than it should."""
@@ -137,23 +137,6 @@ class SubmapPlacement(Stateful):
         if row == len(drawn.keys) or drawn.keys[row] != key:
             return None
         return drawn.T_odom_keyframe[row], drawn.since
-
-    def measured(
-        self, closure: LoopClosure, first: Keyframe, second: Keyframe, scan_poses: Sequence[FloatArray]
-    ) -> LoopClosure:
-        """The closure as registration measured it, where the local map held the first keyframe's submap.
-
-        Args:
-            closure: of two keyframes.
-            first, second: the keyframes.
-            scan_poses: (4, 4) of all scans, as registered.
-        """
-        place = self.place(closure.first, first.scan, scan_poses[first.scan], second.scan)
-        if place is None:
-            return closure
-        T_odom_first, since = place
-        way = np.array(scan_poses[since : second.scan + 1])
-        return as_registered(closure, T_odom_first, way, first.covariance, second.covariance, self._radius_m)
 
     def _distances(self, poses: FloatArray) -> FloatArray:
         """(K,) of poses (K, 4, 4) from the last keyframe."""
