@@ -39,7 +39,7 @@ def track(rng: np.random.Generator) -> ProjectedTrack:
     return ProjectedTrack(gnss, antenna, 1.0)
 
 
-def test_positions_take_the_drift_away_and_outliers_are_rejected(track: ProjectedTrack) -> None:
+def test_positions_take_the_drift_away_and_outliers_are_rejected(track):
     true, drifted = drive(0.0), drive(2e-4)
     scans = np.arange(0, SCANS, EVERY)
     registered = Trajectory(PERIOD_S * np.arange(SCANS), drifted)
@@ -59,7 +59,7 @@ def test_positions_take_the_drift_away_and_outliers_are_rejected(track: Projecte
     assert len(rejected) < 70
 
 
-def test_positions_outside_of_the_run_are_refused(track: ProjectedTrack) -> None:
+def test_positions_outside_of_the_run_are_refused(track):
     later = Trajectory(1000.0 + PERIOD_S * np.arange(SCANS), drive(0.0))
     with pytest.raises(TooFewPositionsError, match="0 GNSS positions are within the time of the run"):
         track.aligned(later)

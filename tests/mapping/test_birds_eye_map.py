@@ -22,13 +22,7 @@ def points(rng: np.random.Generator, l_shaped_room: RoomPoints) -> FloatArray:
 
 @pytest.mark.parametrize("turned_deg", [0.0, 77.0, 180.0, -130.0])
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (-2.5, 3.0, -0.4), (4.0, -1.5, 0.5)])
-def test_place_turn_and_height_are_found(
-    rng: np.random.Generator,
-    l_shaped_room: RoomPoints,
-    points: FloatArray,
-    place: tuple[float, float, float],
-    turned_deg: float,
-) -> None:
+def test_place_turn_and_height_are_found(rng, l_shaped_room, points, place, turned_deg):
     true = exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
     true[:3, 3] = place
     scan = transform_points(inverse(true), l_shaped_room(rng, 4_000))
@@ -38,9 +32,7 @@ def test_place_turn_and_height_are_found(
     assert np.rad2deg(rotation_angle(inverse(true) @ best)) < 6.0
 
 
-def test_in_a_tilted_world_the_lean_is_kept(
-    rng: np.random.Generator, l_shaped_room: RoomPoints, points: FloatArray
-) -> None:
+def test_in_a_tilted_world_the_lean_is_kept(rng, l_shaped_room, points):
     tilt = exp([0.2, -0.1, 0.0, 1.0, 2.0, 3.0])
     true = tilt @ exp([0.0, 0.0, 1.0, 1.0, -1.0, 0.0])
     scan = transform_points(inverse(true), transform_points(tilt, l_shaped_room(rng, 4_000)))
@@ -50,12 +42,12 @@ def test_in_a_tilted_world_the_lean_is_kept(
     assert np.rad2deg(rotation_angle(inverse(true) @ best)) < 6.0
 
 
-def test_what_shows_nothing_upright_lies_nowhere(points: FloatArray) -> None:
+def test_what_shows_nothing_upright_lies_nowhere(points):
     floor = np.column_stack([np.random.default_rng(0).uniform(-3.0, 3.0, (500, 2)), np.full(500, -1.0)])
     assert complete(BirdsEyeMap.of(points, UP, 0.4).find(floor, np.eye(4), 12.0, 5)).shape == (0, 4, 4)
 
 
-def test_no_two_places_are_the_same(rng: np.random.Generator, l_shaped_room: RoomPoints, points: FloatArray) -> None:
+def test_no_two_places_are_the_same(rng, l_shaped_room, points):
     poses = complete(BirdsEyeMap.of(points, UP, 0.4).find(l_shaped_room(rng, 4_000), np.eye(4), 12.0, 20))
     assert len(poses) == 20
     for one, other in pairwise(poses):

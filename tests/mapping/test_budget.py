@@ -13,7 +13,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking import attempts, start_poses
-from lidarslam.mapping.tracking.budget import Budget, Steps, complete
+from lidarslam.mapping.tracking.budget import Budget, Steps
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.motion import mount_pose
@@ -53,7 +53,7 @@ def counting(last: int) -> Steps[str]:
     return "done"
 
 
-def test_without_a_budget_no_time_is_ever_spent() -> None:
+def test_without_a_budget_no_time_is_ever_spent():
     clock = FakeClock()
     budget = Budget(None, clock)
     for _ in range(5):
@@ -63,7 +63,7 @@ def test_without_a_budget_no_time_is_ever_spent() -> None:
         assert budget.run(counting(100)) == ("done",)
 
 
-def test_a_computation_pauses_when_the_time_is_spent_and_goes_on() -> None:
+def test_a_computation_pauses_when_the_time_is_spent_and_goes_on():
     clock = FakeClock()
     budget = Budget(10.0, clock)
     for _ in range(2):
@@ -88,7 +88,7 @@ def test_a_computation_pauses_when_the_time_is_spent_and_goes_on() -> None:
     assert pauses == 3
 
 
-def test_a_computation_goes_on_even_where_nothing_is_left() -> None:
+def test_a_computation_goes_on_even_where_nothing_is_left():
     clock = FakeClock()
     budget = Budget(10.0, clock)
     for _ in range(3):
@@ -106,7 +106,7 @@ def taking(clock: FakeClock, steps: int) -> Steps[None]:
         yield
 
 
-def test_auto_is_half_of_the_shorter_of_the_last_two_intervals() -> None:
+def test_auto_is_half_of_the_shorter_of_the_last_two_intervals():
     clock = FakeClock()
     budget = Budget("auto", clock)
     for interval_s, length_s in ((np.inf, np.inf), (0.1, np.inf), (0.1, 0.05), (5.0, 0.05), (0.1, 0.05), (0.2, 0.05)):
@@ -115,10 +115,6 @@ def test_auto_is_half_of_the_shorter_of_the_last_two_intervals() -> None:
         assert not budget.is_spent
         clock.s += 0.002
         assert budget.is_spent == np.isfinite(length_s)
-
-
-def test_a_complete_computation_gives_its_result() -> None:
-    assert complete(counting(3)) == "done"
 
 
 @pytest.fixture(scope="module")
@@ -150,9 +146,7 @@ def results(mapper: Mapper, faulty: Faulty, clock: FakeClock, first: int = 0) ->
 
 
 @pytest.mark.parametrize("fault", ["carried", "covered"])
-def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(
-    simulation: Simulation, clock: FakeClock, fault: str
-) -> None:
+def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(simulation, clock, fault):
     if fault == "carried":
         faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
     else:
@@ -168,7 +162,7 @@ def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_re
             assert np.linalg.norm(one.state.T_world_lidar[:3, 3] - T[:3, 3]) < 0.1
 
 
-def test_without_a_budget_the_same_search_takes_one_scan(simulation: Simulation, clock: FakeClock) -> None:
+def test_without_a_budget_the_same_search_takes_one_scan(simulation, clock):
     faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
     mapper = Mapper(MappingConfig(), clock=clock)
     mapped = list(results(mapper, faulty, clock))
@@ -176,7 +170,7 @@ def test_without_a_budget_the_same_search_takes_one_scan(simulation: Simulation,
     assert mapped[AT].message.startswith("relocalised")
 
 
-def test_a_search_that_was_under_way_begins_anew_after_a_resumption(simulation: Simulation, clock: FakeClock) -> None:
+def test_a_search_that_was_under_way_begins_anew_after_a_resumption(simulation, clock):
     faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
     config = MappingConfig(budget_ms=BUDGET_MS)
     mapper = Mapper(config, clock=clock)

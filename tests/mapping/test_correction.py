@@ -23,19 +23,7 @@ def along_x(positions: list[float]) -> FloatArray:
     return T
 
 
-def test_what_was_not_corrected_does_not_change(trajectory: FloatArray) -> None:
-    keyframes = np.array([3, 10, 11, 30])
-    moved = corrected(trajectory, keyframes, trajectory[keyframes])
-    np.testing.assert_allclose(moved, trajectory, atol=1e-12)
-
-
-def test_far_from_the_origin_it_does_not_change_either(trajectory: FloatArray) -> None:
-    far = FAR @ trajectory
-    keyframes = np.array([0, 20, 39])
-    np.testing.assert_allclose(corrected(far, keyframes, far[keyframes]), far, atol=1e-9)
-
-
-def test_where_the_world_lies_does_not_matter(trajectory: FloatArray, rng: np.random.Generator) -> None:
+def test_where_the_world_lies_does_not_matter(trajectory, rng):
     keyframes = np.array([5, 12, 33])
     poses = trajectory[keyframes] @ exp(rng.normal(size=(3, 6)) * 0.3)
     here = corrected(trajectory, keyframes, poses)
@@ -43,13 +31,13 @@ def test_where_the_world_lies_does_not_matter(trajectory: FloatArray, rng: np.ra
     np.testing.assert_allclose(there, FAR @ here, atol=1e-8)
 
 
-def test_keyframes_get_exactly_their_poses(trajectory: FloatArray, rng: np.random.Generator) -> None:
+def test_keyframes_get_exactly_their_poses(trajectory, rng):
     keyframes = np.array([5, 12, 13, 33])
     poses = exp(rng.normal(size=(4, 6)))
     np.testing.assert_array_equal(corrected(trajectory, keyframes, poses)[keyframes], poses)
 
 
-def test_a_rigid_move_of_all_keyframes_moves_everything(trajectory: FloatArray) -> None:
+def test_a_rigid_move_of_all_keyframes_moves_everything(trajectory):
     keyframes = np.array([5, 12, 33])
     move = exp([0.4, -0.2, 1.5, 10.0, 20.0, -3.0])
     np.testing.assert_allclose(
@@ -57,9 +45,7 @@ def test_a_rigid_move_of_all_keyframes_moves_everything(trajectory: FloatArray) 
     )
 
 
-def test_before_the_first_and_after_the_last_the_motion_to_them_is_kept(
-    trajectory: FloatArray, rng: np.random.Generator
-) -> None:
+def test_before_the_first_and_after_the_last_the_motion_to_them_is_kept(trajectory, rng):
     keyframes = np.array([5, 33])
     poses = trajectory[keyframes] @ exp(rng.normal(size=(2, 6)))
     moved = corrected(trajectory, keyframes, poses)
@@ -68,24 +54,24 @@ def test_before_the_first_and_after_the_last_the_motion_to_them_is_kept(
         np.testing.assert_allclose(inverse(poses[key]) @ moved[scans], kept, atol=1e-12)
 
 
-def test_what_is_missing_is_spread_by_the_path() -> None:
+def test_what_is_missing_is_spread_by_the_path():
     """The second keyframe was 1 m too near; three quarters of the way lie behind the third scan."""
     moved = corrected(along_x([0.0, 2.0, 6.0, 8.0]), np.array([0, 3]), along_x([0.0, 9.0]))
     np.testing.assert_allclose(moved, along_x([0.0, 2.25, 6.75, 9.0]), atol=1e-12)
 
 
-def test_standing_still_it_is_spread_by_the_scans() -> None:
+def test_standing_still_it_is_spread_by_the_scans():
     moved = corrected(along_x([3.0] * 5), np.array([0, 4]), along_x([3.0, 4.0]))
     np.testing.assert_allclose(moved, along_x([3.0, 3.25, 3.5, 3.75, 4.0]), atol=1e-12)
 
 
-def test_stretches_between_keyframes_do_not_mix() -> None:
+def test_stretches_between_keyframes_do_not_mix():
     """Still in the first, driving in the second."""
     moved = corrected(along_x([0.0, 0.0, 0.0, 1.0, 4.0]), np.array([0, 2, 4]), along_x([0.0, 1.0, 7.0]))
     np.testing.assert_allclose(moved, along_x([0.0, 0.5, 1.0, 2.5, 7.0]), atol=1e-12)
 
 
-def test_a_turn_that_was_missed_is_made_up_for_evenly() -> None:
+def test_a_turn_that_was_missed_is_made_up_for_evenly():
     """Half-way, a scan is as far from where the first keyframe has it as from where the second has it."""
     before = along_x([0.0, 2.0, 4.0, 8.0])
     poses = before[[0, 3]] @ exp([[0.0] * 6, [0.1, 0.0, 0.4, 0.0, 0.5, 0.0]])
@@ -98,6 +84,6 @@ def test_a_turn_that_was_missed_is_made_up_for_evenly() -> None:
 
 
 @pytest.mark.parametrize("keyframes", [[], [3, 3], [5, 3]])
-def test_keyframes_must_increase(trajectory: FloatArray, keyframes: list[int]) -> None:
+def test_keyframes_must_increase(trajectory, keyframes):
     with pytest.raises(ValueError, match="keyframe"):
         corrected(trajectory, np.array(keyframes, dtype=np.intp), np.tile(np.eye(4), (len(keyframes), 1, 1)))

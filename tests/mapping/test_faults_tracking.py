@@ -3,14 +3,12 @@
 Offices and tunnels scanned by a simulated VLP-16 of few columns; poses, statuses and the map against the truth.
 """
 
-from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from simulated_faults import (
-    Cover,
     Faulty,
     carried_off,
     covered,
@@ -40,7 +38,6 @@ from lidarslam.simulation.world import World, build_world
 AT = 70
 COUNT = 100
 NOTHING = Prior()
-Start = Callable[[], Mapper]
 
 
 def light(name: str = "vlp-16") -> Sensor:
@@ -123,9 +120,7 @@ def polluted_share(results: list[MappedScan], recorded: Faulty, simulation: Simu
 
 
 @pytest.mark.parametrize("cover", ["empty", "near", "stray"])
-def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(
-    mapper: Mapper, drive_by: Simulation, cover: Cover
-) -> None:
+def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(mapper, drive_by, cover):
     """For one second, while it moves on; more scans than after which a map is given up."""
     recorded = covered(drive_by, AT, AT + 10, cover)
     held = len(mapper.local_map or ())
@@ -140,7 +135,7 @@ def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(
     assert polluted_share(results, recorded, drive_by) < 0.02
 
 
-def test_a_first_scan_of_stray_points_begins_no_map(drive_by: Simulation) -> None:
+def test_a_first_scan_of_stray_points_begins_no_map(drive_by):
     recorded = covered(drive_by, 0, 3, "stray")
     mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in recorded.scans[:3]]
@@ -150,7 +145,7 @@ def test_a_first_scan_of_stray_points_begins_no_map(drive_by: Simulation) -> Non
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
-def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: Simulation, turned_deg: float) -> None:
+def test_carried_5_m_back_it_finds_itself_in_its_map(mapper, drive_by, turned_deg):
     back = index_back(drive_by, AT, 5.0)
     recorded = carried_off(drive_by, AT, back, turned_deg)
     moved = recorded.truth.positions[AT] - recorded.truth.positions[AT - 1]
@@ -166,7 +161,7 @@ def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: S
 
 
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
-def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper: Mapper, drive_by: Simulation) -> None:
+def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper, drive_by):
     """In a tunnel it begins a map that is told to be a guess; back in the office, it is in its first map again."""
     tunnel = build_world("tunnel", 0)
     motion = motion_along_route("tracked", tunnel, 0)
@@ -186,14 +181,14 @@ def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper: Mapper, d
 
 
 @pytest.mark.parametrize("count", [1, 3, 10])
-def test_dropped_scans_do_no_harm(mapper: Mapper, drive_by: Simulation, count: int) -> None:
+def test_dropped_scans_do_no_harm(mapper, drive_by, count):
     recorded = dropped(drive_by, range(AT, AT + count))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded)
 
 
-def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive_by: Simulation) -> None:
+def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper, drive_by):
     recorded = dropped(replace(drive_by, scan_count=AT + 75), range(AT, AT + 50))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
@@ -201,7 +196,7 @@ def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive
 
 
 @pytest.mark.parametrize(("acceleration_deg", "rate_deg"), [(600.0, 180.0), (1500.0, 250.0)])
-def test_sudden_turns_on_the_spot_are_followed(acceleration_deg: float, rate_deg: float) -> None:
+def test_sudden_turns_on_the_spot_are_followed(acceleration_deg, rate_deg):
     """After four seconds of rest as fast as that one way round, then the other; nothing tells but the scans."""
     world = build_world("hall", 0)
     route = motion_along_route("tracked", world, 0)
@@ -236,7 +231,7 @@ def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> 
 
 
 @pytest.mark.parametrize("name", ["office", pytest.param("forest", marks=pytest.mark.slow)])
-def test_nothing_drifts_while_the_sensor_stands_still(name: str) -> None:
+def test_nothing_drifts_while_the_sensor_stands_still(name):
     """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 200 scans."""
     recorded = stand(build_world(name, 0), 200)
     mapper = Mapper(MappingConfig())
@@ -249,7 +244,7 @@ def test_nothing_drifts_while_the_sensor_stands_still(name: str) -> None:
 
 
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
-def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office: World) -> None:
+def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office):
     recorded = stand(office, 80, np.array([0.8, -0.8, 0.9, -0.9, 1.0, -1.1, 1.2]))
     mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
@@ -260,7 +255,7 @@ def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office: World) ->
 
 
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
-def test_an_even_tunnel_is_told_to_say_nothing_along_it() -> None:
+def test_an_even_tunnel_is_told_to_say_nothing_along_it():
     world = even_tunnel(12.0, 60.0, 65.0)
     motion = motion_along(straight_drive(65.0, 4.0, 1.5), world, on_ground=False)
     sensor = light()
@@ -277,7 +272,7 @@ def test_an_even_tunnel_is_told_to_say_nothing_along_it() -> None:
     assert all("degenerate along" in result.message for result in concerned)
 
 
-def test_a_scan_that_fits_two_places_alike_is_at_neither(rng: np.random.Generator) -> None:
+def test_a_scan_that_fits_two_places_alike_is_at_neither(rng):
     """A plain room looks the same after half a turn."""
     half = np.array([5.0, 3.0, 1.5])
 

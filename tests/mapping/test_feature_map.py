@@ -1,14 +1,12 @@
 """Maps of edges and planar points: their lines and planes, and registration to them, against known truth."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
-from lidarslam.core.state import Saved, State, decode
+from lidarslam.core.state import decode
 from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE
 from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
 from lidarslam.mapping.motion.deskew import Sweep
@@ -18,8 +16,6 @@ from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 
-ThroughDisk = Callable[[State], Saved]
-Grass = Callable[[np.random.Generator, float], tuple[FloatArray, FloatArray]]
 ORIGIN = np.zeros(3)
 CELL_M = 0.2
 
@@ -44,7 +40,7 @@ def map_of(edges: FloatArray, planes: FloatArray, cell_m: float = CELL_M, radius
 NONE = np.empty((0, 3))
 
 
-def test_a_voxel_has_the_mean_of_its_points(rng: np.random.Generator) -> None:
+def test_a_voxel_has_the_mean_of_its_points(rng):
     clouds = [rng.uniform(-3.0, 3.0, (2000, 3)) for _ in range(3)]
     grid = VoxelGrid(0.5)
     for cloud in clouds:
@@ -56,7 +52,7 @@ def test_a_voxel_has_the_mean_of_its_points(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(grid.means[np.argsort(grid._keys)], means, atol=1e-12)
 
 
-def test_a_full_voxel_stays_as_it_is(rng: np.random.Generator) -> None:
+def test_a_full_voxel_stays_as_it_is(rng):
     grid = VoxelGrid(1.0)
     grid.insert(rng.uniform(0.1, 0.2, (60, 3)))
     before = grid.means
@@ -64,7 +60,7 @@ def test_a_full_voxel_stays_as_it_is(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(grid.means, before)
 
 
-def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng: np.random.Generator) -> None:
+def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng):
     points = rng.uniform(-10.0, 10.0, (2000, 3))
     feature_map = map_of(points[:500], points[500:], radius_m=8.0)
     sensor = np.array([5.0, 0.0, 0.0])
@@ -74,7 +70,7 @@ def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng: np.random.Generato
         assert np.linalg.norm(grid.means - sensor, axis=1).max() < 8.0
 
 
-def test_a_map_of_other_cells_has_the_same_points(rng: np.random.Generator) -> None:
+def test_a_map_of_other_cells_has_the_same_points(rng):
     points = rng.uniform(-3.0, 3.0, (3000, 3))
     fine, coarse = map_of(points[:900], points[900:], 0.1), map_of(points[:900], points[900:], 0.4)
     resized = fine.resized(0.4)
@@ -85,7 +81,7 @@ def test_a_map_of_other_cells_has_the_same_points(rng: np.random.Generator) -> N
         assert len(found) == pytest.approx(len(expected), rel=0.2)
 
 
-def test_a_restored_map_goes_on(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+def test_a_restored_map_goes_on(rng, through_disk):
     whole = map_of(rng.uniform(-4.0, 4.0, (1000, 3)), rng.uniform(-4.0, 4.0, (2000, 3)), 0.3)
     restored = FeatureMap(1.0, 1.0)
     restored.restore(through_disk(whole.state()))
@@ -97,7 +93,7 @@ def test_a_restored_map_goes_on(rng: np.random.Generator, through_disk: ThroughD
             add(held, more[:1000], more[1000:])
 
 
-def test_a_local_map_is_restored_as_what_it_is(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+def test_a_local_map_is_restored_as_what_it_is(rng, through_disk):
 
     whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
     saved = through_disk({"map": whole.state()})
@@ -109,7 +105,7 @@ def on_plane(rng: np.random.Generator, count: int, noise_m: float = 0.0) -> Floa
     return np.column_stack([rng.uniform(-3.0, 3.0, (count, 2)), 1.0 + noise_m * rng.standard_normal(count)])
 
 
-def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng: np.random.Generator) -> None:
+def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng):
     points = on_plane(rng, 20_000, 0.01)
     feature_map, asked = map_of(NONE, points), on_plane(rng, 200)[:, :]
     found = feature_map.match(asked, np.eye(4))
@@ -127,14 +123,14 @@ def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng: np.random
         assert found.tilt[row] == pytest.approx(np.sqrt(variance / (number * values[1])))
 
 
-def test_the_normal_of_a_plane_faces_the_sensor(rng: np.random.Generator) -> None:
+def test_the_normal_of_a_plane_faces_the_sensor(rng):
     feature_map, asked = map_of(NONE, on_plane(rng, 20_000)), on_plane(rng, 50)
     for z, side in ((5.0, 1.0), (-5.0, -1.0)):
         found = feature_map.match(asked, exp([0, 0, 0, 0, 0, z]))
         np.testing.assert_allclose(found.normals, np.tile([0.0, 0.0, side], (50, 1)), atol=1e-6)
 
 
-def test_a_line_has_two_residuals_the_first_along_the_distance(rng: np.random.Generator) -> None:
+def test_a_line_has_two_residuals_the_first_along_the_distance(rng):
     along = rng.uniform(-3.0, 3.0, 3000)
     edges = np.column_stack([along, np.full((3000, 2), [2.0, -1.0])]) + 0.005 * rng.standard_normal((3000, 3))
     asked = np.array([[0.5, 2.05, -1.0], [-0.7, 2.0, -0.9]])
@@ -148,20 +144,14 @@ def test_a_line_has_two_residuals_the_first_along_the_distance(rng: np.random.Ge
 
 
 @pytest.mark.parametrize("held", [0, 4])
-def test_fewer_than_five_voxels_make_no_plane(rng: np.random.Generator, held: int) -> None:
+def test_fewer_than_five_voxels_make_no_plane(rng, held):
     middles = CELL_M * (np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])[:held] + 0.5)
     points = (middles[:, None] + rng.uniform(-0.05, 0.05, (held, 50, 3)) * [1, 1, 0]).reshape(-1, 3)
     assert len(map_of(NONE, points).match(middles, np.eye(4))) == 0
 
 
-def test_points_of_one_ring_make_no_plane(rng: np.random.Generator) -> None:
-    """Noise gives them any."""
-    ring = np.column_stack([rng.uniform(-0.45, 0.45, 40), 0.02 * rng.standard_normal((40, 2))])
-    assert len(map_of(NONE, ring).match(np.array([[0.01, 0.01, 0.01]]), np.eye(4))) == 0
-
-
 @pytest.mark.parametrize("heights_m", [[0.0], [0.0, 0.35]], ids=["one ring", "two rings"])
-def test_the_plane_of_a_ring_s_beams_is_no_surface(rng: np.random.Generator, heights_m: list[float]) -> None:
+def test_the_plane_of_a_ring_s_beams_is_no_surface(rng, heights_m):
     """Of a wall seen by one ring, ranges scatter more than elevations."""
     count = 400 * len(heights_m)
     wall = np.column_stack([np.full(count, 10.0), rng.uniform(-2.0, 2.0, count), np.resize(heights_m, count)])
@@ -174,7 +164,7 @@ def test_the_plane_of_a_ring_s_beams_is_no_surface(rng: np.random.Generator, hei
         assert np.abs(found.normals[:, 0]).min() > 0.95
 
 
-def test_across_a_corner_a_plane_is_uncertain(rng: np.random.Generator) -> None:
+def test_across_a_corner_a_plane_is_uncertain(rng):
     sides = rng.uniform(0.0, 1.0, (2, 4000, 3)) * [1.0, 1.0, 2.0]
     sides[0, :, 0], sides[1, :, 1] = 0.0, 0.0
     feature_map = map_of(NONE, sides.reshape(-1, 3))
@@ -184,7 +174,7 @@ def test_across_a_corner_a_plane_is_uncertain(rng: np.random.Generator) -> None:
     assert thickness_m[0] > 3.0 * thickness_m[1]
 
 
-def test_where_the_finest_voxels_are_too_few_coarser_ones_have_the_plane(rng: np.random.Generator) -> None:
+def test_where_the_finest_voxels_are_too_few_coarser_ones_have_the_plane(rng):
     feature_map, asked = map_of(NONE, on_plane(rng, 150, 0.005)), on_plane(rng, 50)
     assert len(feature_map.match(asked, np.eye(4), 2)) > 45
     found = feature_map.match(asked, np.eye(4))
@@ -235,16 +225,14 @@ def registered(
 
 
 @pytest.mark.parametrize(("edges", "planes"), [(200, 600), (600, 0), (0, 600)])
-def test_a_motion_is_found(rng: np.random.Generator, edges: int, planes: int) -> None:
+def test_a_motion_is_found(rng, edges, planes):
     found = registered(rng, edges, planes, hall(rng))
-    assert found is not None
     np.testing.assert_allclose(log(inverse(T_TRUE) @ found.T_world_lidar), 0.0, atol=1e-3)
     assert found.degeneracy.names == ()
 
 
-def test_along_a_corridor_the_prediction_is_kept_and_the_covariance_grows(rng: np.random.Generator) -> None:
+def test_along_a_corridor_the_prediction_is_kept_and_the_covariance_grows(rng):
     found = registered(rng, 300, 900, hall(rng, (1, 2), (0,)), (1, 2), (0,))
-    assert found is not None
     assert found.degeneracy.names == ("x",)
     error = (found.T_world_lidar - T_TRUE)[:3, 3]
     assert error[0] == pytest.approx((T_TRUE @ CLOSE - T_TRUE)[0, 3], abs=0.01)
@@ -253,18 +241,17 @@ def test_along_a_corridor_the_prediction_is_kept_and_the_covariance_grows(rng: n
     assert along @ found.covariance[3:6, 3:6] @ along == pytest.approx(COVARIANCE[3, 3], rel=0.05)
 
 
-def test_too_few_correspondences_make_no_pose(rng: np.random.Generator) -> None:
+def test_too_few_correspondences_make_no_pose(rng):
     feature_map = hall(rng)
     assert registered(rng, 20, 20, feature_map) is None
     assert registered(rng, 100, 300, FeatureMap(CELL_M, 100.0)) is None
 
 
-def test_the_covariance_is_no_smaller_than_the_errors(rng: np.random.Generator) -> None:
+def test_the_covariance_is_no_smaller_than_the_errors(rng):
     """Of independent noise; the errors of real scans are correlated, and the covariance allows for that."""
     feature_map, errors, stated = hall(rng), [], []
     for _ in range(30):
         found = registered(rng, 100, 300, feature_map, noise_m=0.02)
-        assert found is not None
         errors.append(log(inverse(T_TRUE) @ found.T_world_lidar))
         stated.append(np.diag(found.covariance)[:6])
     ratio = np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0)
@@ -272,13 +259,13 @@ def test_the_covariance_is_no_smaller_than_the_errors(rng: np.random.Generator) 
     assert (ratio < 100.0).all()
 
 
-def test_the_vertical_is_that_of_the_floor(rng: np.random.Generator) -> None:
+def test_the_vertical_is_that_of_the_floor(rng):
     tilt = exp([0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
     feature_map = map_of(NONE, transform_points(tilt, on_faces(rng, 60_000)))
     np.testing.assert_allclose(feature_map.vertical(), tilt[:3, 2], atol=0.01)
 
 
-def test_large_surfaces_go_on(rng: np.random.Generator) -> None:
+def test_large_surfaces_go_on(rng):
     faces = on_faces(rng, 60_000)
     person = np.array([1.0, 1.0, 0.0]) + rng.uniform(-1.0, 1.0, (600, 3)) * [0.2, 0.0, 0.2]
     feature_map = map_of(NONE, np.concatenate([faces, person]))
@@ -288,7 +275,7 @@ def test_large_surfaces_go_on(rng: np.random.Generator) -> None:
     assert not feature_map.goes_on(board, np.array([[0.0, 1.0, 0.0]]), ORIGIN, 0.94, 0.08).any()
 
 
-def test_in_grass_a_wider_plane_is_taken(rng: np.random.Generator, grass_on_a_slope: Grass) -> None:
+def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):
     """Through the finest voxels, planes are 2.1 degrees off."""
     points, normal = grass_on_a_slope(rng, 0.16)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]

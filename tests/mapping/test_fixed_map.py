@@ -75,7 +75,7 @@ def localised(room: Any, room_map: FixedMap) -> tuple[MapLocaliser, list[MappedS
     return localiser, localise(localiser, scan_along(room))
 
 
-def test_is_found_without_a_guess_and_tracked(localised: tuple[MapLocaliser, list[MappedScan]]) -> None:
+def test_is_found_without_a_guess_and_tracked(localised):
     localiser, mapped = localised
     (found,) = localiser.found
     assert found.scan < 15
@@ -89,9 +89,7 @@ def test_is_found_without_a_guess_and_tracked(localised: tuple[MapLocaliser, lis
     assert not any(one.added for one in mapped)
 
 
-def test_scans_before_the_place_are_placed_by_the_recordings_own_map(
-    localised: tuple[MapLocaliser, list[MappedScan]],
-) -> None:
+def test_scans_before_the_place_are_placed_by_the_recordings_own_map(localised):
     localiser, _ = localised
     first = localiser.found[0].scan
     assert localiser.placed_afterwards == list(range(first))
@@ -99,7 +97,7 @@ def test_scans_before_the_place_are_placed_by_the_recordings_own_map(
     assert off_m.max() < 0.1
 
 
-def test_another_room_is_refused_with_a_reason(room: Any, room_map: FixedMap) -> None:
+def test_another_room_is_refused_with_a_reason(room, room_map):
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     localiser = MapLocaliser(MappingConfig(), room_map)
     mapped = localise(localiser, scan_along(other))
@@ -109,7 +107,7 @@ def test_another_room_is_refused_with_a_reason(room: Any, room_map: FixedMap) ->
     assert all(reason for _, reason in localiser.refusals)
 
 
-def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room: Any) -> None:
+def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room):
     empty = type(room)(pillars=())  # as it is, and turned by half a turn
     empty_map = draw_map(empty)
     localiser = MapLocaliser(MappingConfig(), empty_map)
@@ -125,7 +123,7 @@ def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room: 
     assert off_m[guided.found[0].scan :].max() < 0.05
 
 
-def test_a_place_that_later_scans_contradict_is_given_up(room: Any, room_map: FixedMap) -> None:
+def test_a_place_that_later_scans_contradict_is_given_up(room, room_map):
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     localiser = MapLocaliser(MappingConfig(), room_map)
     mapped = localise(localiser, [*scan_along(room, 8), *scan_along(other, 20)[8:]])
@@ -135,7 +133,7 @@ def test_a_place_that_later_scans_contradict_is_given_up(room: Any, room_map: Fi
     assert mapped[-1].status is Status.LOST
 
 
-def test_a_covered_sensor_is_lost_and_tracked_again(room: Any, room_map: FixedMap) -> None:
+def test_a_covered_sensor_is_lost_and_tracked_again(room, room_map):
     scans = scan_along(room, 40)
     nothing = [Scan(np.empty((0, 3)), scan.stamp, np.empty(0)) for scan in scans[28:33]]
     localiser = MapLocaliser(MappingConfig(), room_map)
@@ -146,7 +144,7 @@ def test_a_covered_sensor_is_lost_and_tracked_again(room: Any, room_map: FixedMa
     assert off_m[-3:].max() < 0.03
 
 
-def test_surfels_of_a_region_are_those_around_its_centre(room_map: FixedMap) -> None:
+def test_surfels_of_a_region_are_those_around_its_centre(room_map):
     centre = transform_points(T_MAP_ROOM, np.array([[-6.0, 0.0, 0.0]]))[0]
     region = room_map.region(centre, 3.0, 0.4)
     assert 0 < len(region) < len(room_map.region(centre, 50.0, 0.4))

@@ -35,7 +35,7 @@ def measured(trajectory: Trajectory, noise_m: float, rng: np.random.Generator) -
     return track, projected
 
 
-def test_the_pose_of_the_world_is_found(trajectory: Trajectory, rng: np.random.Generator) -> None:
+def test_the_pose_of_the_world_is_found(trajectory, rng):
     track, projected = measured(trajectory, 0.0, rng)
     found = align_to_track(trajectory, track, projected, SCALE)
     error = inverse(T_MAP_WORLD) @ found.T_map_world
@@ -47,7 +47,7 @@ def test_the_pose_of_the_world_is_found(trajectory: Trajectory, rng: np.random.G
     np.testing.assert_allclose(found.positions(trajectory.positions), expected, atol=1e-3)
 
 
-def test_outliers_count_little(trajectory: Trajectory, rng: np.random.Generator) -> None:
+def test_outliers_count_little(trajectory, rng):
     """A fifth of the positions are reflections, up to 30 m away to one side."""
     track, projected = measured(trajectory, 0.05, rng)
     projected[::5, 0] += rng.uniform(10.0, 30.0, len(projected[::5]))
@@ -59,7 +59,7 @@ def test_outliers_count_little(trajectory: Trajectory, rng: np.random.Generator)
     assert found.rms_m > 5.0
 
 
-def test_a_straight_line_leaves_the_roll_to_the_prior(rng: np.random.Generator) -> None:
+def test_a_straight_line_leaves_the_roll_to_the_prior(rng):
     stamps = 0.1 * np.arange(300)
     straight = Trajectory(stamps, exp(np.multiply.outer(stamps, [0.0, 0.0, 0.0, 5.0, 0.0, 0.0])))
     track, projected = measured(straight, 0.0, rng)
@@ -68,7 +68,7 @@ def test_a_straight_line_leaves_the_roll_to_the_prior(rng: np.random.Generator) 
     assert found.T_map_world[2, 2] > 0.998
 
 
-def test_a_short_track_leaves_the_heading_open(trajectory: Trajectory, rng: np.random.Generator) -> None:
+def test_a_short_track_leaves_the_heading_open(trajectory, rng):
     track, projected = measured(trajectory.select(slice(0, 100)), 1.0, rng)
     assert align_to_track(trajectory, track, projected, SCALE).heading_sigma_deg > 3.0
     with pytest.raises(ValueError, match="4 GNSS positions are within the time of the run"):

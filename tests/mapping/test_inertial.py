@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity
@@ -120,7 +119,7 @@ def angle_deg(a: FloatArray, b: FloatArray) -> float:
     return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def test_integrated_turns_are_those_of_the_motion() -> None:
+def test_integrated_turns_are_those_of_the_motion():
     gyroscope = Gyroscope(samples(walk, 4.0), T_LIDAR_IMU[:3, :3])
     turn = gyroscope.turn(0.513, 3.207, T_LIDAR_IMU[:3, :3] @ BIAS)
     expected = inverse(walk(0.513)) @ walk(3.207)
@@ -129,14 +128,14 @@ def test_integrated_turns_are_those_of_the_motion() -> None:
     np.testing.assert_allclose(back, turn.T, atol=1e-4)
 
 
-def test_clocks_that_count_from_1970_lose_no_digits() -> None:
+def test_clocks_that_count_from_1970_lose_no_digits():
     imu = samples(walk, 4.0)
     late = replace(imu, stamps=imu.stamps + 1.7e9)
     turns = [Gyroscope(one, np.eye(3)).turn(t, t + 0.1, BIAS) for one, t in ((imu, 2.0), (late, 1.7e9 + 2.0))]
     np.testing.assert_allclose(turns[1], turns[0], atol=1e-6)
 
 
-def test_a_gap_between_samples_is_not_covered() -> None:
+def test_a_gap_between_samples_is_not_covered():
     imu = samples(walk, 4.0)
     kept = (imu.stamps < 2.0) | (imu.stamps > 2.2)
     gyroscope = Gyroscope(
@@ -149,7 +148,7 @@ def test_a_gap_between_samples_is_not_covered() -> None:
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
-def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at: float, rng: np.random.Generator) -> None:
+def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at, rng):
     """By one angular velocity, once it is evened; the gyroscope's bias has no part in it."""
     stamp, offsets = 1.0, PERIOD_S * (np.sort(rng.uniform(size=3000)) - stamp_at)
     points = rng.uniform(-10.0, 10.0, (3000, 3))
@@ -167,7 +166,7 @@ def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at: float, rng: np.ra
     assert evened < 0.007
 
 
-def test_sweeps_without_times_or_samples_stay_as_they_are() -> None:
+def test_sweeps_without_times_or_samples_stay_as_they_are():
     gyroscope = Gyroscope(samples(walk, 2.0), np.eye(3))
     points = np.ones((5, 3))
     for scan in (Scan(points, 1.0), Scan(points, 9.0, np.linspace(0.0, 0.1, 5)), Scan(points, 1.0, np.zeros(5))):
@@ -175,7 +174,7 @@ def test_sweeps_without_times_or_samples_stay_as_they_are() -> None:
         assert gyroscope.mean_rate(scan) is None
 
 
-def test_biases_and_gravity_are_recovered(rng: np.random.Generator) -> None:
+def test_biases_and_gravity_are_recovered(rng):
     inertial = Inertial(samples(walk, 20.0), T_LIDAR_IMU)
     directions = followed(inertial, 19.9, rng)
     np.testing.assert_allclose(inertial._window.last.bias[3:], T_LIDAR_IMU[:3, :3] @ BIAS, atol=1e-3)
@@ -188,13 +187,12 @@ def test_biases_and_gravity_are_recovered(rng: np.random.Generator) -> None:
     assert angle_deg(last.lidar, walk(stamp)[:3, :3].T @ [0.0, 0.0, 1.0]) < 0.15
 
 
-def test_pose_and_velocity_are_predicted(rng: np.random.Generator) -> None:
+def test_pose_and_velocity_are_predicted(rng):
     """To centimetres after a fifth of a second, and within the stated covariance; without it by decimetres."""
     inertial = Inertial(samples(walk, 10.0), T_LIDAR_IMU)
     followed(inertial, 8.0, rng)
     stamp, h = 8.1, 1e-4
     state = inertial.prior(empty(stamp), Prior()).inertial
-    assert state is not None
     error = log(inverse(state.T_world_lidar) @ inverse(walk(0.5)) @ walk(stamp))
     assert np.rad2deg(np.linalg.norm(error[:3])) < 0.06
     assert np.linalg.norm(error[3:]) < 0.02
@@ -203,13 +201,12 @@ def test_pose_and_velocity_are_predicted(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(state.velocity, velocity, atol=0.06)
 
 
-def test_it_predicts_through_scans_that_are_lost_and_ends_then(rng: np.random.Generator) -> None:
+def test_it_predicts_through_scans_that_are_lost_and_ends_then(rng):
     inertial = Inertial(samples(walk, 14.0), T_LIDAR_IMU)
     followed(inertial, 8.0, rng)
     before = inertial._window.last.bias
     for stamp in np.arange(8.0, 9.9, PERIOD_S):
         state = take(inertial, stamp, exp([0.0, 0.0, 2.0, 9.0, 9.0, 0.0]), is_registered=False, is_connected=False)
-        assert state is not None
         error = log(inverse(state.T_world_lidar) @ inverse(walk(0.5)) @ walk(stamp))
         assert np.linalg.norm(error[3:]) < 0.02 + 0.05 * (stamp - 7.9) ** 2
         assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
@@ -217,7 +214,7 @@ def test_it_predicts_through_scans_that_are_lost_and_ends_then(rng: np.random.Ge
     assert inertial.prior(empty(10.2), Prior()).inertial is None
 
 
-def test_another_place_changes_no_bias(rng: np.random.Generator) -> None:
+def test_another_place_changes_no_bias(rng):
     inertial = Inertial(samples(walk, 10.0), T_LIDAR_IMU)
     followed(inertial, 8.0, rng)
     before = inertial._window.last.bias
@@ -226,14 +223,13 @@ def test_another_place_changes_no_bias(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(inertial._window.last.bias, before)
 
 
-def test_a_direction_without_structure_is_held_by_the_imu(rng: np.random.Generator) -> None:
+def test_a_direction_without_structure_is_held_by_the_imu(rng):
     """One axis of the world is registered to nothing for two seconds: a straight corridor, taken at changing speed."""
     inertial, stamps = Inertial(samples(walk, 12.0), T_LIDAR_IMU), np.arange(8.0, 10.0, PERIOD_S)
     followed(inertial, 8.0, rng)
     for stamp in stamps:
         true = inverse(walk(0.5)) @ walk(stamp)
         state = inertial.prior(empty(stamp), Prior()).inertial
-        assert state is not None
         T_world_lidar = true.copy()
         T_world_lidar[0, 3] = state.T_world_lidar[0, 3]
         information = np.diag(1.0 / np.diag(REGISTRATION))
@@ -249,7 +245,6 @@ def test_a_direction_without_structure_is_held_by_the_imu(rng: np.random.Generat
             ),
         )  # fmt: skip
     state = inertial.prior(empty(stamps[-1] + 1e-4), Prior()).inertial
-    assert state is not None
     error = (state.T_world_lidar - inverse(walk(0.5)) @ walk(stamps[-1] + 1e-4))[0, 3]
     moved = np.linalg.norm(walk(stamps[-1])[:3, 3] - walk(stamps[0])[:3, 3])
     assert moved > 2.0
@@ -258,16 +253,15 @@ def test_a_direction_without_structure_is_held_by_the_imu(rng: np.random.Generat
     assert error**2 < 9.0 * variance < 0.3**2
 
 
-def test_reversed_time_gives_the_reversed_motion(rng: np.random.Generator) -> None:
+def test_reversed_time_gives_the_reversed_motion(rng):
     inertial = Inertial(samples(walk, 12.0), T_LIDAR_IMU).reversed(10.0)
     for stamp in np.arange(10.0, 16.0, PERIOD_S):
         state = take(inertial, stamp, inverse(walk(10.0)) @ walk(20.0 - stamp))
-    assert state is not None
     true = inverse(walk(10.0)) @ walk(20.0 - stamp)
     assert np.linalg.norm(log(inverse(state.T_world_lidar) @ true)[3:]) < 0.01
 
 
-def test_a_wrong_mounting_or_clock_is_noticed(rng: np.random.Generator) -> None:
+def test_a_wrong_mounting_or_clock_is_noticed(rng):
     imu, turned = samples(walk, 10.0), T_LIDAR_IMU @ exp([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
     late = replace(imu, stamps=imu.stamps + 0.3)
     for wrong, T in ((imu, T_LIDAR_IMU), (imu, turned), (late, T_LIDAR_IMU)):
@@ -277,7 +271,7 @@ def test_a_wrong_mounting_or_clock_is_noticed(rng: np.random.Generator) -> None:
         assert any("the IMU's mounting or clock is wrong" in warning for warning in inertial.warnings) != is_right
 
 
-def test_scaled_accelerations_are_recovered(rng: np.random.Generator) -> None:
+def test_scaled_accelerations_are_recovered(rng):
     """Beside gravity, which is not scaled; the prediction is as good as without."""
     inertial = Inertial(samples(shaken, 20.0, scale=1.25), T_LIDAR_IMU)
     for stamp in np.arange(0.5, 19.0, PERIOD_S):
@@ -286,13 +280,12 @@ def test_scaled_accelerations_are_recovered(rng: np.random.Generator) -> None:
     seen = "the IMU's accelerations are 1.25 times those of the LiDAR's positions; estimated, corrected"
     assert inertial.warnings[-1] == seen
     state = inertial.prior(empty(19.4), Prior()).inertial
-    assert state is not None
     error = log(inverse(state.T_world_lidar) @ inverse(shaken(0.5)) @ shaken(19.4))
     assert np.linalg.norm(error[3:]) < 0.02
     assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
 
 
-def test_an_unknown_lever_arm_is_recovered(rng: np.random.Generator) -> None:
+def test_an_unknown_lever_arm_is_recovered(rng):
     T_turned = make_transform(T_LIDAR_IMU[:3, :3], np.zeros(3))
     inertial = Inertial(samples(shaken, 20.0), T_turned, UNKNOWN_LEVER_M)
     for stamp in np.arange(0.5, 19.0, PERIOD_S):
@@ -302,7 +295,7 @@ def test_an_unknown_lever_arm_is_recovered(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("begin_s", [-0.1, -0.05, 0.0])
-def test_the_velocity_of_a_sweep_in_a_curve(begin_s: float, rng: np.random.Generator) -> None:
+def test_the_velocity_of_a_sweep_in_a_curve(begin_s, rng):
     """Begin and end of the sweep, moved by the predicted velocity, lie where the sensor was."""
 
     def curve(times: FloatArray) -> FloatArray:
@@ -316,13 +309,12 @@ def test_the_velocity_of_a_sweep_in_a_curve(begin_s: float, rng: np.random.Gener
         take(inertial, stamp, inverse(curve(0.5)) @ curve(stamp))
     offsets = begin_s + np.linspace(0.0, PERIOD_S, 50)
     state = inertial.prior(Scan(np.zeros((50, 3)), 9.1, offsets), Prior()).inertial
-    assert state is not None
     for offset in offsets[[0, -1]]:
         ahead, true = exp(offset * state.velocity), inverse(curve(9.1)) @ curve(9.1 + offset)
         assert np.linalg.norm((ahead - true)[:3, 3]) < 0.006
 
 
-def test_a_pose_measured_by_correspondences_alone(rng: np.random.Generator) -> None:
+def test_a_pose_measured_by_correspondences_alone(rng):
     """The minimum of their cost, and nothing along a direction that they do not constrain."""
     hessian, step = np.diag([900.0, 900.0, 900.0, 400.0, 400.0, 0.0]), 0.01 * rng.normal(size=6)
     T = exp(rng.normal(size=6))
@@ -331,7 +323,7 @@ def test_a_pose_measured_by_correspondences_alone(rng: np.random.Generator) -> N
     np.testing.assert_allclose(log(inverse(T) @ measured.T_world_lidar), step * [1, 1, 1, 1, 1, 0], atol=1e-9)
 
 
-def test_a_measured_pose_without_a_direction(rng: np.random.Generator) -> None:
+def test_a_measured_pose_without_a_direction(rng):
     """The marginal: nothing of the direction, and of others what is left when it is unknown."""
     root = rng.normal(size=(6, 6))
     information, direction = root @ root.T + np.eye(6), np.array([0.0, 0.0, 0.0, 0.6, 0.8, 0.0])
@@ -342,25 +334,24 @@ def test_a_measured_pose_without_a_direction(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(others @ left @ others.T, np.linalg.inv(others @ unknown @ others.T), rtol=1e-5)
 
 
-def test_another_world_after_tracking_was_lost_has_another_vertical(rng: np.random.Generator) -> None:
+def test_another_world_after_tracking_was_lost_has_another_vertical(rng):
     inertial = Inertial(samples(walk, 20.0), T_LIDAR_IMU)
     followed(inertial, 8.0, rng)
     T_other_world = exp([0.2, -0.1, 0.4, 3.0, 0.0, 0.0])
     for stamp in np.arange(12.0, 19.0, PERIOD_S):
         state = take(inertial, stamp, T_other_world @ walk(stamp))
-    assert state is not None
     error = log(inverse(state.T_world_lidar) @ T_other_world @ walk(stamp))
     assert np.linalg.norm(error[3:]) < 0.01
     assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
 
 
-def test_forces_without_gravity_are_refused() -> None:
+def test_forces_without_gravity_are_refused():
     imu = samples(walk, 4.0)
     assert no_gravity(imu) is None
     assert "which is not gravity" in str(no_gravity(replace(imu, accelerations=0.0 * imu.accelerations)))
 
 
-def test_states_are_fused_by_their_information(rng: np.random.Generator) -> None:
+def test_states_are_fused_by_their_information(rng):
     """Gaussians on the tangent space: the mean of the product is where both gradients cancel."""
     roots = rng.normal(size=(2, 12, 12)) * 0.02
     P, Q = roots @ roots.swapaxes(1, 2) + 1e-6 * np.eye(12)
@@ -375,7 +366,7 @@ def test_states_are_fused_by_their_information(rng: np.random.Generator) -> None
     np.testing.assert_allclose(fused.velocity - first.velocity, mean[6:], atol=1e-9)
 
 
-def test_a_prediction_follows_the_imu_where_the_motion_is_uncertain() -> None:
+def test_a_prediction_follows_the_imu_where_the_motion_is_uncertain():
     covariance = UNKNOWN_VELOCITY.copy()
     last = MotionState(0.0, np.eye(4), np.zeros(6), covariance)
     moved = MotionState(
@@ -390,7 +381,7 @@ def test_a_prediction_follows_the_imu_where_the_motion_is_uncertain() -> None:
     assert not predict(last, 0.1, Prior(), ProcessNoise(), MappingConfig()).is_held_within(100.0)
 
 
-def test_large_biases_are_reported(rng: np.random.Generator) -> None:
+def test_large_biases_are_reported(rng):
     biased = samples(walk, 20.0, bias=np.deg2rad([1.0, -1.0, 0.5]), force_bias=np.array([0.4, 0.8, -0.3]))
     inertial = Inertial(biased, T_LIDAR_IMU)
     followed(inertial, 19.0, rng)
@@ -417,34 +408,25 @@ def still(times: FloatArray) -> FloatArray:
     return np.broadcast_to(np.eye(4), (*np.shape(times), 4, 4))
 
 
-def test_the_mounting_is_recovered(rng: np.random.Generator) -> None:
+def test_the_mounting_is_recovered(rng):
     found = compared(walk, rng, samples(walk, 20.0), np.eye(4)).mounting()
     assert np.rad2deg(rotation_angle(found.R_lidar_imu.T @ T_LIDAR_IMU[:3, :3])) < 0.2
     assert found.sigma < np.deg2rad(1.0)
 
 
 @pytest.mark.parametrize(("motion", "why"), [(yaw_only, "one axis only"), (still, "turns too little")])
-def test_motions_that_show_no_mounting(
-    motion: Callable[[FloatArray], FloatArray], why: str, rng: np.random.Generator
-) -> None:
+def test_motions_that_show_no_mounting(motion, why, rng):
     with pytest.raises(MountingError, match=why):
         compared(motion, rng, samples(motion, 20.0), np.eye(4)).mounting()
 
 
-def test_another_clock_shows_no_mounting(rng: np.random.Generator) -> None:
-    imu = samples(walk, 20.0)
-    late = replace(imu, stamps=imu.stamps + 0.7)
-    with pytest.raises(MountingError, match=r"different clocks|one axis only"):
-        compared(walk, rng, late, np.eye(4)).mounting()
-
-
-def test_too_few_turns_show_no_mounting(rng: np.random.Generator) -> None:
+def test_too_few_turns_show_no_mounting(rng):
     with pytest.raises(MountingError, match="only 14 turns"):
         compared(walk, rng, samples(walk, 2.5), np.eye(4)).mounting()
 
 
 @pytest.mark.parametrize("late_s", [0.02, -0.02, 0.0])
-def test_errors_of_clock_and_rotation_are_found_with_their_deviations(late_s: float, rng: np.random.Generator) -> None:
+def test_errors_of_clock_and_rotation_are_found_with_their_deviations(late_s, rng):
     imu, turned = samples(walk, 12.0), np.array([0.02, -0.03, 0.025])
     late = replace(imu, stamps=imu.stamps + late_s)
     wrong = exp(-np.pad(turned, (0, 3))) @ T_LIDAR_IMU
@@ -455,7 +437,7 @@ def test_errors_of_clock_and_rotation_are_found_with_their_deviations(late_s: fl
     assert found.rotation_sigma < np.deg2rad(0.3)
 
 
-def test_what_no_turn_shows_stays_unknown(rng: np.random.Generator) -> None:
+def test_what_no_turn_shows_stays_unknown(rng):
     found = compared(still, rng, samples(still, 12.0)).alignment()
     assert found.offset_sigma_s > 0.09
     assert abs(found.offset_s) < 0.01
@@ -472,9 +454,7 @@ def test_what_no_turn_shows_stays_unknown(rng: np.random.Generator) -> None:
         (np.eye(3), -1.0, "opposed to those of the accelerometer"),
     ],
 )
-def test_signs_units_and_axes_that_cannot_be_right_are_seen(
-    rates: FloatArray, forces: float, seen: str | None, rng: np.random.Generator
-) -> None:
+def test_signs_units_and_axes_that_cannot_be_right_are_seen(rates, forces, seen, rng):
     imu, R = samples(walk, 12.0), T_LIDAR_IMU[:3, :3]
     flawed = replace(
         imu, angular_velocities=imu.angular_velocities @ R.T @ rates, accelerations=forces * imu.accelerations @ R.T
@@ -483,7 +463,7 @@ def test_signs_units_and_axes_that_cannot_be_right_are_seen(
     assert found is None if seen is None else seen in str(found)
 
 
-def test_restored_it_goes_on_alike(rng: np.random.Generator, through_disk: Callable[[State], Saved]) -> None:
+def test_restored_it_goes_on_alike(rng, through_disk):
     """To the last bit, in the middle of a second of gravity."""
     imu = samples(walk, 12.0)
     begun, resumed = (Inertial(imu, T_LIDAR_IMU) for _ in range(2))
@@ -492,8 +472,6 @@ def test_restored_it_goes_on_alike(rng: np.random.Generator, through_disk: Calla
     for stamp in 8.3 + PERIOD_S * np.arange(30):
         pose = inverse(walk(0.5)) @ walk(stamp)
         one, other = take(begun, stamp, pose), take(resumed, stamp, pose)
-        assert one is not None
-        assert other is not None
         np.testing.assert_array_equal(one.T_world_lidar, other.T_world_lidar)
         np.testing.assert_array_equal(one.covariance, other.covariance)
         assert (begun.direction is None) == (resumed.direction is None)

@@ -1,12 +1,11 @@
 """A local map drawn anew from submaps: what it holds, how firmly, and where submaps lay in it at a scan."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.state import Saved, State
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout, Rows
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER, SubmapPlacement, draw_local_map
@@ -37,7 +36,7 @@ def off_wall_m(local_map: SurfelMap, half_size_m: float) -> float:
     return float(np.median(np.abs(matches.residuals(np.column_stack([np.full(500, WALL_M), y, z])[matches.index]))))
 
 
-def test_scans_that_follow_do_not_shift_what_was_drawn(rng: np.random.Generator) -> None:
+def test_scans_that_follow_do_not_shift_what_was_drawn(rng):
     """They are registered to it; their own errors would repeat, and carry the surfaces along."""
     submaps = [(np.eye(4), means_of_wall(rng, WALL_M, 2.5)) for _ in range(2)]
     drawn = draw_local_map(submaps, CELL_M, RADIUS_M)
@@ -61,7 +60,7 @@ def laid(
     return laid, drawn
 
 
-def test_a_drawn_map_holds_all_that_its_submaps_reach(rng: np.random.Generator) -> None:
+def test_a_drawn_map_holds_all_that_its_submaps_reach(rng):
     """Else the latest scans alone would make its border, which most of a scan may lie beyond."""
     far_m = 2.5 * RADIUS_M
     submaps = {key: means_of_wall(rng, far_m, 4.0) for key in range(2)}
@@ -83,9 +82,7 @@ def revisited(rng: np.random.Generator) -> tuple[SubmapPlacement, FloatArray]:
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_where_a_submap_lay_when_a_scan_was_registered(
-    revisited: tuple[SubmapPlacement, FloatArray], through_disk: Callable[[State], Saved], resumed: bool
-) -> None:
+def test_where_a_submap_lay_when_a_scan_was_registered(revisited, through_disk, resumed):
     laid, poses = revisited
     if resumed:
         again = SubmapPlacement(RADIUS_M)
@@ -94,14 +91,11 @@ def test_where_a_submap_lay_when_a_scan_was_registered(
     exchanged = 40 + SCANS_LATER
     before = laid.place(0, 0, poses[0], exchanged - 1)
     after = laid.place(0, 0, poses[0], exchanged)
-    assert before is not None
-    assert after is not None
     assert (before[1], after[1]) == (0, exchanged)
     np.testing.assert_array_equal(before[0], poses[0])
     np.testing.assert_allclose(after[0], at(0.5), atol=1e-12)
     assert laid.place(4, 16, poses[4], exchanged) is None, "beyond the radius"
     later = laid.place(10, 45, at(-1.0), exchanged + 3)
-    assert later is not None
     assert later[1] == 45, "of a keyframe since then, its own pose"
     assert laid.is_exchanged(exchanged - 1, exchanged)
     assert not laid.is_exchanged(exchanged, exchanged + 5)

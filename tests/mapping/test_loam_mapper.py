@@ -1,6 +1,5 @@
 """Sweeps of known truth through LOAM's mapping: accuracy, degenerate directions, the way back, a state that goes on."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig
@@ -17,8 +15,6 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
-Path = Callable[[FloatArray], FloatArray]
-ThroughDisk = Callable[[State], Saved]
 VELOCITY = np.array([0.0, 0.01, 0.3, 0.8, 0.05, 0.0])  # of the drive
 NOTHING = Prior()
 LOAM = MappingConfig(method="loam")
@@ -51,7 +47,7 @@ def mapper() -> Mapper:
     return Mapper(LOAM)
 
 
-def test_the_first_scan_makes_maps_of_edges_and_planes(mapper: Mapper, ring_scans: list[Scan]) -> None:
+def test_the_first_scan_makes_maps_of_edges_and_planes(mapper, ring_scans):
     first = mapper.process(ring_scans[0], NOTHING)
     np.testing.assert_array_equal(first.state.T_world_lidar, np.eye(4))
     assert (first.status, first.registered, first.added, first.fit) == (Status.OK, False, True, None)
@@ -59,16 +55,14 @@ def test_the_first_scan_makes_maps_of_edges_and_planes(mapper: Mapper, ring_scan
     assert min(len(grid) for grid in mapper.local_map._grids) > 10
 
 
-def test_poses_are_true_with_the_true_motion(mapper: Mapper, ring_scans: list[Scan], room_truth: Trajectory) -> None:
+def test_poses_are_true_with_the_true_motion(mapper, ring_scans, room_truth):
     results = process(mapper, ring_scans, true_priors(room_truth))
     assert_true(results, room_truth.T_world_lidar, 0.003, 0.1)
     assert all(result.registered and result.added and result.is_connected for result in results[1:])
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_poses_are_true_from_wrong_motions(
-    mapper: Mapper, ring_scans: list[Scan], room_truth: Trajectory, seed: int
-) -> None:
+def test_poses_are_true_from_wrong_motions(mapper, ring_scans, room_truth, seed):
     """Each is wrong by a degree and ten centimetres; the velocity is true."""
     axes = np.random.default_rng(seed).normal(size=(20, 2, 3))
     axes /= np.linalg.norm(axes, axis=2, keepdims=True)
@@ -80,9 +74,7 @@ def test_poses_are_true_from_wrong_motions(
     assert_true(process(mapper, ring_scans, priors), room_truth.T_world_lidar, 0.006, 0.15)
 
 
-def test_poses_and_velocities_are_true_without_any_prior(
-    mapper: Mapper, ring_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_poses_and_velocities_are_true_without_any_prior(mapper, ring_scans, room_truth):
     """The first sweep is bent by a motion that is not known yet."""
     results = process(mapper, ring_scans)
     assert_true(results, room_truth.T_world_lidar, 0.01, 0.25)
@@ -90,9 +82,7 @@ def test_poses_and_velocities_are_true_without_any_prior(
     np.testing.assert_allclose(results[-1].state.velocity[3:], VELOCITY[3:], atol=0.1)
 
 
-def test_poses_are_true_with_noise(
-    mapper: Mapper, ring_scans: list[Scan], room_truth: Trajectory, rng: np.random.Generator
-) -> None:
+def test_poses_are_true_with_noise(mapper, ring_scans, room_truth, rng):
     """Two centimetres along the ray."""
     scans = []
     for scan in ring_scans:
@@ -101,9 +91,7 @@ def test_poses_are_true_with_noise(
     assert_true(process(mapper, scans, true_priors(room_truth)), room_truth.T_world_lidar, 0.006, 0.15)
 
 
-def test_a_sensor_that_was_carried_away_is_relocalised(
-    mapper: Mapper, ring_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_a_sensor_that_was_carried_away_is_relocalised(mapper, ring_scans, room_truth):
     """Covered for a second and turned by 100 degrees in the meantime."""
     process(mapper, ring_scans[:10], true_priors(room_truth)[:10])
     assert mapper.process(Scan(np.empty((0, 3)), ring_scans[10].stamp, np.empty(0)), NOTHING).status is Status.LOST
@@ -117,7 +105,7 @@ def test_a_sensor_that_was_carried_away_is_relocalised(
     assert np.rad2deg(rotation_angle(error[-1])) < 1.0
 
 
-def test_along_a_corridor_the_odometry_is_kept(mapper: Mapper) -> None:
+def test_along_a_corridor_the_odometry_is_kept(mapper):
     """Walls, floor and ceiling along x, the sensor's way; the odometry is a tenth too short."""
     half = np.array([1e3, 1.5, 1.2])
 
@@ -143,7 +131,7 @@ def test_along_a_corridor_the_odometry_is_kept(mapper: Mapper) -> None:
     assert (np.diff(sigmas) > 0.0).all(), "the uncertainty grows on the way"
 
 
-def test_a_mapper_goes_on(ring_scans: list[Scan], through_disk: ThroughDisk) -> None:
+def test_a_mapper_goes_on(ring_scans, through_disk):
     """Among the scans is an empty one."""
     scans = list(ring_scans[:10])
     scans[7] = Scan(np.empty((0, 3)), scans[7].stamp, np.empty(0))

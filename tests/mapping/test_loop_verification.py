@@ -69,7 +69,6 @@ def test_exact_from_a_guess_wrong_by_a_metre_and_twenty_degrees(room, guess):
     off = np.array(guess, dtype=float)
     off[:3] = np.deg2rad(off[:3])
     found = verify(*room, TRUE @ exp(off))
-    assert found is not None
     error = inverse(TRUE) @ found.T_target_source
     assert np.linalg.norm(error[:3, 3]) < 0.01
     assert np.rad2deg(rotation_angle(error)) < 0.1
@@ -82,7 +81,6 @@ def test_exact_from_a_guess_wrong_by_a_metre_and_twenty_degrees(room, guess):
 
 def test_covariance_has_floors_and_holds_the_error(room):
     found = verify(*room, TRUE)
-    assert found is not None
     sigmas = np.sqrt(np.diag(found.covariance))
     assert (sigmas[:3] > np.deg2rad(0.1)).all()
     assert (sigmas[3:] > 0.01).all()
@@ -93,10 +91,8 @@ def test_covariance_has_floors_and_holds_the_error(room):
 
 def test_another_room_of_the_same_size_is_refused(room):
     found = verify(room[0], place(OTHER_ROOM, SECOND, 3), TRUE)
-    assert found is not None
     assert found.objection(MIN_OVERLAP)
     right = verify(*room, TRUE)
-    assert right is not None
     assert found.overlap < right.overlap - 0.1
 
 
@@ -126,7 +122,6 @@ def test_a_pole_has_no_direction():
 def test_a_corridor_says_nothing_along_itself():
     first, second = pose(0.0, 0.2, 0.0), pose(3.0, -0.2, 30.0)
     found = verify(place(CORRIDOR, first, 1), place(CORRIDOR, second, 2), inverse(first) @ second)
-    assert found is not None
     # In the second's frame the corridor runs at -30 degrees.
     along = np.array([np.cos(np.deg2rad(30.0)), -np.sin(np.deg2rad(30.0)), 0.0])
     across = np.array([along[1], -along[0], 0.0])
@@ -151,25 +146,12 @@ def test_along_a_corridor_what_would_tell_must_fit():
 
     target, source, elsewhere = stand(1.0, first, 1), stand(1.0, second, 2), stand(2.7, second, 2)
     right = verify(target, source, inverse(first) @ second)
-    assert right is not None
     assert right.objection(MIN_OVERLAP) == ""
     # Walls, floor and ceiling fit as well where the closets of one stand between those of the other.
     wrong = evaluate(target, elsewhere, inverse(first) @ second)
     assert wrong.overlap > MIN_OVERLAP
     assert wrong.information < 0.3
     assert "weakest direction" in wrong.objection(MIN_OVERLAP)
-
-
-def test_neighbours_help(room):
-    T_first_other = inverse(FIRST) @ pose(1.5, 0.8, 40.0)
-    alone, joined = (
-        room[0],
-        SubmapCloud.join(room[0].submap, [(T_first_other, submap_from(ROOM, pose(1.5, 0.8, 40.0), 5))], [0.0]),
-    )
-    assert len(joined.points) > len(alone.points)
-    found = verify(joined, room[1], TRUE)
-    assert found is not None
-    assert np.linalg.norm((inverse(TRUE) @ found.T_target_source)[:3, 3]) < 0.01
 
 
 def test_neighbours_that_drift_may_have_moved_count_less(room):
@@ -184,7 +166,6 @@ def test_neighbours_that_drift_may_have_moved_count_less(room):
     off = []
     for target, other in ((trusted, room[1]), (doubted, source)):
         found = verify(target, other, TRUE)
-        assert found is not None
         off.append(np.linalg.norm((inverse(TRUE) @ found.T_target_source)[:3, 3]))
     assert off[0] > 0.03
     assert off[1] < 0.5 * off[0]
@@ -224,12 +205,3 @@ def test_points_know_which_way_their_keyframe_lies(room):
     assert place.middle_m == 1.0  # half the way to the next
     assert place.drift_rates == (0.1, 0.2)
     assert len(place.ahead_m) == len(place.points)
-
-
-@pytest.mark.parametrize("count", [0, 1, 9, 30])
-def test_tiny_submaps_are_no_place(room, count):
-    points = np.random.default_rng(0).uniform(-3.0, 3.0, (count, 3))
-    tiny = SubmapCloud.join(SparseSubmap.of(points, 60.0))
-    for pair in ((tiny, room[0]), (room[0], tiny)):
-        found = verify(*pair, np.eye(4))
-        assert found is None or found.objection(MIN_OVERLAP)

@@ -1,7 +1,5 @@
 """Maps on disk."""
 
-from pathlib import Path
-
 import laspy
 import numpy as np
 import open3d as o3d
@@ -27,23 +25,13 @@ def cloud(rng: np.random.Generator) -> PointCloud:
         ring=rng.integers(0, 128, count).astype(np.int32),
         time=1_700_000_000.0 + 1e-4 * rng.permutation(count),
     )
-    assert known.intensity is not None
-    assert known.ring is not None
     known.intensity[3], known.ring[4] = np.nan, -1
     points = rng.normal(0.0, 30.0, (count, 3)).astype(np.float32).astype(np.float64)
     return PointCloud(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), known)
 
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
-def test_a_map_is_read_back(tmp_path: Path, name: str) -> None:
-    write_cloud(tmp_path / name, PointCloud(np.eye(3), np.eye(3)))
-    np.testing.assert_array_equal(np.asarray(o3d.io.read_point_cloud(str(tmp_path / name)).points), np.eye(3))
-
-
-@pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
-def test_open3d_reads_every_attribute(
-    tmp_path: Path, cloud: PointCloud, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_open3d_reads_every_attribute(tmp_path, cloud, name, monkeypatch):
     monkeypatch.setattr(point_cloud, "_POINTS_AT_A_TIME", 200)
     write_cloud(tmp_path / name, cloud)
     read = o3d.t.io.read_point_cloud(str(tmp_path / name)).point
@@ -55,7 +43,7 @@ def test_open3d_reads_every_attribute(
 
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
-def test_maps_come_back_with_their_attributes(tmp_path: Path, cloud: PointCloud, name: str) -> None:
+def test_maps_come_back_with_their_attributes(tmp_path, cloud, name):
     write_cloud(tmp_path / name, cloud)
     back = load_map(tmp_path / name)
     np.testing.assert_array_equal(back.points, cloud.points)
@@ -65,13 +53,13 @@ def test_maps_come_back_with_their_attributes(tmp_path: Path, cloud: PointCloud,
     assert not expected
 
 
-def test_laspy_reads_laz(tmp_path: Path, cloud: PointCloud) -> None:
+def test_laspy_reads_laz(tmp_path, cloud):
     write_cloud(tmp_path / "map.laz", cloud)
     read, known = laspy.read(tmp_path / "map.laz"), cloud.attributes
     assert read.header.are_points_compressed
     np.testing.assert_allclose(read.xyz, cloud.points, atol=0.51e-4)
     np.testing.assert_array_equal(read.NormalZ, cloud.normals[:, 2].astype(np.float32))
-    np.testing.assert_allclose(read.intensity, np.nan_to_num(known.intensity), atol=0.5)  # type: ignore[call-overload]
+    np.testing.assert_allclose(read.intensity, np.nan_to_num(known.intensity), atol=0.5)
     np.testing.assert_array_equal(read.ring, known.ring)
     np.testing.assert_array_equal(read.gps_time, known.time)
     assert known.rgb is not None
@@ -79,20 +67,20 @@ def test_laspy_reads_laz(tmp_path: Path, cloud: PointCloud) -> None:
     assert set(read.return_number) == set(read.number_of_returns) == {1}
 
 
-def test_intensities_up_to_one_fill_the_bits_of_laz(tmp_path: Path) -> None:
+def test_intensities_up_to_one_fill_the_bits_of_laz(tmp_path):
     shares = PointAttributes(intensity=np.array([0.0, 0.5, 1.0], dtype=np.float32))
     write_cloud(tmp_path / "map.laz", PointCloud(np.eye(3), np.eye(3), shares))
     assert laspy.read(tmp_path / "map.laz").intensity.tolist() == [0, 32768, 65535]
 
 
-def test_intensities_of_a_tile_are_on_the_scale_of_its_map(tmp_path: Path) -> None:
+def test_intensities_of_a_tile_are_on_the_scale_of_its_map(tmp_path):
     dark = PointCloud(np.eye(3), np.eye(3), PointAttributes(intensity=np.array([0.0, 0.6, 1.0], dtype=np.float32)))
     for brightest, expected in ((255.0, [0, 1, 1]), (1.0, [0, 39321, 65535])):
         write_cloud(tmp_path / "0_0.laz", dark, brightest)
         assert laspy.read(tmp_path / "0_0.laz").intensity.tolist() == expected
 
 
-def test_pye57_reads_e57(tmp_path: Path, cloud: PointCloud) -> None:
+def test_pye57_reads_e57(tmp_path, cloud):
     pye57 = pytest.importorskip("pye57")
     write_cloud(tmp_path / "map.e57", cloud)
     file = pye57.E57(str(tmp_path / "map.e57"))
@@ -100,14 +88,13 @@ def test_pye57_reads_e57(tmp_path: Path, cloud: PointCloud) -> None:
     file.close()
     for column, axis in enumerate("XYZ"):
         np.testing.assert_allclose(read[f"cartesian{axis}"], cloud.points[:, column], atol=1e-5)
-    np.testing.assert_array_equal(read["intensity"], np.nan_to_num(known.intensity))  # type: ignore[call-overload]
-    assert known.rgb is not None
+    np.testing.assert_array_equal(read["intensity"], np.nan_to_num(known.intensity))
     for column, colour in enumerate(("Red", "Green", "Blue")):
         np.testing.assert_array_equal(read[f"color{colour}"], known.rgb[:, column])
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_map_without_attributes_is_written_in_every_format(tmp_path: Path, name: str) -> None:
+def test_a_map_without_attributes_is_written_in_every_format(tmp_path, name):
     if name.endswith("e57"):
         pytest.importorskip("pye57")
     write_cloud(tmp_path / name, PointCloud(np.eye(3), np.eye(3)))
@@ -115,7 +102,7 @@ def test_a_map_without_attributes_is_written_in_every_format(tmp_path: Path, nam
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_failure_names_the_folder_and_no_partial_file(tmp_path: Path, name: str) -> None:
+def test_a_failure_names_the_folder_and_no_partial_file(tmp_path, name):
     if name.endswith("e57"):
         pytest.importorskip("pye57")
     suffix = name.removeprefix("map")
@@ -125,23 +112,18 @@ def test_a_failure_names_the_folder_and_no_partial_file(tmp_path: Path, name: st
     assert "\n" not in str(caught.value)
 
 
-def test_an_empty_map_is_no_full_disk(tmp_path: Path) -> None:
+def test_an_empty_map_is_no_full_disk(tmp_path):
     with pytest.raises(OutputError, match="a map without points"):
         write_cloud(tmp_path / "map.ply", PointCloud(np.empty((0, 3)), np.empty((0, 3))))
 
 
-def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_named_with_its_extra(monkeypatch):
     require_format("laz")
     monkeypatch.setattr(point_cloud, "find_spec", lambda _name: None)
     with pytest.raises(OutputError, match=r"E57 maps need pye57; type: pip install 'lidarslam\[e57\]'$"):
         require_format("e57")
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".PCD", ".laz"])
-def test_a_cloud_saves_itself(suffix, tmp_path):
-    cloud = PointCloud(np.eye(3), np.eye(3), PointAttributes(intensity=np.float32([1, 2, 3])))
-    cloud.save(str(tmp_path / f"saved{suffix}"))
-    write_cloud(tmp_path / f"written{suffix}", cloud)
-    assert (tmp_path / f"saved{suffix}").read_bytes() == (tmp_path / f"written{suffix}").read_bytes()
+def test_another_suffix_is_refused(tmp_path):
     with pytest.raises(OutputError, match=r"map\.xyz: expected a name that ends in \.ply, \.pcd, \.laz, \.e57"):
-        cloud.save(tmp_path / "map.xyz")
+        PointCloud(np.eye(3), np.eye(3)).save(str(tmp_path / "map.xyz"))

@@ -1,24 +1,19 @@
 """A mapper and a map that are saved and restored go on as they would have, to the last bit."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import KeyframeConfig, MappingConfig
 from lidarslam.mapping.global_map import global_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
-from lidarslam.mapping.motion.prediction import OdometryNoise, Prior, ProcessNoise
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
-ThroughDisk = Callable[[State], Saved]
 CONFIG = MappingConfig(keypoints=600)
 
 
@@ -46,7 +41,7 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
         assert getattr(found, name) == getattr(expected, name), name
 
 
-def test_a_mapper_goes_on(scans: list[Scan], through_disk: ThroughDisk) -> None:
+def test_a_mapper_goes_on(scans, through_disk):
     whole = Mapper(CONFIG)
     expected = []
     for scan in scans:
@@ -63,9 +58,7 @@ def test_a_mapper_goes_on(scans: list[Scan], through_disk: ThroughDisk) -> None:
 
 
 @pytest.mark.parametrize("tidied_after", [1_000, 3])
-def test_a_map_that_has_forgotten_goes_on(
-    rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch, tidied_after: int
-) -> None:
+def test_a_map_that_has_forgotten_goes_on(rng, through_disk, monkeypatch, tidied_after):
     """Rows of cells are in the order in which they came, also after some were dropped."""
     from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
@@ -90,9 +83,7 @@ def test_a_map_that_has_forgotten_goes_on(
             np.testing.assert_array_equal(getattr(found, name), value)
 
 
-def test_a_global_map_goes_on(
-    rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_global_map_goes_on(rng, through_disk, monkeypatch):
     """It is merged when it would have been: sums in another order are rounded otherwise."""
     monkeypatch.setattr(global_map, "_MIN_PENDING", 2500)
     clouds = [rng.uniform(-3.0, 3.0, (1000, 3)) for _ in range(9)]
@@ -110,7 +101,7 @@ def test_a_global_map_goes_on(
         np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
 
 
-def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+def test_keyframes_are_chosen_as_before(rng, through_disk):
     points = rng.uniform(-5.0, 5.0, (2000, 3))
     selector, restored = KeyframeSelector(KeyframeConfig()), KeyframeSelector(KeyframeConfig())
     selector.take(np.eye(4), points)
@@ -120,46 +111,3 @@ def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: 
     assert set(answers) == {True, False}
     assert [restored.is_due(pose, points) for pose in poses] == answers
     assert restored.is_due(np.eye(4), points + 3.0) == selector.is_due(np.eye(4), points + 3.0)
-
-
-def test_a_state_of_another_shape_is_refused(through_disk: ThroughDisk) -> None:
-    mapper = Mapper(CONFIG)
-    mapper.process(Scan(np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3)), 0.0), Prior())
-    state = mapper.state()
-    state["_last"] = {**state["_last"], "covariance": np.eye(6)}
-    with pytest.raises(InputError, match=r"covariance.*expected an array of shape \(12, 12\), got float64 \(6, 6\)"):
-        Mapper(CONFIG).restore(through_disk(state))
-
-
-def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through_disk: ThroughDisk) -> None:
-    """Values unlike those at the beginning come back, and no attribute but the settings goes unsaved."""
-    mapper, restored = Mapper(CONFIG), Mapper(CONFIG)
-    for scan in scans[:2]:
-        mapper.process(scan, Prior())
-    tracker = mapper._tracker
-    mapper._first = mapper._sampler.sample(scans[0])
-    tracker._process_noise, tracker._odometry_noise = ProcessNoise(1.5, 7.0), OdometryNoise(3.5, 4)
-    tracker._prediction_error_m = 0.125
-    assert mapper._map is not None
-    mapper._map.scans = 9
-    tracker._archive.add(mapper._map)
-    tracker._state.lost(has_points=True)
-    tracker._state.registered(Status.OK, relocalised=False, quality=0.75, stamp=5.0)
-    tracker._state.registered(Status.DEGRADED, relocalised=True, quality=0.5, stamp=5.1)
-    restored.restore(through_disk(mapper.state()))
-    # A search that is under way begins anew after a resumption.
-    unsaved = {"_config", "kept_scans", "_budget", "_search", "_map_is_due", "_in_vain"}
-    for part in (mapper, tracker, tracker._state, tracker._archive):
-        assert set(vars(part)) - unsaved == set(part.state())
-    assert flat(restored.state()) == flat(mapper.state())
-
-
-def flat(state: State) -> list[object]:
-    """All values one after the other, arrays as their bytes."""
-    values: list[object] = []
-    for name, value in state.items():
-        parts = value if isinstance(value, list) else [value]
-        for part in parts:
-            inside = flat(part) if isinstance(part, dict) else [part]
-            values += [name, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in inside)]
-    return values

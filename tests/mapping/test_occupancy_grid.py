@@ -75,14 +75,13 @@ def value(grid: OccupancyGrid, x: float, y: float) -> int:
     return int(grid.cells[row, column])
 
 
-def test_the_ground_follows_the_slope(room: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+def test_the_ground_follows_the_slope(room):
     ground = find_ground(*room)
-    assert ground is not None
     xy = np.random.default_rng(1).uniform([-1.7, -2.7], [5.7, 2.7], (200, 2))
     np.testing.assert_allclose(ground.at(xy), SLOPE * xy[:, 0] - SENSOR_M, atol=0.03)
 
 
-def test_walls_are_occupied_to_a_cell(grid: OccupancyGrid) -> None:
+def test_walls_are_occupied_to_a_cell(grid):
     for along in np.linspace(-1.9, 5.9, 40):
         assert value(grid, along, -3.0) == OCCUPIED
         assert value(grid, along, 3.0) == OCCUPIED
@@ -94,7 +93,7 @@ def test_walls_are_occupied_to_a_cell(grid: OccupancyGrid) -> None:
         assert value(grid, 6.0 - 1.6 * STEP, across) == FREE
 
 
-def test_furniture_and_free_space(grid: OccupancyGrid) -> None:
+def test_furniture_and_free_space(grid):
     assert value(grid, 2.5, 1.5) == OCCUPIED  # the table, from above
     assert value(grid, 4.0, -1.75) == OCCUPIED  # the box
     assert value(grid, 0.25, -2.25) == FREE  # below the lamp
@@ -105,7 +104,7 @@ def test_furniture_and_free_space(grid: OccupancyGrid) -> None:
     assert (grid.cells == FREE).sum() * STEP**2 == pytest.approx(8 * 6 - 1, abs=1.5)
 
 
-def test_what_the_robot_drove_through_is_free(room: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+def test_what_the_robot_drove_through_is_free(room):
     """Points of those who walked beside the robot are no obstacle on its own path."""
     points, normals, path = room
     person = patch(at(1.0, -0.1), np.array([0.0, 0.2, 0.0]), np.array([0.0, 0.0, 1.7]))
@@ -118,7 +117,7 @@ def test_what_the_robot_drove_through_is_free(room: tuple[FloatArray, FloatArray
     assert value(aside, 1.0, 0.0) == OCCUPIED
 
 
-def test_without_ground_there_is_no_grid(room: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+def test_without_ground_there_is_no_grid(room):
     points, normals, path = room
     above = points[:, 2] > SLOPE * points[:, 0]
     assert occupancy_grid(points[above], normals[above], path, GridOptions()) is None
@@ -145,9 +144,7 @@ def _pgm(image: bytes) -> tuple[bytes, int, int, int, bytes]:
     return words[0], int(words[1]), int(words[2]), int(words[3]), image[position:]
 
 
-def test_the_files_mean_the_same_to_the_map_server(
-    room: tuple[FloatArray, FloatArray, FloatArray], tmp_path: Path
-) -> None:
+def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
     points, normals, path = room
     run, out = tmp_path / "run", tmp_path / "map.yaml"
     run.mkdir()
@@ -159,7 +156,6 @@ def test_the_files_mean_the_same_to_the_map_server(
     assert done.exit_code == 0, done.output
     cloud = load_map(run)  # in single precision
     grid = occupancy_grid(cloud.points, cloud.normals, path, GridOptions(resolution_m=STEP))
-    assert grid is not None
     about, occupancy = _read(out)
     assert (about["image"], about["mode"], about["negate"]) == ("map.pgm", "trinary", "0")
     assert float(str(about["resolution"])) == STEP

@@ -1,7 +1,6 @@
 """Pose graphs whose optimal poses and outlier closures are known."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -69,7 +68,7 @@ def assert_near(actual: FloatArray, expected: FloatArray, tolerance: float) -> N
     assert float(rotation_angle(apart).max()) < tolerance
 
 
-def test_a_drifted_square_with_one_exact_closure_becomes_exact() -> None:
+def test_a_drifted_square_with_one_exact_closure_becomes_exact():
     """The chain is exact as well; only the initial poses have drifted."""
     truth = laps(LAP + 1)
     bend = exp(np.linspace(0.0, 1.0, LAP + 1)[:, None] * [0.05, -0.03, 0.3, 2.0, -1.0, 0.5])
@@ -78,7 +77,7 @@ def test_a_drifted_square_with_one_exact_closure_becomes_exact() -> None:
     assert optimised.inliers.tolist() == [True]
 
 
-def test_a_loop_takes_the_drift_out(rng: np.random.Generator) -> None:
+def test_a_loop_takes_the_drift_out(rng):
     truth = laps(2 * LAP)
     edges = with_errors(chained(truth, LOOSE), rng)
     start = drifted(edges, len(truth))
@@ -91,7 +90,7 @@ def test_a_loop_takes_the_drift_out(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("true", "false"), [(3, 1), (10, 3), (10, 6)])
-def test_false_loops_are_rejected_and_change_nothing(true: int, false: int, rng: np.random.Generator) -> None:
+def test_false_loops_are_rejected_and_change_nothing(true, false, rng):
     truth = laps(2 * LAP)
     edges = with_errors(chained(truth), rng)
     start = drifted(edges, len(truth))
@@ -104,14 +103,14 @@ def test_false_loops_are_rejected_and_change_nothing(true: int, false: int, rng:
     assert_near(found.poses, expected.poses, 1e-6)
 
 
-def test_a_single_false_loop_is_rejected_where_the_chain_would_have_to_break(rng: np.random.Generator) -> None:
+def test_a_single_false_loop_is_rejected_where_the_chain_would_have_to_break(rng):
     truth = laps(2 * LAP)
     found = optimise(truth, chained(truth), false_edges(truth, FALSE[:1], rng))
     assert found.inliers.tolist() == [False]
     assert_near(found.poses, truth, 1e-6)
 
 
-def test_false_loops_that_agree_and_outnumber_the_true_are_inliers(rng: np.random.Generator) -> None:
+def test_false_loops_that_agree_and_outnumber_the_true_are_inliers(rng):
     """A known limit: six closures place the second lap 10 m aside, against one, and the chain cannot decide."""
     truth = laps(2 * LAP)
     aside = np.eye(4)
@@ -123,7 +122,7 @@ def test_false_loops_that_agree_and_outnumber_the_true_are_inliers(rng: np.rando
     assert found.inliers.tolist() == [False] + [True] * 6
 
 
-def test_edges_are_weighed_by_their_covariances() -> None:
+def test_edges_are_weighed_by_their_covariances():
     """Two measurements of one motion: the estimate is their mean, weighted by information."""
     far, near = exp([0, 0, 0, 2.0, 0, 0]), exp([0, 0, 0, 1.0, 0, 0])
     edges = [RelativePose(0, 1, far, LOOSE), RelativePose(0, 1, near, LOOSE / 9.0)]
@@ -132,7 +131,7 @@ def test_edges_are_weighed_by_their_covariances() -> None:
     assert len(optimised.inliers) == 0
 
 
-def test_the_order_of_a_covariance_is_rotation_first() -> None:
+def test_the_order_of_a_covariance_is_rotation_first():
     """Of two chains around a square of four poses, that bends which may: in translation along y, not in rotation."""
     bendy = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1e-3]) ** 2  # precise but for translation along y
     stiff = np.diag([1e-3] * 6) ** 2
@@ -142,7 +141,7 @@ def test_the_order_of_a_covariance_is_rotation_first() -> None:
     assert_near(poses, exp(np.array([[0.0] * 6, [0, 0, 0, 0, 0.5, 0], [0, 0, 0, 0, 0.5, 0]])), 1e-5)
 
 
-def test_relaxed_poses_close_loops_and_bear_false_ones(rng: np.random.Generator) -> None:
+def test_relaxed_poses_close_loops_and_bear_false_ones(rng):
     truth = laps(2 * LAP)
     edges = with_errors(chained(truth, LOOSE), rng)
     poses = drifted(edges, len(truth))
@@ -160,13 +159,13 @@ def apart(truth: FloatArray, T_world_world: FloatArray) -> tuple[FloatArray, lis
     return np.concatenate([truth[:LAP], T_world_world @ truth[LAP:]]), edges
 
 
-def test_components_that_nothing_joins_stay_where_they_are() -> None:
+def test_components_that_nothing_joins_stay_where_they_are():
     poses, edges = apart(laps(2 * LAP), exp([0.1, 0.2, 3.0, 500.0, 300.0, 20.0]))
     assert_near(optimise(poses, edges, []).poses, poses, 1e-6)
     assert_near(relax(poses, edges, []), poses, 1e-6)
 
 
-def test_loops_bring_two_components_together() -> None:
+def test_loops_bring_two_components_together():
     """The second is begun in a world of its own, turned half round and far away."""
     truth = laps(2 * LAP)
     poses, edges = apart(truth, exp([0.0, 0.1, 2.5, 80.0, -50.0, 3.0]))
@@ -178,7 +177,7 @@ def test_loops_bring_two_components_together() -> None:
 
 
 @pytest.mark.parametrize(("true", "false"), [(2, 1), (2, 2), (3, 6)])
-def test_false_loops_between_components_are_rejected(true: int, false: int, rng: np.random.Generator) -> None:
+def test_false_loops_between_components_are_rejected(true, false, rng):
     truth = laps(2 * LAP)
     poses, edges = apart(truth, exp([0.0, 0.1, 2.5, 80.0, -50.0, 3.0]))
     loops = [edge(truth, key, key + LAP) for key in (3, 13, 33)[:true]]
@@ -187,7 +186,7 @@ def test_false_loops_between_components_are_rejected(true: int, false: int, rng:
     assert_near(found.poses, truth, 1e-5)
 
 
-def test_of_two_loops_that_contradict_one_another_at_most_one_is_an_inlier(rng: np.random.Generator) -> None:
+def test_of_two_loops_that_contradict_one_another_at_most_one_is_an_inlier(rng):
     truth = laps(2 * LAP)
     poses, edges = apart(truth, np.eye(4))
     found = optimise(poses, edges, false_edges(truth, ((3, 43), (13, 63)), rng))
@@ -205,7 +204,7 @@ def test_of_two_loops_that_contradict_one_another_at_most_one_is_an_inlier(rng: 
         np.eye(6) + np.triu(np.ones((6, 6)), 1) * 1e-3,
     ],
 )
-def test_bad_covariances_are_bounded_and_do_no_harm(covariance: FloatArray) -> None:
+def test_bad_covariances_are_bounded_and_do_no_harm(covariance):
     kept = bounded(covariance)
     np.testing.assert_array_equal(kept, kept.T)
     assert np.sqrt(np.linalg.eigvalsh(kept))[0] > 0.9 * _LEAST.min()
@@ -225,32 +224,26 @@ def test_bad_covariances_are_bounded_and_do_no_harm(covariance: FloatArray) -> N
         [0.0] * 6,
     ],
 )
-def test_a_chain_that_is_loose_in_some_directions_can_be_solved(variances: list[float]) -> None:
+def test_a_chain_that_is_loose_in_some_directions_can_be_solved(variances):
     truth = laps(2 * LAP)
     edges, loops = chained(truth, np.diag(variances)), [edge(truth, 0, 2 * LAP - 1)]
     assert_near(relax(truth, edges, loops), truth, 1e-6)
     assert_near(optimise(truth, edges, loops).poses, truth, 1e-6)
 
 
-def test_a_good_covariance_is_kept() -> None:
+def test_a_good_covariance_is_kept():
     A = np.random.default_rng(3).normal(size=(6, 6)) * 0.1
     np.testing.assert_allclose(bounded(A @ A.T), A @ A.T, rtol=1e-12)
     np.testing.assert_allclose(bounded(np.zeros((6, 6))), np.diag(_LEAST**2), rtol=1e-12)
 
 
-def test_an_empty_graph_has_no_poses() -> None:
-    empty = optimise(np.empty((0, 4, 4)), [], [])
-    assert empty.poses.shape == (0, 4, 4)
-    assert len(empty.inliers) == 0
-
-
-def test_a_component_is_named_by_its_first_node() -> None:
+def test_a_component_is_named_by_its_first_node():
     assert first_connected(8, [(6, 7), (4, 5), (5, 7), (1, 2)]).tolist() == [0, 1, 1, 3, 4, 4, 4, 4]
     assert first_connected(2, []).tolist() == [0, 1]
 
 
 @pytest.mark.real_data
-def test_a_real_graph_ends_where_gtsam_ends_with_it(real_data: Path) -> None:
+def test_a_real_graph_ends_where_gtsam_ends_with_it(real_data):
     path = real_data / "trajectories" / "parking-garage.g2o"
     if not path.is_file():
         pytest.skip(f"no {path.name} in the real data")
@@ -271,7 +264,7 @@ def test_a_real_graph_ends_where_gtsam_ends_with_it(real_data: Path) -> None:
     assert factors.error(ours) == pytest.approx(factors.error(found), rel=1e-6)
 
 
-def test_gravity_holds_roll_and_pitch_where_the_edges_drift() -> None:
+def test_gravity_holds_roll_and_pitch_where_the_edges_drift():
     """On a long flat drive: edges that pitch up a little each end far above the ground, attitudes keep them on it."""
     truth = chain(np.eye(4), exp(np.tile([0.0, 0.0, 0.002, 1.0, 0.0, 0.0], (300, 1))))
     up = np.array([0.0, 0.0, 1.0])
@@ -291,7 +284,7 @@ def test_gravity_holds_roll_and_pitch_where_the_edges_drift() -> None:
     assert heights[1] < 0.05 * heights[0]
 
 
-def test_an_attitude_leaves_the_heading_alone() -> None:
+def test_an_attitude_leaves_the_heading_alone():
     truth = np.stack([np.eye(4), exp([0.0, 0.0, 2.0, 1.0, 0.0, 0.0])])
     edges, up = chained(truth), np.array([0.0, 0.0, 1.0])
     assert_near(optimise(truth, edges, [], [Attitude(1, up, up, 1e-3)]).poses, truth, 1e-6)

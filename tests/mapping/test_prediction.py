@@ -52,25 +52,25 @@ def isotropic(sigma: float) -> FloatArray:
     return sigma**2 * np.eye(6)
 
 
-def test_without_an_odometry_the_sensor_goes_on() -> None:
+def test_without_an_odometry_the_sensor_goes_on():
     prediction = predicted(measured())
     np.testing.assert_allclose(prediction.T_world_lidar, MOVED, atol=1e-12)
     np.testing.assert_allclose(prediction.velocity, VELOCITY)
 
 
-def test_an_odometry_that_is_sure_is_believed() -> None:
+def test_an_odometry_that_is_sure_is_believed():
     prediction = predicted(measured(MOVED @ exp(OFF), covariance=isotropic(1e-5)))
     np.testing.assert_allclose(step(prediction), OFF, atol=1e-4)
     assert np.sqrt(np.diag(motion_covariance(prediction))).max() < 1.1e-5
 
 
-def test_an_odometry_that_is_unsure_is_not() -> None:
+def test_an_odometry_that_is_unsure_is_not():
     alone, with_prior = (predicted(p) for p in (measured(), measured(MOVED @ exp(OFF), covariance=isotropic(1e3))))
     np.testing.assert_allclose(step(with_prior), 0.0, atol=1e-6)
     np.testing.assert_allclose(with_prior.covariance, alone.covariance, rtol=1e-4, atol=1e-9)
 
 
-def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
+def test_each_direction_is_believed_as_its_own_covariance_says():
     """In the frame of the sensor as it is now, wherever it is in the world."""
     covariance = isotropic(1e-4)
     covariance[3, 3] = 1e6
@@ -83,7 +83,7 @@ def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
         assert np.delete(sigmas, 3).max() < 2e-4
 
 
-def test_an_odometry_is_believed_less_than_it_says_by_the_caution() -> None:
+def test_an_odometry_is_believed_less_than_it_says_by_the_caution():
     motion = MOVED @ exp(OFF)
     cautious = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.01), caution=5.0))
     told = predicted(measured(motion, VELOCITY + 1.0, isotropic(0.05)))
@@ -91,7 +91,7 @@ def test_an_odometry_is_believed_less_than_it_says_by_the_caution() -> None:
         np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
 
 
-def test_an_odometry_that_does_not_say_is_believed_as_configured() -> None:
+def test_an_odometry_that_does_not_say_is_believed_as_configured():
     config = MappingConfig(prior_rotation_deg=2.0, prior_translation_m=0.3)
     sigmas = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)
     motion = MOVED @ exp(OFF)
@@ -104,13 +104,13 @@ def test_an_odometry_that_does_not_say_is_believed_as_configured() -> None:
 
 
 @pytest.mark.parametrize(("sigma", "followed"), [(1e-6, 1.0), (1e4, 0.0)])
-def test_velocities_are_believed_as_far_as_their_covariance_says(sigma: float, followed: float) -> None:
+def test_velocities_are_believed_as_far_as_their_covariance_says(sigma, followed):
     faster = VELOCITY + 1.0
     prediction = predicted(measured(velocity=faster, covariance=isotropic(sigma)))
     np.testing.assert_allclose(prediction.velocity, VELOCITY + followed, atol=1e-3)
 
 
-def test_a_velocity_counts_with_twice_the_deviation_of_the_motion_it_is_derived_from() -> None:
+def test_a_velocity_counts_with_twice_the_deviation_of_the_motion_it_is_derived_from():
     sigma, before = 1e-4, np.linalg.inv(predicted(measured()).covariance)
     prediction = predicted(measured(velocity=VELOCITY, covariance=isotropic(sigma)))
     # The least deviation of a pose is added after the measurement: compared without it, where it is next to nothing.
@@ -118,7 +118,7 @@ def test_a_velocity_counts_with_twice_the_deviation_of_the_motion_it_is_derived_
     np.testing.assert_allclose(np.diag(gained), (2.0 * sigma / 0.1) ** -2, rtol=1e-2)
 
 
-def test_uncertainty_goes_along_with_the_sensor() -> None:
+def test_uncertainty_goes_along_with_the_sensor():
     """Half a metre along x of the last scan is along y of one that has turned by 90 degrees meanwhile."""
     turning = np.array([0.0, 0.0, 0.5 * np.pi / 0.1, 0.0, 0.0, 0.0])
     covariance = np.diag(np.array([1e-4] * 3 + [0.5, 1e-4, 1e-4] + [1e-4] * 6) ** 2)
@@ -133,7 +133,7 @@ def test_uncertainty_goes_along_with_the_sensor() -> None:
 
 
 @pytest.mark.parametrize("seen_from_s", [0.0, 0.05, 0.1], ids=["stamped at the start", "in the middle", "at the end"])
-def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_another(seen_from_s: float) -> None:
+def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_another(seen_from_s):
     """Monte Carlo: each sweep at its own velocity, the second beginning where the first ended."""
     rng, count, sigma = np.random.default_rng(1), 200_000, 15.0 * 0.1
     before = rng.normal(scale=VELOCITY_SIGMA[3], size=count)
@@ -149,7 +149,7 @@ def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_a
     np.testing.assert_allclose(joint - np.diag([uneven, 0.0]), np.cov(way, after), rtol=0.02, atol=2e-4)
 
 
-def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable() -> None:
+def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable():
     """Independent, both would be likely; it is the correlation that keeps the one from making up for the other."""
     known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
     state = MotionState(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.05)
@@ -162,7 +162,7 @@ def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable() ->
     assert squared[1] < 1.0
 
 
-def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was() -> None:
+def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was():
     """However sure the odometry is, the next pose is no better known than the last."""
     known = np.diag(np.array([1e-6] * 3 + [0.3] * 3 + [1e-6] * 6) ** 2)
     state = MotionState(5.0, np.eye(4), np.zeros(6), known)
@@ -170,7 +170,7 @@ def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was() -> N
     np.testing.assert_allclose(np.sqrt(np.diag(prediction.covariance))[3:6], 0.3, rtol=1e-3)
 
 
-def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted() -> None:
+def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted():
     moved = exp(0.1 * VELOCITY)
     assert not predicted(measured(moved, covariance=isotropic(0.01))).contradicted
     assert not predicted(measured()).contradicted
@@ -182,7 +182,7 @@ def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted() -
     assert not predict(driving, 5.1, standing, ProcessNoise(), CONFIG, odometry_noise=doubted).contradicted
 
 
-def test_the_noise_of_an_odometry_follows_its_errors() -> None:
+def test_the_noise_of_an_odometry_follows_its_errors():
     rng, noise = np.random.default_rng(0), OdometryNoise()
     for _ in range(200):
         noise = noise.updated(
@@ -197,7 +197,7 @@ def test_the_noise_of_an_odometry_follows_its_errors() -> None:
     assert noise.updated(measured(), MOVED, CONFIG) == noise
 
 
-def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_not_change() -> None:
+def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_not_change():
     last = MotionState(0.0, exp([0.0, 0.0, 0.4, 1.0, 2.0, 0.0]), np.zeros(6), UNKNOWN_VELOCITY)
     prediction = predict(last, 0.1, measured(), ProcessNoise(), MappingConfig())
     held = prediction.held_along(np.array([0.0, 0.0, 1.0]))

@@ -1,15 +1,12 @@
 """Points and scans beyond the reach of voxels and cells: left out and counted, never merged."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.geometry import exp
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
@@ -19,7 +16,7 @@ from lidarslam.mapping.surfels.voxel_hash import reach_m
 from lidarslam.mapping.tracking.mapper import Mapper
 
 
-def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng: np.random.Generator) -> None:
+def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng):
     points = rng.uniform(-5.0, 5.0, (500, 3))
     whole, moved = GlobalMap(0.05), GlobalMap(0.05)
     whole.add(points, np.eye(4))
@@ -34,7 +31,7 @@ def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng: np.random.Generator)
     assert "voxels of 0.05 m reach, 52 km, and are not in the map" in drawn.warning
 
 
-def test_points_up_to_the_reach_are_in_the_map(rng: np.random.Generator) -> None:
+def test_points_up_to_the_reach_are_in_the_map(rng):
     points = rng.uniform(-5.0, 5.0, (500, 3))
     far = GlobalMap(0.05)
     far.add(points, exp([0.0, 0.0, 0.0, reach_m(0.05) - 6.0, 0.0, 0.0]))
@@ -45,9 +42,7 @@ def test_points_up_to_the_reach_are_in_the_map(rng: np.random.Generator) -> None
 
 
 @pytest.mark.parametrize("method", ["surfels", "loam"])
-def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(
-    method: MappingName, room: Any, drive: Callable[[FloatArray], FloatArray]
-) -> None:
+def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(method, room, drive):
     tracker = Mapper(MappingConfig(method=method, cell_m=0.05, max_range_m=30.0))
     tracker.process(room.ring_sweep(drive, 0.1), Prior(T_prev_curr=np.eye(4)))
     T_prev_curr = exp([0.0, 0.0, 0.0, 1e7, 0.0, 0.0])
@@ -56,7 +51,7 @@ def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(
     assert mapped.message == "beyond the reach of a map with cells of 0.05 m, 52 km"
 
 
-def test_a_map_far_from_its_origin_is_refused(rng: np.random.Generator) -> None:
+def test_a_map_far_from_its_origin_is_refused(rng):
     points = np.add(rng.uniform(-5.0, 5.0, (500, 3)), [4.5e6, 5e6, 0.0])
     fixed = FixedMap(points, np.tile([0.0, 0.0, 1.0], (500, 1)))
     for use in (lambda: fixed.region(points[0], 10.0, 0.1), lambda: fixed.views(0.1)):

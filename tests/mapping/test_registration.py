@@ -82,7 +82,7 @@ def box_map() -> SurfelMap:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map: SurfelMap, seed: int) -> None:
+def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map, seed):
     rng = np.random.default_rng(seed)
     axes = rng.normal(size=(2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -92,22 +92,14 @@ def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map: S
     assert len(refined.degeneracy) == 0
 
 
-def test_fine_cells_alone_suffice_nearby(box_map: SurfelMap, rng: np.random.Generator) -> None:
-    off = exp([0.01, -0.01, 0.01, 0.03, -0.03, 0.02])
-    refined = register(snapshot(rng), predicted(T_TRUE @ off), box_map, coarse_first=False)
-    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
-
-
-def test_the_true_pose_stays(box_map: SurfelMap, rng: np.random.Generator) -> None:
+def test_the_true_pose_stays(box_map, rng):
     refined = register(snapshot(rng), predicted(T_TRUE), box_map, coarse_first=False)
     assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
     assert refined.iterations <= 2
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
-def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(
-    box_map: SurfelMap, rng: np.random.Generator, stamp_at: float
-) -> None:
+def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(box_map, rng, stamp_at):
     """At 120 deg/s and 1.5 m/s the sweep is bent by 12 degrees and 15 cm."""
     refined = register(sweep_of(rng, TURNING, stamp_at=stamp_at), predicted(T_TRUE), box_map)
     assert_at(refined.T_world_lidar, T_TRUE, 2e-4, 0.005)
@@ -115,13 +107,10 @@ def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(
     np.testing.assert_allclose(refined.velocity[3:], TURNING[3:], atol=0.005)
 
 
-def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(
-    box_map: SurfelMap, rng: np.random.Generator
-) -> None:
+def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(box_map, rng):
     off = exp([0.0, 0.0, 0.05, 0.1, 0.0, 0.0])
     prediction = predicted(T_TRUE @ off, TURNING)
     refined = register_sweep(sweep_of(rng, TURNING), prediction, box_map, with_velocity=False)
-    assert refined is not None
     assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
     np.testing.assert_array_equal(refined.velocity, TURNING)
 
@@ -132,9 +121,7 @@ def corridor_map() -> SurfelMap:
 
 
 @pytest.mark.parametrize("along_m", [0.3, -0.7])
-def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(
-    corridor_map: SurfelMap, rng: np.random.Generator, along_m: float
-) -> None:
+def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(corridor_map, rng, along_m):
     """The corridor goes along x of the world; sensor and prediction look elsewhere."""
     shift = np.eye(4)
     shift[0, 3] = along_m
@@ -149,7 +136,7 @@ def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(
     assert refined.degeneracy.names == ("x",)
 
 
-def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng: np.random.Generator) -> None:
+def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng):
     """Their normals are off by a little, and each would pull along the corridor a little."""
     noisy = sides(rng, 60_000, axes=(1, 2))
     local_map = map_of(noisy + rng.normal(0.0, 0.02, noisy.shape))
@@ -160,9 +147,7 @@ def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng: np.random.Ge
     assert refined.T_world_lidar[0, 3] == pytest.approx(T_TRUE[0, 3], abs=2e-3)
 
 
-def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(
-    corridor_map: SurfelMap, rng: np.random.Generator
-) -> None:
+def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(corridor_map, rng):
     T_level = np.eye(4)
     truth = np.concatenate([np.deg2rad([0.0, 0.0, 20.0]), [1.0, 0.3, 0.0]])
     sweep = sweep_of(rng, truth, T_level, axes=(1, 2))
@@ -174,7 +159,7 @@ def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(
 
 
 @pytest.mark.parametrize("off_m", [0.05, 0.1])
-def test_a_few_points_on_its_end_hold_a_corridor(off_m: float) -> None:
+def test_a_few_points_on_its_end_hold_a_corridor(off_m):
     """All others fit perfectly wherever along it the sensor is, and must not make outliers of them."""
     rng = np.random.default_rng(1)
     local_map = map_of(np.concatenate([sides(rng, 60_000, axes=(1, 2)), sides(rng, 3_000, axes=(0,))]))
@@ -188,26 +173,24 @@ def test_a_few_points_on_its_end_hold_a_corridor(off_m: float) -> None:
 
 
 @pytest.mark.parametrize(("count", "suffices"), [(59, False), (100, True)])
-def test_too_few_points_make_no_pose(box_map: SurfelMap, rng: np.random.Generator, count: int, suffices: bool) -> None:
+def test_too_few_points_make_no_pose(box_map, rng, count, suffices):
     few = snapshot(rng, count=count)
     assert (register_sweep(few, predicted(T_TRUE), box_map, with_velocity=False) is not None) == suffices
 
 
 @pytest.mark.parametrize("count", [0, 500])
-def test_nothing_to_meet_makes_no_pose(rng: np.random.Generator, count: int) -> None:
+def test_nothing_to_meet_makes_no_pose(rng, count):
     assert register_sweep(snapshot(rng, count=count), predicted(T_TRUE), SurfelMap(CELL, 10.0), False) is None
 
 
-def test_no_more_iterations_than_allowed(
-    box_map: SurfelMap, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_more_iterations_than_allowed(box_map, rng, monkeypatch):
     off = exp([0.0, 0.0, 0.03, 0.05, -0.05, 0.0])
     assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations > 2
     monkeypatch.setattr("lidarslam.mapping.registration.registration._ITERATIONS", (3, 2))
     assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations == 2
 
 
-def test_outliers_do_not_move_the_pose(box_map: SurfelMap, rng: np.random.Generator) -> None:
+def test_outliers_do_not_move_the_pose(box_map, rng):
     """A third of the points stands away from the walls, all on one side of them, as people and furniture do."""
     world = sides(rng, 3_000, margin=2.1 * CELL)
     world[::3] *= rng.uniform(0.8, 0.98, (1_000, 1))
@@ -216,7 +199,7 @@ def test_outliers_do_not_move_the_pose(box_map: SurfelMap, rng: np.random.Genera
     assert_at(register(sweep, predicted(T_TRUE @ off), box_map).T_world_lidar, T_TRUE, 0.01, 0.1)
 
 
-def test_the_covariance_has_its_order_and_its_frame(corridor_map: SurfelMap, rng: np.random.Generator) -> None:
+def test_the_covariance_has_its_order_and_its_frame(corridor_map, rng):
     """Turned left by 90 degrees, the sensor sees the corridor go along its own y."""
     T_turned = exp([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0])
     prediction = predicted(T_turned, rotation_deg=3.0, metres=0.5)
@@ -228,7 +211,7 @@ def test_the_covariance_has_its_order_and_its_frame(corridor_map: SurfelMap, rng
     assert sigmas[:3].max() < np.deg2rad(1.0)
 
 
-def test_rotations_come_first_in_the_covariance(rng: np.random.Generator) -> None:
+def test_rotations_come_first_in_the_covariance(rng):
     """A floor leaves yaw open, x and y, and holds roll, pitch and z."""
     floor = np.column_stack([rng.uniform(-4, 4, (60_000, 2)), np.full(60_000, -1.5)])
     sweep = Sweep(np.column_stack([rng.uniform(-3, 3, (2_000, 2)), np.full(2_000, -1.5)]))
@@ -238,7 +221,7 @@ def test_rotations_come_first_in_the_covariance(rng: np.random.Generator) -> Non
     assert sigmas[3:5].min() > 10.0 * sigmas[5]
 
 
-def test_the_covariance_is_symmetric_and_positive(box_map: SurfelMap, rng: np.random.Generator) -> None:
+def test_the_covariance_is_symmetric_and_positive(box_map, rng):
     covariance = register(sweep_of(rng, TURNING), predicted(T_TRUE), box_map).covariance
     assert covariance.shape == (12, 12)
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
@@ -293,7 +276,7 @@ def registrations(room: Any, sigma_m: float, count: int = 20) -> Consistency:
     return Consistency(pose, motion)
 
 
-def test_errors_are_as_large_as_the_covariance_says(room: Any) -> None:
+def test_errors_are_as_large_as_the_covariance_says(room):
     """The mean of six squared normal variables is six. Errors are never understated, and not overstated tenfold.
 
     Here all errors are independent and the covariance is cautious; on rough ground they are not, and it is about right.

@@ -31,14 +31,14 @@ def closure(way: FloatArray, off: FloatArray, sigma: float = 0.01) -> LoopClosur
 NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
 
 
-def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip: FloatArray) -> None:
+def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip):
     found = as_registered(closure(round_trip, NEAR), round_trip[0], round_trip, REGISTERED, REGISTERED, radius_m=100.0)
     np.testing.assert_allclose(found.T_first_second, inverse(round_trip[0]) @ round_trip[-1], atol=1e-12)
     assert found.accepted
     assert np.linalg.eigvalsh(found.covariance - REGISTERED).min() > 0.0, "both registrations err"
 
 
-def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip: FloatArray) -> None:
+def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip):
     """The local map was drawn anew before the last ten scans, which are registered to its surfaces."""
     measured, T_odom_first = closure(round_trip, NEAR), round_trip[0] @ exp(0.5 * NEAR)
     found = as_registered(measured, T_odom_first, round_trip[-10:], REGISTERED, REGISTERED, radius_m=30.0)
@@ -55,8 +55,6 @@ def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip: FloatArr
     ],
     ids=["the way left the map", "without a map", "not registered", "drifted off its own map"],
 )
-def test_elsewhere_the_closure_counts(
-    round_trip: FloatArray, radius_m: float, first: FloatArray | None, off: FloatArray
-) -> None:
+def test_elsewhere_the_closure_counts(round_trip, radius_m, first, off):
     measured = closure(round_trip, off)
     assert as_registered(measured, round_trip[0], round_trip, first, REGISTERED, radius_m) is measured

@@ -26,18 +26,18 @@ def cells(points: FloatArray, cell_m: float) -> FloatArray:
     return np.floor(points.astype(np.float32) * np.float32(1.0 / cell_m))
 
 
-def test_at_most_one_point_goes_into_the_map_from_each_half_cell(rng: np.random.Generator) -> None:
+def test_at_most_one_point_goes_into_the_map_from_each_half_cell(rng):
     sampled = sample(shell(rng, 5.0, 50_000), cell_m=0.4)
     assert len(np.unique(cells(sampled.sweep.points, 0.2), axis=0)) == len(sampled)
 
 
-def test_nearly_every_half_cell_gives_its_point(rng: np.random.Generator) -> None:
+def test_nearly_every_half_cell_gives_its_point(rng):
     scan = shell(rng, 5.0, 50_000)
     occupied = len(np.unique(cells(scan.points, 0.2), axis=0))
     assert len(sample(scan, cell_m=0.4)) > 0.95 * occupied
 
 
-def test_registered_points_are_spread_wider(rng: np.random.Generator) -> None:
+def test_registered_points_are_spread_wider(rng):
     sampled = sample(shell(rng, 5.0, 50_000), cell_m=0.1, keypoints=100_000)
     keys = sampled.keypoints.points
     assert 100 < len(keys) < len(sampled)
@@ -45,9 +45,7 @@ def test_registered_points_are_spread_wider(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("keypoints", [100, 700, 2_000])
-def test_no_more_points_are_registered_than_wanted_and_they_come_from_everywhere(
-    rng: np.random.Generator, keypoints: int
-) -> None:
+def test_no_more_points_are_registered_than_wanted_and_they_come_from_everywhere(rng, keypoints):
     sampled = sample(shell(rng, 5.0), cell_m=0.05, keypoints=keypoints)
     keys = sampled.keypoints.points
     assert len(keys) == keypoints
@@ -55,7 +53,7 @@ def test_no_more_points_are_registered_than_wanted_and_they_come_from_everywhere
     np.testing.assert_allclose((keys > 0.0).mean(axis=0), 0.5, atol=0.15)
 
 
-def test_only_points_within_range_are_left(rng: np.random.Generator) -> None:
+def test_only_points_within_range_are_left(rng):
     points = rng.normal(size=(20_000, 3))
     points *= rng.uniform(0.1, 20.0, (20_000, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
     sampled = sample(Scan(points, 0.0), cell_m=0.1, min_range_m=2.0, max_range_m=10.0)
@@ -64,7 +62,7 @@ def test_only_points_within_range_are_left(rng: np.random.Generator) -> None:
     assert 9.8 < ranges.max() < 10.0
 
 
-def test_times_stay_with_their_points(rng: np.random.Generator) -> None:
+def test_times_stay_with_their_points(rng):
     scan = shell(rng, 5.0)
     sampled = sample(scan, cell_m=0.3, min_range_m=4.7, keypoints=150)
     for sweep in (sampled.sweep, sampled.keypoints):
@@ -72,39 +70,37 @@ def test_times_stay_with_their_points(rng: np.random.Generator) -> None:
         np.testing.assert_array_equal(sweep.points, scan.points[np.round(1e6 * sweep.times).astype(int)])
 
 
-def test_elevations_are_those_of_their_points(rng: np.random.Generator) -> None:
+def test_elevations_are_those_of_their_points(rng):
     sampled = sample(shell(rng, 5.0), cell_m=0.3)
     upward = np.hypot(sampled.sweep.points[:, 0], sampled.sweep.points[:, 1])
     np.testing.assert_allclose(sampled.elevations, np.arctan2(sampled.sweep.points[:, 2], upward), atol=1e-12)
 
 
-def test_a_scan_without_times_is_sampled_without(rng: np.random.Generator) -> None:
+def test_a_scan_without_times_is_sampled_without(rng):
     sampled = sample(Scan(shell(rng, 5.0).points, 1.5))
     assert sampled.sweep.times is None
     assert sampled.stamp == 1.5
 
 
-def test_nothing_is_sampled_from_nothing() -> None:
+def test_nothing_is_sampled_from_nothing():
     sampled = sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)))
     assert len(sampled) == len(sampled.keypoints) == 0
     assert sampled.is_sparse
     assert sampled.cell_m > 0.0
 
 
-def test_an_empty_scan_does_not_decide_on_the_cells(rng: np.random.Generator) -> None:
+def test_an_empty_scan_does_not_decide_on_the_cells(rng):
     sampler = SurfelSampler(MappingConfig())
     sampler.sample(Scan(np.empty((0, 3)), 0.0))
     assert sampler.sample(shell(rng, 12.0)).cell_m == pytest.approx(0.4, rel=0.02)
 
 
 @pytest.mark.parametrize(("radius_m", "cell_m"), [(6.0, 0.2), (24.0, 0.8), (0.6, 0.05), (60.0, 1.0)])
-def test_cells_are_a_share_of_the_median_range_within_bounds(
-    rng: np.random.Generator, radius_m: float, cell_m: float
-) -> None:
+def test_cells_are_a_share_of_the_median_range_within_bounds(rng, radius_m, cell_m):
     assert sample(shell(rng, radius_m)).cell_m == pytest.approx(cell_m, rel=0.02)
 
 
-def test_a_given_cell_stays_whatever_the_scene(rng: np.random.Generator) -> None:
+def test_a_given_cell_stays_whatever_the_scene(rng):
     sampler = SurfelSampler(MappingConfig(cell_m=0.33))
     assert {sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in (1.0, 40.0, 5.0)} == {0.33}
 
@@ -114,35 +110,33 @@ def cell_sizes(rng: np.random.Generator, radii_m: list[float]) -> list[float]:
     return [sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in radii_m]
 
 
-def test_a_scene_that_changes_by_less_than_two_keeps_its_cells(rng: np.random.Generator) -> None:
+def test_a_scene_that_changes_by_less_than_two_keeps_its_cells(rng):
     sizes = cell_sizes(rng, [6.0] + [10.5] * 100 + [3.6] * 100 + [10.5] * 100)
     assert len(set(sizes)) == 1
 
 
 @pytest.mark.parametrize(("before_m", "after_m"), [(6.0, 14.0), (14.0, 6.0)])
-def test_a_scene_that_has_changed_by_more_has_other_cells_in_the_end(
-    rng: np.random.Generator, before_m: float, after_m: float
-) -> None:
+def test_a_scene_that_has_changed_by_more_has_other_cells_in_the_end(rng, before_m, after_m):
     sizes = cell_sizes(rng, [before_m] + [after_m] * 120)
     assert len(set(sizes)) == 2, "it changes once"
     assert sizes[-1] == pytest.approx(after_m / 30.0, rel=0.25)
 
 
-def test_one_scan_of_another_scale_changes_nothing(rng: np.random.Generator) -> None:
+def test_one_scan_of_another_scale_changes_nothing(rng):
     sizes = cell_sizes(rng, [6.0] * 10 + [60.0] + [6.0] * 10)
     assert len(set(sizes)) == 1
 
 
 @pytest.mark.parametrize("numbered", [False, True])
 @pytest.mark.parametrize("name", [name for name in SENSORS if name != "livox"])
-def test_strokes_are_told_from_rings(name: str, numbered: bool) -> None:
+def test_strokes_are_told_from_rings(name, numbered):
     """Livox's drivers number the lasers, too."""
     rays = SENSORS[name].pattern.rays(3)
     scan = Scan(10.0 * rays.directions, 0.3, 0.1 * rays.fractions, rays.rings if numbered else None)
     assert has_rings(scan) == (SENSORS[name].driver != "livox")
 
 
-def test_points_of_strokes_have_no_elevations() -> None:
+def test_points_of_strokes_have_no_elevations():
     rays = SENSORS["mid-360"].pattern.rays(0)
     sampled = sample(Scan(10.0 * rays.directions, 0.0, 0.1 * rays.fractions))
     assert not sampled.has_rings

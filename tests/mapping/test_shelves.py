@@ -42,7 +42,7 @@ def matcher() -> ScanMatcher:
     return ScanMatcher(scan, last, surfel_map, MappingConfig(), Budget())
 
 
-def test_the_odometrys_motion_is_tried_where_the_prediction_is_uncertain(matcher: ScanMatcher) -> None:
+def test_the_odometrys_motion_is_tried_where_the_prediction_is_uncertain(matcher):
     predicted = HERE.copy()
     predicted[2, 3] = -1.5 * SPACING_M
     near = matcher.register(Prediction(1.1, predicted, np.zeros(6), np.diag(VARIANCES)), coarse_first=False)
@@ -52,7 +52,7 @@ def test_the_odometrys_motion_is_tried_where_the_prediction_is_uncertain(matcher
     assert matcher.or_from_odometry(near, Prior()) is near
 
 
-def test_the_odometrys_motion_is_not_taken_where_it_fits_no_better(matcher: ScanMatcher) -> None:
+def test_the_odometrys_motion_is_not_taken_where_it_fits_no_better(matcher):
     right = matcher.register(Prediction(1.1, HERE, np.zeros(6), np.diag(VARIANCES)), coarse_first=False)
     lower = HERE.copy()
     lower[2, 3] = -1.5 * SPACING_M

@@ -1,17 +1,14 @@
 """A walk round a block of corridors, with a drift that is known: loops are closed, and nothing else is."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
-from lidarslam.core.state import Saved, State
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.loops.closure import NEAR_SCANS, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph import slam_graph
@@ -173,7 +170,7 @@ def closed(walk: Walk) -> tuple[SlamGraph, Corrected]:
     return graph, result
 
 
-def test_a_closed_round_takes_the_drift_away(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+def test_a_closed_round_takes_the_drift_away(walk, closed):
     _, result = closed
     before, after = walk.errors_m(walk.estimate), walk.errors_m(result.T_world_lidar)
     assert before.max() > 0.6
@@ -181,7 +178,7 @@ def test_a_closed_round_takes_the_drift_away(walk: Walk, closed: tuple[SlamGraph
     assert sum(result.inliers) >= 2
 
 
-def test_a_forbidden_loop_is_not_found(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+def test_a_forbidden_loop_is_not_found(walk, closed):
     graph, free = closed
     scans = [graph.keyframes[key].scan for key in range(len(graph.keyframes))]
     near, far = (8, 170), (8 + NEAR_SCANS + 60, 170)
@@ -189,14 +186,13 @@ def test_a_forbidden_loop_is_not_found(walk: Walk, closed: tuple[SlamGraph, Corr
     assert found
     assert all(abs(i - near[0]) <= NEAR_SCANS and abs(j - near[1]) <= NEAR_SCANS for i, j in found)
     result = follow(walk, given=GivenLoops(forbidden=(far, near))).finish()
-    assert result is not None
     assert not result.closures
     np.testing.assert_allclose(result.T_world_lidar, walk.estimate, atol=1e-6)
     barred = GivenLoops(forbidden=((100, 300),)).barred(np.array([49, 50, 150, 151, 250]))
     assert barred.tolist() == [False, True, True, False, False]
 
 
-def test_a_given_loop_is_closed_from_a_wrong_estimate(walk: Walk) -> None:
+def test_a_given_loop_is_closed_from_a_wrong_estimate(walk):
     """No loop is tried by itself; the estimate is off by more than a room, without a word of it."""
     T_off, lost = exp([0.0, 0.0, 1.2, 6.0, -4.0, 0.5]), 140
     estimate = np.array([*walk.estimate[:lost], *(walk.estimate[0] @ T_off @ walk.estimate[lost:])])
@@ -205,7 +201,6 @@ def test_a_given_loop_is_closed_from_a_wrong_estimate(walk: Walk) -> None:
     config = CONFIG.model_copy(update={"loops": CONFIG.loops.model_copy(update={"min_way_m": 1000.0})})
     graph = follow(wrong, config=config, given=given)
     result = graph.finish()
-    assert result is not None
     first, second = sorted(result.closures, key=lambda one: one.given or (0, 0))
     assert (first.given, first.accepted, second.given, second.accepted) == ((12, 172), True, (25, 80), False)
     assert second.reason
@@ -217,7 +212,7 @@ def test_a_given_loop_is_closed_from_a_wrong_estimate(walk: Walk) -> None:
     assert walk.errors_m(result.T_world_lidar)[keys[1]] < 0.1 < walk.errors_m(estimate)[keys[1]]
 
 
-def test_loops_are_closed_on_the_way_and_nothing_changes(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+def test_loops_are_closed_on_the_way_and_nothing_changes(walk, closed):
     """Asked now and then, the graph gives what it has, and ends up the same."""
     graph, presents = SlamGraph(CONFIG), []
     for i, scan in enumerate(walk.scans()):
@@ -225,22 +220,15 @@ def test_loops_are_closed_on_the_way_and_nothing_changes(walk: Walk, closed: tup
         if i in (60, len(walk.truth) - 1):
             presents.append(graph.present())
     early, late = presents
-    assert early is not None
-    assert late is not None
     np.testing.assert_allclose(early.T_world_lidar, walk.estimate[:61], atol=1e-6)
     before, after = walk.errors_m(walk.estimate), walk.errors_m(late.T_world_lidar)
     assert np.sqrt(np.mean(after**2)) < 0.25 * np.sqrt(np.mean(before**2))
     finished = graph.finish()
-    assert finished is not None
     np.testing.assert_allclose(finished.T_world_lidar, closed[1].T_world_lidar, atol=1e-4)
     assert finished.inliers == closed[1].inliers
 
 
-def test_nothing_is_present_before_the_first_keyframe() -> None:
-    assert SlamGraph(CONFIG).present() is None
-
-
-def test_every_loop_that_is_inlier_is_one(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+def test_every_loop_that_is_inlier_is_one(walk, closed):
     _, result = closed
     for closure, inlier in zip(result.closures, result.inliers, strict=True):
         first, second = (walk.truth[result.keyframe_scans[k]] for k in (closure.first, closure.second))
@@ -249,7 +237,7 @@ def test_every_loop_that_is_inlier_is_one(walk: Walk, closed: tuple[SlamGraph, C
         assert not inlier or closure.accepted
 
 
-def test_the_scans_between_follow_their_keyframes(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+def test_the_scans_between_follow_their_keyframes(walk, closed):
     _, result = closed
     np.testing.assert_allclose(result.T_world_lidar[result.keyframe_scans], result.keyframe_poses, atol=1e-9)
     steps = log(inverse(result.T_world_lidar[:-1]) @ result.T_world_lidar[1:])
@@ -257,7 +245,7 @@ def test_the_scans_between_follow_their_keyframes(walk: Walk, closed: tuple[Slam
     assert np.linalg.norm((steps - as_estimated)[:, 3:], axis=1).max() < 0.04  # spread over the way, no jump
 
 
-def test_the_map_is_drawn_where_the_scans_have_gone(walk: Walk, closed: tuple[SlamGraph, Corrected]) -> None:
+def test_the_map_is_drawn_where_the_scans_have_gone(walk, closed):
     graph, result = closed
     true = cKDTree(np.concatenate([transform_points(T, p) for T, p in zip(walk.truth, walk.points, strict=True)]))
     drawn = true.query(graph.draw_map(result, VOXEL_M).points())[0]
@@ -284,9 +272,7 @@ def redrawn(walk: Walk) -> list[tuple[int, SurfelMap]]:
     return drawn
 
 
-def test_the_local_map_is_drawn_anew_where_the_second_round_is(
-    walk: Walk, redrawn: list[tuple[int, SurfelMap]]
-) -> None:
+def test_the_local_map_is_drawn_anew_where_the_second_round_is(walk, redrawn):
     """Surfaces of the first round lie where the truth has them relative to the sensor, which has drifted away."""
     assert 1 <= len(redrawn) <= 3
     first_round = np.concatenate([transform_points(walk.truth[i], walk.points[i]) for i in range(8)])
@@ -302,8 +288,8 @@ def test_the_local_map_is_drawn_anew_where_the_second_round_is(
         assert np.percentile(distances, 95) < 2.0 * CELL_M
 
 
-def test_a_local_map_that_is_right_is_left_alone(walk: Walk) -> None:
-    """Loops are closed, but the poses were right, and all is within the radius."""
+def test_a_local_map_that_is_right_is_left_alone(walk):
+    """Loops are closed, but the poses were right, and stay so; all is within the radius."""
     graph = SlamGraph(CONFIG, local_radius_m=60.0)
     right = replace(walk, estimate=walk.truth)
     for scan in right.scans():
@@ -311,12 +297,12 @@ def test_a_local_map_that_is_right_is_left_alone(walk: Walk) -> None:
         assert graph.redrawn_local_map(CELL_M) is None
         graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
     result = graph.finish()
-    assert result is not None
-    assert any(result.inliers)
+    assert sum(result.inliers) >= 2
+    assert walk.errors_m(result.T_world_lidar).max() < 0.01
     graph.close()
 
 
-def test_edges_are_of_trajectory_odometry_and_loops(closed: tuple[SlamGraph, Corrected]) -> None:
+def test_edges_are_of_trajectory_odometry_and_loops(closed):
     _, result = closed
     keyframes = len(result.keyframe_scans)
     assert len(loops_of(result)) == sum(result.inliers)
@@ -324,48 +310,11 @@ def test_edges_are_of_trajectory_odometry_and_loops(closed: tuple[SlamGraph, Cor
     assert 20 < keyframes < 120
 
 
-def test_a_trajectory_that_is_right_stays_right(walk: Walk) -> None:
-    right = replace(walk, estimate=walk.truth)
-    result = follow(right).finish()
-    assert result is not None
-    assert sum(result.inliers) >= 2
-    assert walk.errors_m(result.T_world_lidar).max() < 0.01
-
-
-def test_without_a_loop_the_trajectory_stays(walk: Walk) -> None:
-    scans = list(walk.scans())[:60]
-    graph = follow(walk, scans)
-    result = graph.finish()
-    assert result is not None
-    assert not any(result.inliers)
-    np.testing.assert_allclose(result.T_world_lidar, walk.estimate[:60], atol=1e-6)
-    graph.close()
-
-
-def test_an_odometry_that_says_nothing_gives_no_edge(walk: Walk) -> None:
-    silent = [replace(scan, motion_covariance=None) for scan in list(walk.scans())[:40]]
-    result = follow(walk, silent).finish()
-    assert result is not None
-    assert len(result.edges) == len(result.keyframe_scans) - 1
-
-
-def test_an_odometry_alone_is_the_trajectory(walk: Walk) -> None:
-    alone = [replace(scan, covariance=None) for scan in list(walk.scans())[:40]]
-    result = follow(walk, alone).finish()
-    assert result is not None
-    assert len(result.edges) == len(result.keyframe_scans) - 1
-    firmer = follow(walk, list(walk.scans())[:40]).finish()
-    assert firmer is not None
-    loose, firm = (r.edges[0].covariance for r in (result, firmer))
-    assert loose[3, 3] > 4.0 * firm[3, 3]
-
-
-def test_where_tracking_was_lost_the_edge_is_weak_and_no_keyframe_is_made(walk: Walk) -> None:
+def test_where_tracking_was_lost_the_edge_is_weak_and_no_keyframe_is_made(walk):
     scans = list(walk.scans())[:60]
     for i in range(20, 28):
         scans[i] = replace(scans[i], lost=True, belongs_in_map=False, covariance=None, T_prev_curr=None)
     result = follow(walk, scans).finish()
-    assert result is not None
     assert not set(range(20, 28)) & set(result.keyframe_scans.tolist())
     after = np.searchsorted(result.keyframe_scans, 20)
     (weak,) = (edge for edge in result.edges if (edge.first, edge.second) == (after - 1, after))
@@ -373,22 +322,17 @@ def test_where_tracking_was_lost_the_edge_is_weak_and_no_keyframe_is_made(walk: 
     assert np.sqrt(weak.covariance[2, 2]) >= np.deg2rad(20.0)
 
 
-def test_a_run_without_a_scan_has_nothing_to_correct() -> None:
+def test_a_run_without_a_scan_has_nothing_to_correct():
     graph = SlamGraph(CONFIG)
+    assert graph.present() is None
     assert graph.finish() is None
     graph.draw(np.zeros((3, 3)), np.eye(4), VOXEL_M)  # nothing to draw into, and no harm done
     graph.close()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.97, 1.0])
-def test_a_graph_that_is_restored_goes_on_to_the_same_result(
-    walk: Walk,
-    closed: tuple[SlamGraph, Corrected],
-    through_disk: Callable[[State], Saved],
-    tmp_path: Path,
-    share: float,
-) -> None:
-    """The last two after loops were closed, so that iSAM2 has been through something."""
+@pytest.mark.parametrize("share", [0.3, 0.97])
+def test_a_graph_that_is_restored_goes_on_to_the_same_result(walk, closed, through_disk, tmp_path, share):
+    """The second time after loops were closed."""
     scans, file = list(walk.scans()), tmp_path / "submaps.bin"
     begun = SlamGraph(CONFIG, file=file)
     until = int(share * len(scans))
@@ -400,7 +344,6 @@ def test_a_graph_that_is_restored_goes_on_to_the_same_result(
     graph.restore(saved)
     go_on(graph, scans[until:])
     result = graph.finish()
-    assert result is not None
     whole, expected = closed
     np.testing.assert_array_equal(result.T_world_lidar, expected.T_world_lidar)
     np.testing.assert_array_equal(result.keyframe_scans, expected.keyframe_scans)
@@ -412,27 +355,7 @@ def test_a_graph_that_is_restored_goes_on_to_the_same_result(
     np.testing.assert_array_equal(drawn.means().rows, whole.draw_map(expected, VOXEL_M).means().rows)
 
 
-def test_a_file_of_submaps_that_was_changed_is_refused(
-    walk: Walk, through_disk: Callable[[State], Saved], tmp_path: Path
-) -> None:
-    file = tmp_path / "submaps.bin"
-    graph = SlamGraph(CONFIG, file=file)
-    go_on(graph, list(walk.scans())[:20])
-    saved = through_disk(graph.state())
-    graph.close()
-    content = bytearray(file.read_bytes())
-    content[-1] ^= 1
-    file.write_bytes(content)
-    with pytest.raises(InputError, match=r"submaps\.bin: is damaged"):
-        SlamGraph(CONFIG, file=file).restore(saved)
-    file.write_bytes(content[:100])
-    with pytest.raises(InputError, match=r"submaps\.bin: is damaged"):
-        SlamGraph(CONFIG, file=file).restore(saved)
-
-
-def test_a_recording_that_is_added_whole_has_the_result_of_one_that_is_followed(
-    walk: Walk, closed: tuple[SlamGraph, Corrected]
-) -> None:
+def test_a_recording_that_is_added_whole_has_the_result_of_one_that_is_followed(walk, closed):
     _, expected = closed
     _, result = follow_all(walk)
     np.testing.assert_array_equal(result.T_world_lidar, expected.T_world_lidar)
@@ -446,9 +369,7 @@ def two(walk: Walk, second_walk: Walk) -> tuple[SlamGraph, Corrected]:
     return follow_all(walk, second_walk)
 
 
-def test_a_second_recording_finds_itself_in_the_first(
-    walk: Walk, second_walk: Walk, two: tuple[SlamGraph, Corrected]
-) -> None:
+def test_a_second_recording_finds_itself_in_the_first(walk, second_walk, two):
     graph, result = two
     count = len(walk.truth)
     assert result.first_scans.tolist() == [0, count]
@@ -474,9 +395,7 @@ def test_a_second_recording_finds_itself_in_the_first(
     assert 0 < len(drawn) < len(graph.draw_map(result, VOXEL_M).points())
 
 
-def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace(
-    walk: Walk, second_walk: Walk, two: tuple[SlamGraph, Corrected], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace(walk, second_walk, two, monkeypatch):
     graph, joined = two
 
     def reject_all(poses: FloatArray, edges: list[RelativePose], loops: list[RelativePose], _: object) -> Optimised:
@@ -484,7 +403,6 @@ def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace
 
     monkeypatch.setattr(slam_graph, "optimise", reject_all)
     result = graph.finish()
-    assert result is not None
     assert result.frames.tolist() == [0, 1]
     count = len(walk.truth)
     first = result.keyframe_scans[result.keyframe_recordings == 1][0]
@@ -497,7 +415,7 @@ def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace
     np.testing.assert_allclose(result.T_world_lidar[:count], joined.T_world_lidar[:count], atol=1e-3)
 
 
-def test_recordings_of_different_places_stay_apart(walk: Walk, foreign_walk: Walk) -> None:
+def test_recordings_of_different_places_stay_apart(walk, foreign_walk):
     graph, result = follow_all(
         replace(walk, truth=walk.truth[:80], estimate=walk.estimate[:80], points=walk.points[:80]), foreign_walk
     )
@@ -508,13 +426,12 @@ def test_recordings_of_different_places_stay_apart(walk: Walk, foreign_walk: Wal
     graph.close()
 
 
-def test_recordings_without_a_keyframe_are_in_frames_of_their_own(walk: Walk) -> None:
+def test_recordings_without_a_keyframe_are_in_frames_of_their_own(walk):
     """One without a scan, one whose scans are all lost; those around them are corrected as ever."""
     scans, far = list(walk.scans()), exp([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])
     lost = [replace(s, T_world_lidar=far @ s.T_world_lidar, belongs_in_map=False, lost=True) for s in scans[:5]]
     graph = joined(scans[:30], [], lost, scans[29:39])
     result = graph.finish()
-    assert result is not None
     assert result.first_scans.tolist() == [0, 30, 30, 35]
     assert result.frames[:3].tolist() == [0, 1, 2]
     assert sorted(set(result.keyframe_recordings.tolist())) == [0, 3]

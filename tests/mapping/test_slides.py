@@ -1,13 +1,12 @@
 """Slips along the way are found, and nothing else is taken for one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.state import Saved, State
 from lidarslam.mapping.consistency import ConsistencyCheck, Contradiction, Surfels, find_contradictions, shift_profile
 
 # A street of 120 m with buildings, parked vans and posts, driven through at 8 m/s.
@@ -18,7 +17,7 @@ COLONNADE = tuple((x, side * 5.0, 0.8) for x in range(-45, 46, 5) for side in (-
 
 
 @pytest.fixture(scope="module")
-def street(room: "Room") -> "Room":  # type: ignore[name-defined] # noqa: F821 # of the root conftest
+def street(room):
     """The street."""
     return replace(room, half_size=(60.0, 9.0, 2.0), pillars=BESIDE)
 
@@ -38,8 +37,8 @@ def record(place: object, ahead: float | None = None) -> list[FloatArray]:
     for number, T in enumerate(TRUE):
         here = place
         if ahead is not None:
-            here = replace(place, pillars=(*place.pillars, (T[0, 3] + ahead, 1.5, 1.0)))  # type: ignore[attr-defined,type-var]
-        scans.append(here.sweep(lambda times, T=T: np.tile(T, (len(times), 1, 1)), 0.1 * number).points)  # type: ignore[attr-defined]
+            here = replace(place, pillars=(*place.pillars, (T[0, 3] + ahead, 1.5, 1.0)))
+        scans.append(here.sweep(lambda times, T=T: np.tile(T, (len(times), 1, 1)), 0.1 * number).points)
     return scans
 
 
@@ -63,8 +62,8 @@ def found(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> tuple[Contr
     return find_contradictions(check(scans, T_world_lidar).tests, T_world_lidar)
 
 
-def test_normals_are_those_of_the_walls(room: object) -> None:
-    points = room.sweep(lambda times: np.tile(np.eye(4), (len(times), 1, 1)), 0.1).points  # type: ignore[attr-defined]
+def test_normals_are_those_of_the_walls(room):
+    points = room.sweep(lambda times: np.tile(np.eye(4), (len(times), 1, 1)), 0.1).points
     surfels = Surfels.of(points)
     on_wall = np.abs(np.abs(surfels.points[:, 0]) - 7.0) < 0.01
     assert np.count_nonzero(on_wall) > 50
@@ -72,29 +71,28 @@ def test_normals_are_those_of_the_walls(room: object) -> None:
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 0.4, -1.3, 20.0])
-def test_the_profile_peaks_at_the_shift(scans: list[FloatArray], shift_m: float) -> None:
+def test_the_profile_peaks_at_the_shift(scans, shift_m):
     first, second = Surfels.of(scans[0]), Surfels.of(scans[10])
     T = np.eye(4)
     T[0, 3] = 10 * STEP_M - shift_m
     profile = shift_profile(first, second, T, np.array([1.0, 0.0, 0.0]))
-    assert profile is not None
     assert 0.1 * (profile.argmax() - len(profile) // 2) == pytest.approx(shift_m, abs=0.11)
 
 
-def test_true_poses_are_not_contradicted(scans: list[FloatArray]) -> None:
+def test_true_poses_are_not_contradicted(scans):
     assert len(check(scans, TRUE).tests) >= 6
     assert found(scans, TRUE) == ()
 
 
 @pytest.mark.parametrize("scale", [0.96, 0.9, 0.05, 1.1])
-def test_a_slide_of_the_whole_run_is_found(scans: list[FloatArray], scale: float) -> None:
+def test_a_slide_of_the_whole_run_is_found(scans, scale):
     (stretch,) = found(scans, poses([scale * STEP_M] * (SCANS - 1)))
     assert np.sign(stretch.shift_m) == np.sign(1.0 - scale)
     assert stretch.pairs >= 4
     assert stretch.votes_at_pose < 0.5 * stretch.votes
 
 
-def test_a_slide_at_one_place_is_found_there(scans: list[FloatArray]) -> None:
+def test_a_slide_at_one_place_is_found_there(scans):
     steps = [STEP_M] * (SCANS - 1)
     steps[20] = -0.2
     (stretch,) = found(scans, poses(steps))
@@ -102,29 +100,29 @@ def test_a_slide_at_one_place_is_found_there(scans: list[FloatArray]) -> None:
     assert stretch.shift_m == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_vehicle_that_drives_ahead_does_not_contradict(street: object) -> None:
+def test_a_vehicle_that_drives_ahead_does_not_contradict(street):
     assert found(record(street, ahead=8.0), TRUE) == ()
 
 
-def test_a_colonnade_that_repeats_itself_does_not_contradict(street: object) -> None:
-    assert found(record(replace(street, pillars=COLONNADE)), TRUE) == ()  # type: ignore[type-var]
+def test_a_colonnade_that_repeats_itself_does_not_contradict(street):
+    assert found(record(replace(street, pillars=COLONNADE)), TRUE) == ()
 
 
-def test_a_bare_tunnel_says_nothing(street: object) -> None:
-    bare = record(replace(street, half_size=(300.0, 9.0, 2.0), pillars=()))  # type: ignore[type-var]
+def test_a_bare_tunnel_says_nothing(street):
+    bare = record(replace(street, half_size=(300.0, 9.0, 2.0), pillars=()))
     near = [points[np.linalg.norm(points, axis=1) < 60.0] for points in bare]
     assert len(check(near, poses([0.5 * STEP_M] * (SCANS - 1))).tests) == 0
     assert found(near, poses([0.5 * STEP_M] * (SCANS - 1))) == ()
 
 
-def test_poses_that_were_corrected_are_judged_as_corrected(scans: list[FloatArray]) -> None:
+def test_poses_that_were_corrected_are_judged_as_corrected(scans):
     slid = poses([0.9 * STEP_M] * (SCANS - 1))
     assert find_contradictions(check(scans, slid).tests, TRUE) == ()
     (stretch,) = find_contradictions(check(scans, TRUE).tests, slid)
     assert stretch.shift_m > 0.0
 
 
-def test_it_goes_on_from_its_state(scans: list[FloatArray], through_disk: Callable[[State], Saved]) -> None:
+def test_it_goes_on_from_its_state(scans, through_disk):
     slid = poses([0.9 * STEP_M] * (SCANS - 1))
     begun, resumed = ConsistencyCheck(), ConsistencyCheck()
     for number in range(25):
@@ -139,13 +137,13 @@ def test_it_goes_on_from_its_state(scans: list[FloatArray], through_disk: Callab
 
 
 @pytest.mark.parametrize("count", [0, 3])
-def test_scans_without_surfaces_are_no_matter(count: int) -> None:
+def test_scans_without_surfaces_are_no_matter(count):
     nothing = [np.ones((count, 3))] * SCANS
     assert found(nothing, TRUE) == ()
     assert found([], np.empty((0, 4, 4))) == ()
 
 
-def test_long_runs_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_runs_are_sampled(monkeypatch):
     looked_at: list[FloatArray] = []
 
     def empty(points: FloatArray) -> Surfels:

@@ -25,7 +25,7 @@ def walk(sensor: str, start: int, count: int = 25, name: str = "office") -> tupl
 
 
 @pytest.mark.parametrize("start", [0, 40])
-def test_motions_of_a_sensor_without_rings_are_true(start: int) -> None:
+def test_motions_of_a_sensor_without_rings_are_true(start):
     scans, truth = walk("mid-360", start)
     smoothed = smoothed_start(scans, MappingConfig())
     assert list(smoothed) == [scan.stamp for scan in scans[1:SMOOTHED]]
@@ -35,18 +35,18 @@ def test_motions_of_a_sensor_without_rings_are_true(start: int) -> None:
         assert motion.interval_s == pytest.approx(0.1)
 
 
-def test_registration_in_order_suffices_where_a_sweep_makes_a_map() -> None:
+def test_registration_in_order_suffices_where_a_sweep_makes_a_map():
     scans, _ = walk("os0-64", 40, 10)
     assert smoothed_start(iter(scans), MappingConfig()) == {}
 
 
-def test_nothing_is_smoothed_across_another_place() -> None:
+def test_nothing_is_smoothed_across_another_place():
     scans, _ = walk("mid-360", 40)
     elsewhere, _ = walk("mid-360", 40, name="tunnel")
     assert smoothed_start(scans[:12] + elsewhere[12:], MappingConfig()) == {}
 
 
-def test_too_few_scans_are_left_as_they_are() -> None:
+def test_too_few_scans_are_left_as_they_are():
     scans, _ = walk("mid-360", 40)
     assert smoothed_start(scans[:5], MappingConfig()) == {}
     assert smoothed_start([], MappingConfig()) == {}

@@ -51,19 +51,19 @@ def worst_m(results: list[MappedScan], truth: FloatArray) -> float:
     return float(np.linalg.norm((inverse(truth) @ estimated)[:, :3, 3], axis=1).max())
 
 
-def test_the_car_is_at_speed(truth: FloatArray) -> None:
+def test_the_car_is_at_speed(truth):
     assert np.linalg.norm(truth[1, :3, 3]) > 0.9
 
 
 @pytest.mark.parametrize(("step", "metres"), [(1, 0.05), (3, 0.1)])
-def test_without_an_odometry_its_way_is_found(scans: list[Scan], truth: FloatArray, step: int, metres: float) -> None:
+def test_without_an_odometry_its_way_is_found(scans, truth, step, metres):
     """Three scans apart it is three metres: out of reach of the pose expected of a car that stands."""
     results = process(scans[::step], [None] * len(scans[::step]))
     assert worst_m(results, truth[::step]) < metres
     assert [result.status for result in results] == [Status.OK] * len(results)
 
 
-def test_an_odometry_that_states_that_it_stands_is_overruled(scans: list[Scan], truth: FloatArray) -> None:
+def test_an_odometry_that_states_that_it_stands_is_overruled(scans, truth):
     results = process(scans, [np.eye(4)] * COUNT)
     assert worst_m(results, truth) < 0.05
     assert Status.LOST not in {result.status for result in results}
@@ -77,7 +77,7 @@ def compensated(scan: Scan, T_curr_next: FloatArray) -> Scan:
     return Scan(move(scan.points, scan.time_offsets, log(T_curr_next) / 0.1), scan.stamp)
 
 
-def test_scans_without_times_are_no_worse(scans: list[Scan], truth: FloatArray) -> None:
+def test_scans_without_times_are_no_worse(scans, truth):
     """Compensated already, as those of KITTI odometry: nothing within a scan shows the speed."""
     moved = inverse(truth[:-1]) @ truth[1:]
     still = [compensated(scan, T_curr_next) for scan, T_curr_next in zip(scans[:-1], moved, strict=True)]

@@ -17,7 +17,7 @@ from lidarslam.simulation.world import build_world
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_drone_takes_off(seed: int) -> None:
+def test_a_drone_takes_off(seed):
     world = build_world("street", seed)
     motion = motion_along_route("drone-agile", world, seed)
     T_body_lidar = mount_pose("upright", motion.sensor_height_m)

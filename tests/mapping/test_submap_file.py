@@ -31,11 +31,3 @@ def test_submaps_are_the_same_to_the_last_bit(tmp_path):
             assert np.array_equal(a, b), field.name
     with pytest.raises(IndexError):
         kept[len(given)]
-
-
-def test_few_submaps_stay_in_memory():
-    kept = SubmapFile()
-    for seed in range(300):
-        kept.append(submap(20, seed))
-    assert all(np.array_equal(kept[seed].points, submap(20, seed).points) for seed in range(300))
-    assert kept._recent.cache_info().currsize <= 256

@@ -1,7 +1,5 @@
 """Correspondences of points with surfaces that have formulas."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,6 @@ from lidarslam.mapping.registration.local_map import LEVELS
 from lidarslam.mapping.registration.surfaces import Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
-Grass = Callable[[np.random.Generator, float], tuple[FloatArray, FloatArray]]
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
 ORIGIN = np.zeros(3)
@@ -58,7 +55,7 @@ def distances(points: FloatArray, matches: Correspondences) -> FloatArray:
     return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
 
 
-def test_a_wall_pulls_nobody_who_looks_at_its_back(rng: np.random.Generator) -> None:
+def test_a_wall_pulls_nobody_who_looks_at_its_back(rng):
     """What is seen from the other side of a thin wall is its other side."""
     wall = np.column_stack([np.full(20_000, 2.0), rng.uniform(-3.0, 3.0, (20_000, 2))])
     local_map, asked = map_of(wall), np.column_stack([np.full(200, 2.1), rng.uniform(-2.0, 2.0, (200, 2))])
@@ -68,7 +65,7 @@ def test_a_wall_pulls_nobody_who_looks_at_its_back(rng: np.random.Generator) -> 
     assert len(local_map.match(asked, behind)) == 0
 
 
-def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng: np.random.Generator) -> None:
+def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng):
     """Though they lie in neighbouring cells, and in the same one of the coarser grids; seen more across than along."""
     sides = [np.column_stack([np.full(20_000, x), rng.uniform(-1.3, 1.3, (20_000, 2))]) for x in (1.93, 2.02)]
     sensors = [np.array([x, 0.0, 0.0]) for x in (0.0, 4.0)]
@@ -82,7 +79,7 @@ def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng: np.random.Genera
         assert distances(asked, matches).max() < 0.005
 
 
-def test_points_on_walls_meet_the_walls(rng: np.random.Generator) -> None:
+def test_points_on_walls_meet_the_walls(rng):
     local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
     matches = local_map.match(asked, HERE)
     np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
@@ -92,7 +89,7 @@ def test_points_on_walls_meet_the_walls(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.abs(matches.normals[np.arange(len(side)), side]), 1.0, atol=1e-9)
 
 
-def test_the_finest_grid_that_shows_a_plane_decides(rng: np.random.Generator) -> None:
+def test_the_finest_grid_that_shows_a_plane_decides(rng):
     """Two floors, one above the other: only fine cells keep them apart."""
     lower, upper = floor_points(rng, 20_000, z=-1.0), floor_points(rng, 20_000, z=-1.0 + 3.2 * CELL)
     local_map = map_of(np.concatenate([lower, upper]))
@@ -102,7 +99,7 @@ def test_the_finest_grid_that_shows_a_plane_decides(rng: np.random.Generator) ->
     assert distances(lower[inner], fine).max() < 1e-5
 
 
-def test_where_fine_cells_show_nothing_coarse_ones_do(rng: np.random.Generator) -> None:
+def test_where_fine_cells_show_nothing_coarse_ones_do(rng):
     sparse = floor_points(rng, 150)
     asked = floor_points(rng, 300, half_size=3.0)
     local_map = map_of(sparse)
@@ -112,7 +109,7 @@ def test_where_fine_cells_show_nothing_coarse_ones_do(rng: np.random.Generator) 
 
 
 @pytest.mark.parametrize("first_level", range(len(LEVELS)))
-def test_coarse_grids_reach_farther(rng: np.random.Generator, first_level: int) -> None:
+def test_coarse_grids_reach_farther(rng, first_level):
     """Alone they reach at least as far above the floor as their own cells, and not three times as far."""
     local_map = map_of(floor_points(rng, 40_000, z=-0.01))
     cell_m = CELL * LEVELS[first_level]
@@ -122,7 +119,7 @@ def test_coarse_grids_reach_farther(rng: np.random.Generator, first_level: int) 
     assert len(local_map.match(beyond, make_transform(np.eye(3), [0.0, 0.0, 9.0]), first_level)) == 0
 
 
-def test_finer_grids_are_left_out_on_request(rng: np.random.Generator) -> None:
+def test_finer_grids_are_left_out_on_request(rng):
     """Of floors half a coarse cell apart, fine cells show each, coarse ones something between."""
     low, high = floor_points(rng, 30_000, z=-1.0), floor_points(rng, 5_000, z=-1.0 + 3.2 * CELL)
     local_map = map_of(np.concatenate([low, high]))
@@ -132,24 +129,24 @@ def test_finer_grids_are_left_out_on_request(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("elevation_deg", [-4.0, 0.5, 8.0])
-def test_a_ring_bent_around_a_corner_is_no_plane(elevation_deg: float) -> None:
+def test_a_ring_bent_around_a_corner_is_no_plane(elevation_deg):
     points = ring(elevation_deg, walls=(4.0, 5.0))
     assert len(map_of(points).match(points, HERE)) == 0
 
 
-def test_a_ring_on_the_ground_far_away_is_no_plane() -> None:
+def test_a_ring_on_the_ground_far_away_is_no_plane():
     points = ring(-5.7, z=-1.0)
     assert len(map_of(points).match(points, HERE)) == 0
 
 
-def test_two_rings_on_the_ground_show_it() -> None:
+def test_two_rings_on_the_ground_show_it():
     points = np.concatenate([ring(-5.7, z=-1.0), ring(-6.7, z=-1.0)])
     matches = map_of(points).match(points, HERE)
     assert len(np.unique(matches.index)) > 0.95 * len(points)
     np.testing.assert_allclose(np.abs(matches.normals[:, 2]), 1.0, atol=1e-6)
 
 
-def test_two_rings_on_walls_show_them() -> None:
+def test_two_rings_on_walls_show_them():
     points = np.concatenate([ring(3.0, walls=(4.0, 5.0)), ring(6.0, walls=(4.0, 5.0))])
     away = np.abs(points[:, 0] - points[:, 1] * 4.0 / 5.0) > 2.5  # from the corner
     matches = map_of(points).match(points[away], HERE)
@@ -157,17 +154,7 @@ def test_two_rings_on_walls_show_them() -> None:
     assert distances(points[away], matches).max() < 1e-5
 
 
-def test_nothing_is_matched_in_an_empty_map(rng: np.random.Generator) -> None:
-    empty = SurfelMap(CELL, 100.0)
-    assert len(empty.match(floor_points(rng, 10), HERE)) == 0
-
-
-def test_no_points_have_no_matches(rng: np.random.Generator) -> None:
-    local_map = map_of(floor_points(rng, 2_000))
-    assert len(local_map.match(np.empty((0, 3)), HERE)) == 0
-
-
-def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
+def test_memory_does_not_grow_along_the_way(rng):
     local_map = SurfelMap(0.5, 50.0)
     sizes = []
     for step in range(200):
@@ -179,7 +166,7 @@ def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
     assert min(sizes[100:]) > 0.5 * max(sizes[:30])
 
 
-def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
+def test_the_map_stays_around_the_sensor(rng):
     local_map = SurfelMap(CELL, 20.0)
     floor = floor_points(rng, 20_000, half_size=3.0)
     local_map.insert(floor, elevations_of(floor), ORIGIN)
@@ -190,7 +177,7 @@ def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.45, 0.5, 0.8, 1.5, 2.0, 2.2])
-def test_planes_stay_in_place_when_cells_change_their_size(rng: np.random.Generator, factor: float) -> None:
+def test_planes_stay_in_place_when_cells_change_their_size(rng, factor):
     """By more than two it changes when the sensor leaves a hall for a corridor, or the other way round."""
     resized = map_of(box_points(rng, 60_000)).resized(CELL * factor)
     assert resized.cell_m == CELL * factor
@@ -202,7 +189,7 @@ def test_planes_stay_in_place_when_cells_change_their_size(rng: np.random.Genera
     assert np.percentile(off, 90) < 0.03
 
 
-def test_grazed_ground_is_still_known_when_cells_change_their_size(rng: np.random.Generator) -> None:
+def test_grazed_ground_is_still_known_when_cells_change_their_size(rng):
     azimuth, elevation_deg = rng.uniform(-np.pi, np.pi, 20_000), rng.uniform(-8.0, -4.0, 20_000)
     distance = 1.0 / np.tan(np.deg2rad(-elevation_deg))
     ground = np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), np.full(20_000, -1.0)])
@@ -213,9 +200,7 @@ def test_grazed_ground_is_still_known_when_cells_change_their_size(rng: np.rando
 
 @pytest.mark.parametrize("roll_deg", [0.0, 10.0, -35.0])
 @pytest.mark.parametrize("pitch_deg", [0.0, 25.0])
-def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(
-    rng: np.random.Generator, roll_deg: float, pitch_deg: float
-) -> None:
+def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_deg):
     R = exp(np.deg2rad([roll_deg, pitch_deg, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
     vertical = map_of(box_points(rng, 40_000) @ R.T).vertical()
     tilt_deg = np.hypot(roll_deg, pitch_deg)  # the corners of a room as small as this pull at it
@@ -223,14 +208,12 @@ def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(
     assert np.linalg.norm(vertical) == pytest.approx(1.0)
 
 
-def test_without_a_floor_the_vertical_is_the_worlds(rng: np.random.Generator) -> None:
+def test_without_a_floor_the_vertical_is_the_worlds(rng):
     wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
     np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])
 
 
-def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(
-    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
-) -> None:
+def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(monkeypatch, rng):
     monkeypatch.setattr("lidarslam.mapping.surfels.surfel_map._TIDIED_AFTER", 3)
     tidied: list[float] = []
     monkeypatch.setattr("lidarslam.mapping.surfels.grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
@@ -248,7 +231,7 @@ def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(
     assert [add(local_map.resized(0.2)), add(local_map)] == [3, 3]
 
 
-def test_in_grass_a_wider_plane_is_taken(rng: np.random.Generator, grass_on_a_slope: Grass) -> None:
+def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):
     """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off."""
     points, normal = grass_on_a_slope(rng, 0.2)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
@@ -259,9 +242,7 @@ def test_in_grass_a_wider_plane_is_taken(rng: np.random.Generator, grass_on_a_sl
     assert np.median(matches.tilt) < 0.01
 
 
-def test_with_an_imu_the_finest_plane_of_a_young_map_is_taken(
-    rng: np.random.Generator, grass_on_a_slope: Grass
-) -> None:
+def test_with_an_imu_the_finest_plane_of_a_young_map_is_taken(rng, grass_on_a_slope):
     """Few sweeps of a sensor without rings are a few strokes, of which coarse cells make planes of any direction."""
     points, _ = grass_on_a_slope(rng, 0.2)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]

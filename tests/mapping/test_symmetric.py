@@ -37,7 +37,7 @@ def random_symmetric(rng: np.random.Generator, count: int = 1000) -> FloatArray:
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e-4, 1.0, 1e6])
-def test_values_of_random_matrices_of_any_size(rng: np.random.Generator, scale: float) -> None:
+def test_values_of_random_matrices_of_any_size(rng, scale):
     M = scale * random_symmetric(rng)
     np.testing.assert_allclose(eigenvalues(entries(M)), np.linalg.eigvalsh(M), rtol=0.0, atol=1e-7 * scale)
 
@@ -47,23 +47,18 @@ def test_values_of_random_matrices_of_any_size(rng: np.random.Generator, scale: 
     [[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0], [1.0, 1.0, 3.0], [-2.0, -2.0, 5.0], [0.0, 1e-9, 1.0]],
     ids=["ball", "disc", "needle", "long", "indefinite", "noisy needle"],
 )
-def test_values_of_special_spectra(rng: np.random.Generator, spectrum: list[float]) -> None:
+def test_values_of_special_spectra(rng, spectrum):
     values = eigenvalues(entries(with_spectrum(rng, spectrum)))
     np.testing.assert_allclose(values, np.tile(spectrum, (len(values), 1)), rtol=0.0, atol=1e-7)
 
 
-def test_zero_has_zeros_for_values() -> None:
+def test_zero_has_zeros_for_values():
     np.testing.assert_allclose(eigenvalues(np.zeros((3, 6))), 0.0, atol=1e-14)
-
-
-def test_values_ascend(rng: np.random.Generator) -> None:
-    values = eigenvalues(entries(random_symmetric(rng)))
-    assert (np.diff(values, axis=1) >= 0.0).all()
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_vectors_are_lapacks_up_to_their_sign(rng: np.random.Generator, which: int, scale: float) -> None:
+def test_vectors_are_lapacks_up_to_their_sign(rng, which, scale):
     M = scale * with_spectrum(rng, [0.2, 1.0, 3.0])
     vectors = eigenvectors(entries(M), eigenvalues(entries(M))[:, which])
     expected = np.linalg.eigh(M)[1][:, :, which]
@@ -71,9 +66,7 @@ def test_vectors_are_lapacks_up_to_their_sign(rng: np.random.Generator, which: i
 
 
 @pytest.mark.parametrize(("spectrum", "which"), [([0.0, 1.0, 1.0], 0), ([0.0, 0.0, 1.0], 2), ([0.0, 1e-4, 1.0], 0)])
-def test_vectors_of_simple_values_beside_repeated_ones(
-    rng: np.random.Generator, spectrum: list[float], which: int
-) -> None:
+def test_vectors_of_simple_values_beside_repeated_ones(rng, spectrum, which):
     """A disc's normal, a needle's direction, the normal of a narrow strip."""
     M = with_spectrum(rng, spectrum)
     vectors = eigenvectors(entries(M), eigenvalues(entries(M))[:, which])
@@ -83,14 +76,14 @@ def test_vectors_of_simple_values_beside_repeated_ones(
 
 
 @pytest.mark.parametrize("which", [0, 2])
-def test_vectors_of_a_matrix_in_its_own_axes(which: int) -> None:
+def test_vectors_of_a_matrix_in_its_own_axes(which):
     M = np.diag([0.5, 0.01, 2.0])[None]
     vectors = eigenvectors(entries(M), eigenvalues(entries(M))[:, which])
     np.testing.assert_allclose(np.abs(vectors), [[[0.0, 1.0, 0.0], [], [0.0, 0.0, 1.0]][which]], atol=1e-12)
 
 
 @pytest.mark.parametrize("value", [0.0, 2.0])
-def test_where_every_direction_is_one_a_unit_vector_is_given(value: float) -> None:
+def test_where_every_direction_is_one_a_unit_vector_is_given(value):
     M = value * np.eye(3)[None]
     vectors = eigenvectors(entries(M), np.array([value]))
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=0.0, atol=1e-12)

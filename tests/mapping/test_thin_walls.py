@@ -52,9 +52,7 @@ def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int)
 @pytest.mark.parametrize("sides", [ONE_AFTER_THE_OTHER, IN_TURNS], ids=["one after the other", "in turns"])
 @pytest.mark.parametrize("thickness_m", [0.03, 0.10])
 @pytest.mark.parametrize("cell_m", [0.07, 0.15, 0.25, 0.5])
-def test_each_side_of_a_wall_within_a_cell_pulls_those_who_see_it(
-    rng: np.random.Generator, cell_m: float, thickness_m: float, sides: list[int]
-) -> None:
+def test_each_side_of_a_wall_within_a_cell_pulls_those_who_see_it(rng, cell_m, thickness_m, sides):
     off: list[FloatArray] = []
     for offset in OFFSETS * cell_m:
         faces = 2.0 + offset, 2.0 + offset + thickness_m
@@ -69,7 +67,7 @@ def test_each_side_of_a_wall_within_a_cell_pulls_those_who_see_it(
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 2.2])
-def test_both_sides_stay_when_cells_change_their_size(rng: np.random.Generator, factor: float) -> None:
+def test_both_sides_stay_when_cells_change_their_size(rng, factor):
     cell_m, faces = 0.25, (2.03, 2.13)
     resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(cell_m * factor)
     for side in (0, 1):
@@ -87,7 +85,7 @@ def grid_of_both_sides(rng: np.random.Generator, count: int = 4_000) -> tuple[Su
     return grid, *faces
 
 
-def test_the_side_that_faces_the_sensor_is_found_and_each_has_its_own_plane(rng: np.random.Generator) -> None:
+def test_the_side_that_faces_the_sensor_is_found_and_each_has_its_own_plane(rng):
     grid, near, far = grid_of_both_sides(rng)
     for points, sensor, x, normal in ((near, SENSORS[0], 2.1, -1.0), (far, SENSORS[1], 2.2, 1.0)):
         surfels = grid.surfels(grid.find(points, sensor))
@@ -96,7 +94,7 @@ def test_the_side_that_faces_the_sensor_is_found_and_each_has_its_own_plane(rng:
         np.testing.assert_allclose(surfels[:, NORMAL][:, 0], normal, atol=1e-5)
 
 
-def test_another_side_takes_cells_only_where_it_was_seen(rng: np.random.Generator) -> None:
+def test_another_side_takes_cells_only_where_it_was_seen(rng):
     both, near, far = grid_of_both_sides(rng)
     one = SurfelGrid(CELL)
     for seed in range(5):
@@ -110,7 +108,7 @@ def test_another_side_takes_cells_only_where_it_was_seen(rng: np.random.Generato
     assert len(both) == 2 * cells
 
 
-def test_a_floor_passed_at_a_flat_angle_has_one_side_and_from_below_another(rng: np.random.Generator) -> None:
+def test_a_floor_passed_at_a_flat_angle_has_one_side_and_from_below_another(rng):
     """Seen from ahead and from behind the views are opposed, and yet it is the same surface."""
     grid, count = SurfelGrid(CELL), 4_000
     for view in ([0.98, 0.0, 0.2], [-0.98, 0.0, 0.2], [0.0, -0.98, 0.2]):
@@ -125,7 +123,7 @@ def test_a_floor_passed_at_a_flat_angle_has_one_side_and_from_below_another(rng:
         np.testing.assert_allclose(heights, z, atol=1e-5)
 
 
-def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng: np.random.Generator) -> None:
+def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng):
     """Views of both sides, and of neighbours, differ by less than a right angle."""
     grid, count = SurfelGrid(CELL), 4_000
     faces = [face(rng, x, 1.4, count) for x in (2.1, 2.2)]
@@ -136,7 +134,7 @@ def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng: np.random.Gener
         np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
 
 
-def test_restored_it_goes_on_alike_to_the_last_bit(rng: np.random.Generator) -> None:
+def test_restored_it_goes_on_alike_to_the_last_bit(rng):
     grid, near, far = grid_of_both_sides(rng, count=300)
     restored = SurfelGrid(CELL)
     restored.restore(Saved(deepcopy(grid.state())))
@@ -150,7 +148,7 @@ def test_restored_it_goes_on_alike_to_the_last_bit(rng: np.random.Generator) -> 
         np.testing.assert_array_equal(grid.find(points, sensor), restored.find(points, sensor))
 
 
-def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng: np.random.Generator) -> None:
+def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng):
     grid, near, far = grid_of_both_sides(rng)
     before = [grid.surfels(grid.find(p, s)) for p, s in ((near, SENSORS[0]), (far, SENSORS[1]))]
     held = len(grid)
@@ -161,14 +159,14 @@ def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng: np.ra
         np.testing.assert_array_equal(grid.surfels(grid.find(points[inner], sensor)), values[inner])
 
 
-def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng: np.random.Generator) -> None:
+def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng):
     """Seen from there again it grows, and no third one begins."""
     grid, count = SurfelGrid(CELL), 60_000
     for x, points, view in ((2.1, 300, -1.0), (2.2, count, 1.0)):
         grid.insert(face(rng, x, 2.9, points), np.zeros(points), np.tile([view, 0.0, 0.0], (points, 1)))
-    assert len(grid) > len(np.unique(key_cells(grid.state()["_keys"]), axis=0))  # type: ignore[arg-type]
+    assert len(grid) > len(np.unique(key_cells(grid.state()["_keys"]), axis=0))
     grid.tidy()
-    cells = key_cells(grid.state()["_keys"])  # type: ignore[arg-type]
+    cells = key_cells(grid.state()["_keys"])
     assert len(grid) == len(np.unique(cells, axis=0))
     far = face(rng, 2.2, 2.4, count)
     surfels = grid.surfels(grid.find(far))
@@ -177,7 +175,7 @@ def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng: np.rando
     assert len(grid) == len(cells)
 
 
-def test_the_other_side_of_the_farthest_cell_is_no_free_slot() -> None:
+def test_the_other_side_of_the_farthest_cell_is_no_free_slot():
     table, keys = VoxelHash(), point_keys(np.full((1, 3), 1e12), CELL) | OTHER_SIDE
     table.insert(keys)
     table.insert(keys)

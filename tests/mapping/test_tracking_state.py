@@ -6,12 +6,12 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 
-def test_it_is_not_surprised_by_the_next_scan_but_by_one_after_a_gap() -> None:
+def test_it_is_not_surprised_by_the_next_scan_but_by_one_after_a_gap():
     assert not TrackingState().is_uncertain(0.1)
     assert TrackingState().is_uncertain(1.5)
 
 
-def test_after_a_lost_scan_it_is_uncertain_until_one_is_laid() -> None:
+def test_after_a_lost_scan_it_is_uncertain_until_one_is_laid():
     state = TrackingState()
     state.lost(has_points=True)
     assert state.is_uncertain(0.1)
@@ -19,7 +19,7 @@ def test_after_a_lost_scan_it_is_uncertain_until_one_is_laid() -> None:
     assert not state.is_uncertain(0.1)
 
 
-def test_scans_that_saw_nothing_are_no_reason_to_give_the_map_up() -> None:
+def test_scans_that_saw_nothing_are_no_reason_to_give_the_map_up():
     state = TrackingState()
     for _ in range(50):
         state.lost(has_points=False)
@@ -27,7 +27,7 @@ def test_scans_that_saw_nothing_are_no_reason_to_give_the_map_up() -> None:
     assert state.is_uncertain(0.1)
 
 
-def test_looking_everywhere_becomes_rare() -> None:
+def test_looking_everywhere_becomes_rare():
     state = TrackingState()
     looks = []
     for _ in range(100):
@@ -39,7 +39,7 @@ def test_looking_everywhere_becomes_rare() -> None:
 
 
 @pytest.mark.parametrize(("interval_s", "scans"), [(0.1, 10), (0.5, 3)], ids=["a second at 10 Hz", "three at 2 Hz"])
-def test_found_again_is_confirmed_by_the_next_second_and_three_scans(interval_s: float, scans: int) -> None:
+def test_found_again_is_confirmed_by_the_next_second_and_three_scans(interval_s, scans):
     state = TrackingState()
     state.registered(Status.OK, True, 0.8, 5.0)
     for number in range(1, scans + 1):
@@ -48,7 +48,7 @@ def test_found_again_is_confirmed_by_the_next_second_and_three_scans(interval_s:
     assert not state.is_unconfirmed
 
 
-def test_a_lost_scan_takes_back_that_the_sensor_was_found() -> None:
+def test_a_lost_scan_takes_back_that_the_sensor_was_found():
     state = TrackingState()
     state.registered(Status.OK, True, 0.8, 5.0)
     state.lost(has_points=True)
@@ -56,7 +56,7 @@ def test_a_lost_scan_takes_back_that_the_sensor_was_found() -> None:
     assert not state.is_unconfirmed
 
 
-def test_scans_that_lie_badly_confirm_nothing() -> None:
+def test_scans_that_lie_badly_confirm_nothing():
     state = TrackingState()
     state.registered(Status.OK, True, 0.8, 5.0)
     for number in range(20):
@@ -64,7 +64,7 @@ def test_scans_that_lie_badly_confirm_nothing() -> None:
     assert state.is_unconfirmed
 
 
-def test_the_second_degraded_scan_is_reason_to_look_around() -> None:
+def test_the_second_degraded_scan_is_reason_to_look_around():
     state = TrackingState()
     assert not state.searches_nearby
     state.registered(Status.DEGRADED, False, 0.8, 5.0)
@@ -78,14 +78,14 @@ def settled() -> TrackingState:
     return state
 
 
-def test_a_scan_fits_poorly_beside_what_is_usual() -> None:
+def test_a_scan_fits_poorly_beside_what_is_usual():
     assert not settled().fits_poorly(Status.OK, 0.75)
     assert settled().fits_poorly(Status.OK, 0.7)
     assert settled().fits_poorly(Status.DEGRADED, 0.8)
     assert not TrackingState().fits_poorly(Status.OK, 0.1), "nothing is usual yet"
 
 
-def test_what_is_usual_follows_a_scene_that_is_harder_but_not_scans_that_are_not_believed() -> None:
+def test_what_is_usual_follows_a_scene_that_is_harder_but_not_scans_that_are_not_believed():
     state = settled()
     for _ in range(30):
         state.registered(Status.DEGRADED, False, 0.3, 5.0)
@@ -95,7 +95,7 @@ def test_what_is_usual_follows_a_scene_that_is_harder_but_not_scans_that_are_not
     assert not state.fits_poorly(Status.OK, 0.6)
 
 
-def test_in_a_map_begun_anew_nothing_is_usual_yet() -> None:
+def test_in_a_map_begun_anew_nothing_is_usual_yet():
     state = settled()
     state.map_restarted()
     assert not state.fits_poorly(Status.OK, 0.2)

@@ -23,14 +23,14 @@ def motion_of(*scans: GraphScan) -> MotionSinceKeyframe:
     return motion
 
 
-def test_drift_grows_with_the_way() -> None:
+def test_drift_grows_with_the_way():
     sigmas = np.sqrt(np.diag(drift_covariance(4.0)))
     np.testing.assert_allclose(sigmas, [np.deg2rad(0.03 + 4.0 * 0.02)] * 3 + [0.005 + 4.0 * 0.003] * 3)
     np.testing.assert_allclose(np.sqrt(np.diag(drift_covariance(4.0, registered=False))), 5.0 * sigmas)
     assert drift_covariance(4.0, lost=True)[3, 3] == 9.0
 
 
-def test_motions_are_composed_and_their_covariances_propagated() -> None:
+def test_motions_are_composed_and_their_covariances_propagated():
     motion = motion_of(scan(STEP), scan(STEP))
     A = adjoint(inverse(STEP))
     assert motion.T_keyframe_lidar is not None
@@ -39,13 +39,13 @@ def test_motions_are_composed_and_their_covariances_propagated() -> None:
     assert (motion.length_m, motion.lost) == (3.0, False)
 
 
-def test_an_unknown_motion_leaves_none() -> None:
+def test_an_unknown_motion_leaves_none():
     motion = motion_of(scan(STEP), scan(None, lost=True), scan(STEP))
     assert motion.T_keyframe_lidar is None
     assert (motion.length_m, motion.lost) == (4.5, True)
 
 
-def test_an_edge_is_as_precise_as_both_poses_and_the_drift_between() -> None:
+def test_an_edge_is_as_precise_as_both_poses_and_the_drift_between():
     before = 2.0 * SIGMA
     refined, measured = trajectory_edges(7, STEP, motion_of(scan(STEP)), before, SIGMA)
     assert [(e.first, e.second) for e in (refined, measured)] == [(6, 7), (6, 7)]
@@ -54,17 +54,17 @@ def test_an_edge_is_as_precise_as_both_poses_and_the_drift_between() -> None:
     np.testing.assert_allclose(measured.covariance, edges._ODOMETRY_CAUTION**2 * SIGMA, rtol=1e-12)
 
 
-def test_where_tracking_was_lost_the_edge_is_loose_whatever_the_covariances_of_the_poses() -> None:
+def test_where_tracking_was_lost_the_edge_is_loose_whatever_the_covariances_of_the_poses():
     [edge] = trajectory_edges(1, STEP, motion_of(scan(None, lost=True)), SIGMA, SIGMA)
     np.testing.assert_array_equal(edge.covariance, drift_covariance(1.5, lost=True))
 
 
-def test_without_a_map_the_odometry_counts_once() -> None:
+def test_without_a_map_the_odometry_counts_once():
     [edge] = trajectory_edges(1, STEP, motion_of(scan(STEP)), None, None)
     np.testing.assert_array_equal(edge.covariance, drift_covariance(1.5, registered=False))
 
 
-def test_between_two_maps_the_edge_is_that_of_an_odometry() -> None:
+def test_between_two_maps_the_edge_is_that_of_an_odometry():
     """One of them was drawn anew, and surfaces lie elsewhere in it."""
     [edge] = trajectory_edges(1, STEP, motion_of(scan(None)), SIGMA, SIGMA, one_map=False)
     apart = edge.covariance - drift_covariance(1.5, registered=False)

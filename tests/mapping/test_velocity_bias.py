@@ -21,7 +21,7 @@ def swept(number: int, velocity: FloatArray, seen_from_s: float) -> MotionState:
 
 
 @pytest.mark.parametrize("seen_from_s", [0.0, 0.05, 0.1])
-def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s: float) -> None:
+def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s):
     """With stamps at the beginning of the sweeps, in their middle, and at their end."""
     bias, last = VelocityBias(), swept(0, VELOCITY + BIAS, seen_from_s)
     for number in range(1, 60):
@@ -32,27 +32,27 @@ def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s: float) -> None
     np.testing.assert_allclose(bias.correction, -BIAS, atol=1e-6)
 
 
-def test_velocities_that_agree_with_the_motion_stay() -> None:
+def test_velocities_that_agree_with_the_motion_stay():
     state = swept(1, VELOCITY, 0.0)
     bias = VelocityBias().updated(swept(0, VELOCITY, 0.0), state, 0.0)
     np.testing.assert_allclose(bias.correction, np.zeros(6), atol=1e-12)
     np.testing.assert_allclose(bias.corrected(state).T_world_lidar, state.T_world_lidar, atol=1e-12)
 
 
-def test_a_sudden_acceleration_is_no_bias() -> None:
+def test_a_sudden_acceleration_is_no_bias():
     """Of 360 deg/s and 30 m/s, a degree and 6 cm per second are taken over."""
     sudden = np.array([0.0, 0.0, np.deg2rad(360.0), 30.0, 0.0, 0.0])
     bias = VelocityBias().updated(swept(0, VELOCITY - sudden, 0.0), swept(1, VELOCITY, 0.0), 0.0)
     np.testing.assert_allclose(bias.correction[[2, 3]], [np.deg2rad(0.9), 0.06], rtol=1e-6)
 
 
-def test_a_gap_between_sweeps_begins_anew() -> None:
+def test_a_gap_between_sweeps_begins_anew():
     biased = VelocityBias(BIAS)
     assert np.array_equal(biased.updated(swept(0, VELOCITY, 0.0), swept(2, VELOCITY, 0.0), 0.0).correction, np.zeros(6))
     assert np.array_equal(biased.updated(swept(1, VELOCITY, 0.0), swept(1, VELOCITY, 0.0), 0.0).correction, np.zeros(6))
 
 
-def test_the_pose_follows_as_it_is_correlated() -> None:
+def test_the_pose_follows_as_it_is_correlated():
     """Known best in the middle of a sweep, the pose at its begin goes back by half of the velocity's sweep."""
     covariance = COVARIANCE.copy()
     covariance[:6, 6:] = covariance[6:, :6] = -0.5 * INTERVAL_S * COVARIANCE[6:, 6:]
