@@ -8,7 +8,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, adjoint
-from lidarslam.mapping.loops.registration import CORRELATION, SubmapCloud
+from lidarslam.mapping.loops.verification import CORRELATION, SubmapCloud
 
 POINT_TO_PLANE, GENERALISED, MULTI_SCALE = "point-to-plane ICP", "generalised ICP", "multi-scale ICP"
 # As many as `refine` fits planes to on both sides.

@@ -15,8 +15,7 @@ from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
-from lidarslam.mapping.loops.registration import register
-from lidarslam.mapping.loops.verification import verify
+from lidarslam.mapping.loops.verification import register, verify
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
 

@@ -24,13 +24,13 @@ from lidarslam.datasets.ros.bag_imu import static_transform
 from lidarslam.datasets.ros.bag_message import deserialize
 from lidarslam.datasets.ros.rosbag import BagRecording
 from lidarslam.exports.source import read_source, require_new
-from lidarslam.mapping.global_map.point_cloud import write_laz
-from lidarslam.mapping.global_map.products.georeference import (
+from lidarslam.mapping.global_map.georeference import (
     Georeference,
     GnssTrack,
     TooFewPositionsError,
     align_to_track,
 )
+from lidarslam.mapping.global_map.point_cloud import write_laz
 from lidarslam.storage.finished_run import load_map, read_trajectory
 
 MAP, TRAJECTORY, GEOJSON, KML = "map.laz", "trajectory_utm.tum", "trajectory.geojson", "trajectory.kml"

@@ -9,7 +9,7 @@ from PIL import Image
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
-from lidarslam.mapping.global_map.products.occupancy_grid import (
+from lidarslam.mapping.global_map.occupancy_grid import (
     FREE,
     OCCUPIED,
     UNKNOWN,

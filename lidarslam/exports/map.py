@@ -17,10 +17,10 @@ from lidarslam.datasets.mounted_recording import recorded_axes
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.exports.source import read_run_scans, read_source
+from lidarslam.mapping.global_map import edits
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views, seen_through
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.mapping.global_map.products import edits
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.storage.directory import CONFIG
 from lidarslam.storage.finished_run import is_run, load_map, read_summary, read_trajectory

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.global_map.products.mesh import Mesh, reconstruct
+from lidarslam.mapping.global_map.edits import Mesh, reconstruct
 from lidarslam.storage.finished_run import load_map, read_summary
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")

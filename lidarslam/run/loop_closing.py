@@ -140,7 +140,7 @@ def _not_closed(graph: "SlamGraph", loops: Sequence[LoopReport], scans: int) -> 
 
 def _placed(graph: "SlamGraph", log: ScanLog, track: "ProjectedTrack") -> "Corrected | None":
     """The graph with a GNSS track, or without where that has too few positions."""
-    from lidarslam.mapping.global_map.products.georeference import TooFewPositionsError  # loads SciPy
+    from lidarslam.mapping.global_map.georeference import TooFewPositionsError  # loads SciPy
 
     try:
         return graph.finish((log.trajectory.stamps, track))

@@ -12,8 +12,8 @@ from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
 from lidarslam.mapping.loops.closure import RelativePose, Track
-from lidarslam.mapping.loops.registration import SubmapCloud
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap, SubmapFile
+from lidarslam.mapping.loops.verification import SubmapCloud
 
 # Shorter ways back are no loops, in median ranges and in metres.
 _MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0

@@ -5,7 +5,6 @@ that drift cannot explain is rejected within a segment; where tracking was lost,
 """
 
 import logging
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +16,7 @@ from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
-from lidarslam.mapping.loops.registration import GUESS_SIGMAS
-from lidarslam.mapping.loops.verification import MIN_INLIERS, Verification, verify
+from lidarslam.mapping.loops.verification import GUESS_SIGMAS, MIN_INLIERS, Verification, verify
 
 logger = logging.getLogger(__name__)
 
@@ -43,24 +41,16 @@ _ALONE = "no other closure agrees"
 
 
 class LoopDetector(Stateful):
-    """Keeps a sparse submap and a descriptor of every keyframe, and finds loop closures among them."""
+    """Keeps a sparse submap and a descriptor of every keyframe, in its database, and finds loop closures among them."""
 
-    _database: KeyframeDatabase
+    database: KeyframeDatabase
     _accepted: list[LoopClosure]
     _pending: list[LoopClosure]
 
     def __init__(self, config: LoopConfig, directory: Path | None = None) -> None:
         self._config = config
-        self._database = KeyframeDatabase(config, directory)
+        self.database = KeyframeDatabase(config, directory)
         self._accepted, self._pending = [], []
-
-    def rebuild(self, submaps: Iterable[FloatArray]) -> None:
-        """See `KeyframeDatabase.rebuild`."""
-        self._database.rebuild(submaps)
-
-    def cell_m(self, index: int) -> float:
-        """The size of detail that suits a keyframe's submap."""
-        return self._database.submaps[index].cell_m
 
     def add(
         self,
@@ -79,10 +69,10 @@ class LoopDetector(Stateful):
             poses: (K, 4, 4) `T_world_lidar` of all keyframes, this one last, as they are estimated now.
             barred: (K,) which of them it is not to be closed with; None: any may be.
         """
-        self._database.add(points, way_m, segment, poses)
+        self.database.add(points, way_m, segment, poses)
         decided = self._drop_old(way_m, segment)
-        if len(self._database.submaps[-1]) >= MIN_INLIERS and not self._is_soon(way_m, segment):
-            decided += self._look(len(self._database) - 1, barred)
+        if len(self.database.submaps[-1]) >= MIN_INLIERS and not self._is_soon(way_m, segment):
+            decided += self._look(len(self.database) - 1, barred)
         return decided
 
     def close(self, first: int, second: int, given: tuple[int, int]) -> LoopClosure:
@@ -90,8 +80,8 @@ class LoopDetector(Stateful):
 
         Neither drift nor other closures object to it.
         """
-        target, source = self._database.cloud(first), self._database.cloud(second)
-        starts, least = self._database.starts(first, second), self._config.min_overlap
+        target, source = self.database.cloud(first), self.database.cloud(second)
+        starts, least = self.database.starts(first, second), self._config.min_overlap
         found = [one for start in starts if (one := verify(target, source, start)) is not None]
         if not found:
             far = np.diag(GUESS_SIGMAS**2)
@@ -112,7 +102,7 @@ class LoopDetector(Stateful):
         """Whether the last closure is so recent that another would repeat it."""
         if self._pending or not self._accepted:
             return False
-        track, range_m = self._database.track, self._database.submaps[-1].range_m
+        track, range_m = self.database.track, self.database.submaps[-1].range_m
         since_m = [way_m - track.way_m[one.second] for one in self._accepted[-_MANY:]]
         are_many = len(since_m) == _MANY and since_m[0] < _MANY * range_m
         spacing_m = max(_SPACING_M, range_m) if are_many else _SPACING_M
@@ -121,14 +111,14 @@ class LoopDetector(Stateful):
     def _look(self, index: int, barred: NDArray[np.bool_] | None) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""
         decided: list[LoopClosure] = []
-        source = self._database.cloud(index)
-        for candidate in self._database.candidates(index, barred):
-            found = verify(self._database.cloud(candidate.index), source, candidate.T_first_second)
+        source = self.database.cloud(index)
+        for candidate in self.database.candidates(index, barred):
+            found = verify(self.database.cloud(candidate.index), source, candidate.T_first_second)
             if found is None:
                 continue
             closure = _closure(candidate, index, found)
             reason = found.objection(self._config.min_overlap)
-            reason = reason or objection_to_drift(closure, closure.by_appearance, self._database.track)
+            reason = reason or objection_to_drift(closure, closure.by_appearance, self.database.track)
             pair = f"loop closure between keyframes {closure.first} and {index}"
             logger.info("%s: %s (overlap %.2f)", pair, reason or "verified", found.overlap)
             if reason:
@@ -157,7 +147,7 @@ class LoopDetector(Stateful):
 
     def _support(self, closure: LoopClosure) -> tuple[bool, int]:
         """Whether a closure is accepted, and the number of others that agree, pending ones too."""
-        track, range_m = self._database.track, self._database.submaps[closure.second].range_m
+        track, range_m = self.database.track, self.database.submaps[closure.second].range_m
         agreeing, against = self._votes(closure)
         # A rival has as much weight as it has support itself: a false closure mostly stands alone. Where places repeat,
         # false ones agree among themselves; then the estimate decides.
@@ -171,8 +161,8 @@ class LoopDetector(Stateful):
 
     def _votes(self, closure: LoopClosure) -> tuple[list[LoopClosure], list[LoopClosure]]:
         """Other closures that agree with one, and that contradict it, where their cycle is significant."""
-        track = self._database.track
-        most_m = _SIGNIFICANT_RANGES * self._database.submaps[closure.second].range_m
+        track = self.database.track
+        most_m = _SIGNIFICANT_RANGES * self.database.submaps[closure.second].range_m
         agreeing: list[LoopClosure] = []
         against: list[LoopClosure] = []
         for other in [*self._accepted[-_MEMORY:], *self._pending[-_MEMORY:]]:
@@ -183,7 +173,7 @@ class LoopDetector(Stateful):
 
     def _drop_old(self, way_m: float, segment: int) -> list[LoopClosure]:
         """Closures that no other agreed with for too long, as rejected."""
-        track = self._database.track
+        track = self.database.track
         old = [
             c for c in self._pending
             if track.segment[c.second] != segment or way_m - track.way_m[c.second] > _PENDING_M

@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 from lidarslam.core.geometry import FloatArray, inverse, log, orthonormalize, transform_points
 from lidarslam.core.thinning import central_per_cell
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
-from lidarslam.mapping.loops.registration import CORRELATION
 from lidarslam.mapping.loops.sparse_submap import principal_components
+from lidarslam.mapping.loops.verification import CORRELATION
 from lidarslam.mapping.registration.gauss_newton import (
     NormalEquations,
     gauss_newton,

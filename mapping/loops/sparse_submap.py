@@ -158,11 +158,7 @@ class SubmapFile:
         return (self[index] for index in range(len(self)))
 
     def append(self, submap: SparseSubmap) -> None:
-        """Keep one more.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Keep one more; OSError where the disk is full."""
         record = np.zeros((), _record(len(submap)))
         for name in record.dtype.names or ():
             record[name] = getattr(submap, name)

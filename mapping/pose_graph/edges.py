@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.global_map.products.georeference import GnssTrack, align_to_track
+from lidarslam.mapping.global_map.georeference import GnssTrack, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
 

@@ -32,11 +32,7 @@ class SubmapStore(BlockFile):
         self._layouts = []
 
     def append(self, means: VoxelMeans) -> None:
-        """Keep one more.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Keep one more; OSError where the disk is full."""
         self.write(np.ascontiguousarray(means.rows, dtype="<f4").tobytes())
         self._layouts.append(means.layout)
 

@@ -80,7 +80,7 @@ class SlamGraph(KeyframeGraph):
         self._laid, self._is_map_due = SubmapPlacement(local_radius_m), False
 
     def _after_restore(self) -> None:
-        self._detector.rebuild(means_points(self.store[key]) for key in range(len(self.store)))
+        self._detector.database.rebuild(means_points(self.store[key]) for key in range(len(self.store)))
 
     def add_recording(self, tracked: KeyframeGraph) -> None:
         """Add all keyframes of a recording, which has ended, and look for loop closures with each of them.
@@ -256,7 +256,7 @@ class SlamGraph(KeyframeGraph):
     def _refined(self, closure: LoopClosure) -> LoopClosure:
         """A closure registered on all points of both submaps and their neighbours, or as registration measured it."""
         ends = closure.first, closure.second
-        cell_m = max(self._detector.cell_m(key) for key in ends)
+        cell_m = max(self._detector.database.submaps[key].cell_m for key in ends)
         target, source = (self._dense_submap(key, cell_m) for key in ends)
         closure = refine(target, source, closure, self._bend(closure.first) + self._bend(closure.second)) or closure
         first, second = self.keyframes[closure.first], self.keyframes[closure.second]

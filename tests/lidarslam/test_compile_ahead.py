@@ -17,7 +17,7 @@ REPOSITORY = Path(__file__).parents[2]
 LEFT_OUT = {
     "lidarslam.core.thinning",
     "lidarslam.mapping.surfels.symmetric",
-    "lidarslam.mapping.global_map.products.occupancy_grid",  # of export-grid, which is no part of a run
+    "lidarslam.mapping.global_map.occupancy_grid",  # of export-grid, which is no part of a run
 }
 # Rehearse everything, take a recording through the pipeline, and print the loops that are called with other types.
 REHEARSE_AND_RUN = """

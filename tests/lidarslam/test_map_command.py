@@ -9,8 +9,8 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.mapping.global_map.edits import moved
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.mapping.global_map.products.edits import moved
 from lidarslam.storage.finished_run import load_map
 
 from ..conftest import lidarslam

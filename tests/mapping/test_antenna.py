@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.global_map.products.georeference import GnssTrack, TooFewPositionsError
+from lidarslam.mapping.global_map.georeference import GnssTrack, TooFewPositionsError
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.edges import ProjectedTrack
 from lidarslam.mapping.pose_graph.optimizer import optimise

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.global_map.products.georeference import GnssTrack, align_to_track
+from lidarslam.mapping.global_map.georeference import GnssTrack, align_to_track
 
 SCALE = 0.9996
 T_MAP_WORLD = make_transform(exp([0.02, -0.03, 2.0, 0.0, 0.0, 0.0])[:3, :3], [457_800.0, 5_428_860.0, 114.0])

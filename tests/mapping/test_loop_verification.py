@@ -7,9 +7,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle, transform_points
 from lidarslam.mapping.config import LoopConfig
-from lidarslam.mapping.loops.registration import Correspondences, SubmapCloud
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap
-from lidarslam.mapping.loops.verification import evaluate, verify
+from lidarslam.mapping.loops.verification import Correspondences, SubmapCloud, evaluate, verify
 
 MIN_OVERLAP = LoopConfig().min_overlap
 # Centre and half sizes; the sensor stands inside.

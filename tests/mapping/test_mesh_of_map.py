@@ -8,8 +8,8 @@ from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.mapping.global_map.edits import reconstruct
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.mapping.global_map.products.mesh import reconstruct
 
 RADIUS_M = 3.0
 

@@ -9,8 +9,7 @@ from click.testing import CliRunner
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.mapping.global_map.products.occupancy_grid import (
+from lidarslam.mapping.global_map.occupancy_grid import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -19,6 +18,7 @@ from lidarslam.mapping.global_map.products.occupancy_grid import (
     find_ground,
     occupancy_grid,
 )
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
 
 SLOPE = np.tan(np.deg2rad(10.0))

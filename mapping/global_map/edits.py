@@ -1,5 +1,6 @@
-"""Edits of a finished map: joined, cleaned, levelled, cropped."""
+"""Edits of a finished map: joined, cleaned, levelled, cropped; and its surface as a mesh."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,10 @@ _NARROWING = np.deg2rad([45.0, 30.0, 20.0, 10.0, 5.0, 5.0])
 # Distance of the ground's points from its plane, and how often this is fitted.
 _GROUND_M, _REFITS = 0.1, 10
 _FEWEST = 100
+# The octree's finest level; deeper ones take minutes and gigabytes.
+_DEEPEST = 12
+# Reconstructed surface farther from the points is invented.
+_TRIM_CELLS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,3 +129,41 @@ def in_box(points: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.
 def near_path(points: FloatArray, positions: FloatArray, radius_m: float) -> NDArray[np.bool_]:
     """(N,) which points (N, 3) lie within a distance of a position (K, 3)."""
     return np.isfinite(cKDTree(positions).query(points, distance_upper_bound=radius_m)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with vertices in the world."""
+
+    vertices: FloatArray  # (N, 3)
+    triangles: NDArray[np.int32]  # (M, 3) indices of vertices
+    colours: NDArray[np.uint8] | None  # (N, 3) red, green, blue; None when the map has none
+
+
+def reconstruct(cloud: PointCloud, cell_m: float) -> Mesh:
+    """The surface through the points of a map with normals (M. Kazhdan and H. Hoppe, ToG 2013).
+
+    Vertices without a point within the edge of a cell are removed.
+
+    Args:
+        cloud: the map.
+        cell_m: edge of the octree's finest cells; larger in a map of more than 2^12 of them.
+    """
+    import open3d as o3d
+
+    extent = float(np.ptp(cloud.points, axis=0).max()) * 1.1
+    depth = int(np.clip(math.ceil(math.log2(max(extent / cell_m, 2.0))), 4, _DEEPEST))
+    given = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
+    given.normals = o3d.utility.Vector3dVector(cloud.normals)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(given, depth=depth, n_threads=1)
+    distance, nearest = cKDTree(cloud.points).query(np.asarray(surface.vertices))
+    finest = max(cell_m, extent / 2**depth)
+    far = distance > _TRIM_CELLS * finest
+    surface.remove_vertices_by_mask(far)
+    rgb = cloud.attributes.rgb
+    return Mesh(
+        np.asarray(surface.vertices),
+        np.asarray(surface.triangles),
+        None if rgb is None else rgb[np.asarray(nearest)[~far]],
+    )

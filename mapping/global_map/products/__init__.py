@@ -1,1 +1,0 @@
-"""Products of a finished map: occupancy grid, mesh, georeference."""
