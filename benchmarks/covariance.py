@@ -40,21 +40,21 @@ from odometry_accuracy import SIGMAS, estimated_motions, shares_within_sigmas, s
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.config import OdometryConfig
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.simulation.world import WORLDS
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]
 
 
-def nees_of_poses(results: Sequence[ScanResult], truth: FloatArray) -> FloatArray:
+def nees_of_poses(results: Sequence[ScanEstimate], truth: FloatArray) -> FloatArray:
     """(N,) of poses against the truth (N, 4, 4), the first made to coincide; NaN without a covariance."""
     poses = np.array([result.T_world_lidar for result in results])
     errors = log(inverse(inverse(poses[0]) @ poses) @ inverse(truth[0]) @ truth)
     return squared_errors([result.covariance for result in results], errors)
 
 
-def nees_of_registration(results: Sequence[ScanResult], truth: FloatArray) -> FloatArray:
+def nees_of_registration(results: Sequence[ScanEstimate], truth: FloatArray) -> FloatArray:
     """(N-1,) of motions between successive poses, against those of the truth (N, 4, 4); NaN without a covariance."""
     poses = np.array([result.T_world_lidar for result in results])
     motions = inverse(poses[:-1]) @ poses[1:]
@@ -63,7 +63,7 @@ def nees_of_registration(results: Sequence[ScanResult], truth: FloatArray) -> Fl
     return squared_errors([motion_covariance(*pair) for pair in pairs], errors)
 
 
-def motion_covariance(previous: ScanResult, current: ScanResult, T_prev_curr: FloatArray) -> FloatArray | None:
+def motion_covariance(previous: ScanEstimate, current: ScanEstimate, T_prev_curr: FloatArray) -> FloatArray | None:
     """(6, 6) of the motion between two poses with independent errors; None when one has no covariance."""
     if previous.covariance is None or current.covariance is None:
         return None

@@ -35,7 +35,7 @@ from lidarslam.evaluation.trajectory.metrics import TrajectoryErrors, evaluate_t
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.odometry.config import KissConfig, OdometryConfig
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import in_order
@@ -154,7 +154,7 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
     )
 
 
-def pipeline_results(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> list[ScanResult]:
+def pipeline_results(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> list[ScanEstimate]:
     """Take a recording through the pipeline of `lidarslam run`."""
     odometry = make_odometry(config.odometry, prior)
     try:

@@ -38,7 +38,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map import global_map
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline import threads
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
@@ -79,7 +79,7 @@ class Case:
     scans: Iterable[Scan]
     config: Config
     prior: Trajectory | None = None
-    error_m: Callable[[ScanResult], float] = lambda _: float("nan")
+    error_m: Callable[[ScanEstimate], float] = lambda _: float("nan")
 
 
 def lap(options: argparse.Namespace) -> Case:
@@ -92,7 +92,7 @@ def lap(options: argparse.Namespace) -> Case:
             simulation, sensor=replace(sensor, pattern=replace(sensor.pattern, columns=options.columns))
         )
 
-    def error_m(result: ScanResult) -> float:
+    def error_m(result: ScanEstimate) -> float:
         T_world_first, T_world_lidar = simulation.T_world_lidar_at(np.array([0.0, result.stamp]))
         return float(np.linalg.norm((inverse(T_world_first) @ T_world_lidar - result.T_world_lidar)[:3, 3]))
 

@@ -45,7 +45,7 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.moved_points import seen_through
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.simulation.motion import motion_along, mount_pose
@@ -154,7 +154,7 @@ def _featureless(kind: str, seed: int) -> Case:
     return Case("nothing to see for 25 m", f"{world.name}, vlp-16", recorded, simulation.distance_to_surfaces)
 
 
-def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:
+def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
     """A recording through the pipeline: the results, and the points (M, 3) of the map."""
     odometry = make_odometry(config.odometry, None)
     try:
@@ -205,7 +205,7 @@ def _counts(status: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> str:
     return f"{lost} lost, {degraded} degraded of {len(status)}"
 
 
-def _tell(results: list[ScanResult], distance: FloatArray, angle: FloatArray, recorded: Faulty) -> None:
+def _tell(results: list[ScanEstimate], distance: FloatArray, angle: FloatArray, recorded: Faulty) -> None:
     previous = ""
     for k, result in enumerate(results):
         if result.message != previous or k % 20 == 0:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lidarslam.api.evaluation import evaluate
     from lidarslam.api.recordings import OpenRecording, open
-    from lidarslam.api.slam import RegisteredScan, Slam
+    from lidarslam.api.slam import Slam
     from lidarslam.config.settings import Config
     from lidarslam.core.errors import LidarSlamError
     from lidarslam.core.scan import Scan
     from lidarslam.core.tracking import Status
     from lidarslam.core.trajectory import Trajectory
     from lidarslam.mapping.global_map.point_cloud import PointCloud
+    from lidarslam.pipeline.estimates import ScanEstimate as RegisteredScan
 
     __version__: str
 
@@ -37,7 +38,7 @@ _MODULES = {
     "LidarSlamError": "lidarslam.core.errors",
     "OpenRecording": "lidarslam.api.recordings",
     "PointCloud": "lidarslam.mapping.global_map.point_cloud",
-    "RegisteredScan": "lidarslam.api.slam",
+    "RegisteredScan": "lidarslam.pipeline.estimates:ScanEstimate",
     "Scan": "lidarslam.core.scan",
     "Slam": "lidarslam.api.slam",
     "Status": "lidarslam.core.tracking",
@@ -57,7 +58,8 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of these
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib import import_module
 
-        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        module, _, renamed = _MODULES[name].partition(":")
+        value = globals()[name] = getattr(import_module(module), renamed or name)
         return value
 
     def __dir__():

@@ -1,8 +1,7 @@
 """Localisation of a recording in a finished map: from a source and a map to a run directory in the map's frame."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +9,26 @@ import numpy as np
 
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.text import as_typed, command_line, count, joined, scan_span
+from lidarslam.core.text import as_typed, command_line, count, joined
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import format_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping.global_map.drawing import DrawnMap
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
-from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
-from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.run.interruption import Interruptions
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest, describe_run, log_choices
-from lidarslam.run.results import RunOutcome, write_results
-from lidarslam.run.run import open_odometry, require_apart, require_overlap, viewing
+from lidarslam.run.results import RunOutcome, Tracked
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.session import RunSession, open_session, require_apart
 from lidarslam.run.summary import WrittenMap, summarise
-from lidarslam.run.summary_text import format_times
-from lidarslam.run.tracking import Progress, Tracked, track
+from lidarslam.run.summary_text import format_end, format_times
+from lidarslam.run.tracking import Progress, track
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY, RunDirectory
+from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.finished_run import load_map
-from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.viewer import Viewer
 from lidarslam.viewer.web_page import WebPage
 
@@ -83,7 +78,7 @@ class PlacedViewer(Viewer):
         self._shown = shown
         self._is_placed = False
 
-    def show_scan(self, index: int, result: ScanResult) -> None:
+    def show_scan(self, index: int, result: ScanEstimate) -> None:
         """One scan, if the place is known."""
         self._is_placed = self._is_placed or result.status is not Status.LOST
         if self._is_placed:
@@ -151,60 +146,43 @@ def execute(
     run = request.run
     require_apart(run.out, run.source)
     require_apart(run.out, request.map)
-    if run.rerun == "spawn":
-        require_window("serve a browser with --rerun web, or write a file with --rerun save")
     phase("reading the map")
     cloud, fixed_map = read_map(request)
     recording = open_recording(run.source, run.config.reader)
     chosen = choose_scans(recording, run.source, run.start, run.stop, run.step)
     log_choices(run, chosen, len(recording))
     guess = None if request.guess is None else (*request.guess[:2], float(np.deg2rad(request.guess[2])))
-    with Interruptions() as interruptions:
-        with ExitStack() as stack:
-            compiling = stack.enter_context(CompileAhead(parts_of(run.config)))
-            phase("loading the odometry")
-            odometry = require_overlap(open_odometry(run.config, run.prior), recording)
-            stack.callback(odometry.close)
-            directory = stack.enter_context(RunDirectory.create(run.out, run.overwrite))
-            log, localiser = ScanLog(), MapLocaliser(run.config.mapping, fixed_map, guess)
-            with viewing(run.rerun, run.config.viewer, recording.name, directory, log, page) as viewer:
-                viewer.show_final_map(cloud.points)
-                compiling.wait_for_first_scan(phase)
-                phase("searching for the place")
-                tracked = track(
-                    run, recording, chosen, odometry, log, None, PlacedViewer(viewer), progress,
-                    mapper=localiser,
-                )  # fmt: skip
-            interruptions.protect_results()
-            phase("writing the results")
-            outcome = _write(request, directory, tracked, localiser)
-        if run.report and outcome.localisation.found is not None:
-            from lidarslam.viewer.run_report import Accuracy, leave_report
-
-            phase("drawing the report")
-            leave_report(run.out, Accuracy(outcome.run.metrics))
-    return outcome
+    localiser = MapLocaliser(run.config.mapping, fixed_map, guess)
+    with open_session(run, phase, recording) as session:
+        session.show(recording.name, page)
+        shown = session.viewer
+        shown.show_final_map(cloud.points)
+        session.viewer = PlacedViewer(shown)
+        session.wait_for_loops(for_first_scan=True)
+        phase("searching for the place")
+        tracked = track(session, run, recording, chosen, progress, mapper=localiser)
+        session.end_scans()
+        session.close_viewer()
+        return _write(request, session, tracked, localiser)
 
 
-def _write(
-    request: LocaliseRequest, directory: RunDirectory, tracked: Tracked, localiser: MapLocaliser
-) -> LocaliseOutcome:
+def _write(request: LocaliseRequest, session: RunSession, tracked: Tracked, localiser: MapLocaliser) -> LocaliseOutcome:
     """Write what is known by now; a recording that was never found has no trajectory in the map."""
-    log, config, described = tracked.log, request.run.config, request.describe()
+    log, directory, config, described = session.log, session.directory, request.run.config, request.describe()
     _correct(log, localiser)
     found = _localisation(log, localiser)
     section = {"localisation": {"map": described["map"], **found.to_json()}}
     if found.found is not None:
-        run = write_results(directory, config, described, tracked, None, DrawnMap(None, None))
+        run = session.finish(replace(tracked, global_map=None), described)
         directory.write_json(files.SUMMARY, run.summary.to_json() | section)
         return LocaliseOutcome(run, found)
     directory.write_text(files.CONFIG, dump_yaml(config, described))
     directory.write_text(files.SCANS_CSV, log.format_csv())
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
-    log.warnings.extend(tracked.faults.warnings())
+    log.warnings.extend(tracked.scans.faults.warnings())
     summary = summarise(log, WrittenMap(0, None, 0), 0)
     directory.write_json(files.SUMMARY, summary.to_json() | section)
-    return LocaliseOutcome(RunOutcome(summary, None, tracked.stopped), found)
+    return LocaliseOutcome(RunOutcome(summary, None, tracked.scans.stopped), found)
 
 
 def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
@@ -240,10 +218,6 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
     )
 
 
-# Stretches of lost scans that are listed; summary.json has them all.
-_LISTED = 3
-
-
 def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
     """A localisation in a few lines: where it was found, what was tracked, what was lost, and where the files are."""
     return joined(_lines(request, outcome))
@@ -263,11 +237,5 @@ def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     before = f", {found.placed_afterwards:,} before that placed afterwards" if found.placed_afterwards else ""
     yield f"{found.tracked:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
     yield from format_times(summary)
-    for warning in summary.warnings:
-        yield f"warning: {warning}"
-    for stretch in summary.lost[:_LISTED]:
-        yield f"LOST on {scan_span(stretch.first, stretch.last)}: {stretch.reason}"
-    if len(summary.lost) > _LISTED:
-        yield f"LOST on {len(summary.lost) - _LISTED} more; {SUMMARY} and {SCANS_CSV} list them"
-    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
+    yield from format_end(out, summary)
     yield f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}"

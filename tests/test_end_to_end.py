@@ -18,7 +18,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses, read_tum, write_tum
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.threads import in_order
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
@@ -36,7 +36,7 @@ MAPPING = ["global_map.voxel_size_m=0.1"]
 KITTI = ["odometry.method=kiss-icp", "mapping.method=off"]
 
 
-def quiet(number: int, total: int, result: ScanResult) -> None:
+def quiet(number: int, total: int, result: ScanEstimate) -> None:
     """No progress bar."""
 
 
@@ -249,7 +249,7 @@ def test_damage_that_no_scan_can_be_left_out_for_ends_the_run_with_what_there_is
 
 
 def test_an_interruption_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:
-    def interrupt(number: int, total: int, result: ScanResult) -> None:
+    def interrupt(number: int, total: int, result: ScanEstimate) -> None:
         if number == 7:
             raise KeyboardInterrupt
 

@@ -50,11 +50,7 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, co
 
 
 def make_vector(name: str, numbers: ArrayLike) -> FloatArray:
-    """Three finite numbers (3,), copied.
-
-    Raises:
-        InputError: they are something else.
-    """
+    """Three finite numbers (3,), copied; InputError where they are something else."""
     vector = np.array(_numbers(name, numbers), dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise InputError(f"{name} must be three finite numbers, got {numbers!r}")
@@ -62,11 +58,7 @@ def make_vector(name: str, numbers: ArrayLike) -> FloatArray:
 
 
 def check_stamp(stamp: float, last: float | None) -> float:
-    """The stamp in seconds.
-
-    Raises:
-        InputError: it is no number of seconds, or not after the last one.
-    """
+    """The stamp in seconds; InputError where it is no number of seconds, or not after the last one."""
     try:
         seconds = float(stamp)
     except (TypeError, ValueError):
@@ -113,11 +105,7 @@ def _times(point_times: ArrayLike, count: int) -> FloatArray:
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[Any]:
-    """An array of real numbers.
-
-    Raises:
-        InputError: it is none.
-    """
+    """An array of real numbers; InputError where it is none."""
     try:
         array = np.asarray(values)
     except ValueError as error:

@@ -78,11 +78,7 @@ class LidarSlam(Pipeline):
         self._T_lidar_imu = np.array(T.inverse().to_mat(), dtype=np.float64)
 
     def initialize(self) -> None:
-        """Build the estimator.
-
-        Raises:
-            LidarSlamError: a parameter does not fit.
-        """
+        """Build the estimator; LidarSlamError where a parameter does not fit."""
         given = self._parameters
         settings = [f"{name}.method={given[name]}" for name in ("odometry", "mapping") if given[name]]
         config = str(given["config"])

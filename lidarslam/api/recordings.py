@@ -26,11 +26,7 @@ class OpenRecording:
         return len(self._chosen)
 
     def __iter__(self) -> Iterator[Scan]:
-        """The scans.
-
-        Raises:
-            InputError: the recording is damaged where no scan can be left out.
-        """
+        """The scans; InputError at damage for which no scan can be left out."""
         self._faults = Faults()
         return take_in(self._recording, self._chosen, self._faults)
 

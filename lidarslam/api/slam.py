@@ -2,16 +2,15 @@
 
 import copy
 import logging
-import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,137 +21,38 @@ from lidarslam.config.settings import Config, make_config
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
-from lidarslam.mapping.global_map.drawing import DrawnMap
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
-from lidarslam.pipeline.estimates import Estimated, Localised
+from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.map_building import MapBuilder
-from lidarslam.pipeline.stages import Stages
-from lidarslam.pipeline.threads import BackgroundWorker
+from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.loop_closing import GraphOutcome, begin_graph, loops_so_far
-from lidarslam.run.results import final_map, write_results
-from lidarslam.run.run import open_odometry, require_no_trajectory
+from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.tracking import Tracked
+from lidarslam.run.session import draw_report, open_odometry, require_no_trajectory
 from lidarslam.storage.directory import RunDirectory
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
-    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+    pass
 
 
-@dataclass(frozen=True, eq=False)
-class RegisteredScan:
-    """The pose of a scan as estimated when it came, and its quality; arrays are read-only."""
-
-    stamp: float  # seconds
-    T_world_lidar: FloatArray  # (4, 4) at the stamp; the world is the LiDAR frame of the first scan
-    # whether no later scan changes the pose: without a pose graph, whose loops correct the earlier ones
-    is_final: bool
-    # status, message: ok, degraded or lost, and the reason unless it is ok; the pose of a lost scan is a prediction
-    status: Status
-    message: str
-    # (6, 6) of the error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first, radians and metres; None where the
-    # scan was not registered to a map
-    covariance: FloatArray | None
-    degenerate: tuple[str, ...]  # of roll, pitch, yaw, x, y, z of the LiDAR: those that the scan does not constrain
-    velocity: FloatArray | None  # (6,) of the LiDAR in its own frame, rotation first, rad/s and m/s; None where unknown
-    points_used: int  # number of correspondences
-    # residual_m, inlier_ratio: of the fit to the map or the previous scan; None when it could not be computed
-    residual_m: float | None
-    inlier_ratio: float | None
-
-    @classmethod
-    def of(cls, stamp: float, localised: Localised, is_final: bool) -> "RegisteredScan":
-        """Of a scan's pose."""
-        return cls(
-            stamp=stamp,
-            is_final=is_final,
-            T_world_lidar=_read_only(localised.T_world_lidar),
-            status=localised.status,
-            message=localised.message,
-            covariance=None if localised.covariance is None else _read_only(localised.covariance),
-            degenerate=localised.degenerate,
-            velocity=None if (velocity := localised.motion.latest) is None else _read_only(velocity),
-            points_used=localised.points_used,
-            residual_m=localised.residual_m,
-            inlier_ratio=localised.inlier_ratio,
-        )
+A = TypeVar("A", bound=FloatArray | None)
 
 
-def _read_only(array: FloatArray) -> FloatArray:
+def _read_only(array: A) -> A:
     """A copy that the caller cannot change: the next scan's estimate begins with the original."""
+    if array is None:
+        return array
     copy = array.copy()
     copy.flags.writeable = False
     return copy
 
 
-_OPTION = re.compile(r"--([a-z][a-z-]*)")
-
-
-@dataclass(frozen=True, eq=False)
-class Built:
-    """All that was built of the scans so far."""
-
-    config: Config  # of the computation
-    # log, faults: of the scans; changed by `correct`
-    log: ScanLog
-    faults: Faults
-    map: MapBuilder  # the global map, and what is kept beside it
-    graph: "SlamGraph | None"  # the pose graph
-
-    def correct(self, directory: RunDirectory | None = None) -> tuple[GraphOutcome | None, DrawnMap]:
-        """Correct the log by the loops that are closed, and draw the map, with tiles in the directory."""
-        closed = loops_so_far(self.graph, self.map.global_map, self.log)
-        return closed, final_map(self.tracked(), closed, self.config.global_map, directory)
-
-    def tracked(self) -> Tracked:
-        """The same as a recording after the pipeline."""
-        built = self.map
-        return Tracked(
-            None,
-            None,
-            self.log,
-            len(self.log),
-            self.faults,
-            built.global_map,
-            built.views,
-            built.slides.tests,
-            None,
-        )
-
-
-def save_run(path: Path, overwrite: bool, config: Config, built: Built) -> None:
-    """Write a run directory.
-
-    Raises:
-        OutputError: the directory holds something else, or cannot be written.
-    """
-    described = {"version": version("lidarslam"), "source": None}
-    with python_names(), RunDirectory.create(path, overwrite) as directory:
-        closed, drawn = built.correct(directory)
-        write_results(directory, config, described, built.tracked(), closed, drawn)
-
-
-@contextmanager
-def python_names() -> Iterator[None]:
-    """Messages name the options of commands; those of functions have the same names, without dashes."""
-    try:
-        yield
-    except LidarSlamError as error:
-        error.args = (_OPTION.sub(lambda found: found[1].replace("-", "_"), str(error)), *error.args[1:])
-        raise
-
-
 logger = logging.getLogger(__name__)
-
-# Scans whose points may wait for the map, to bound the memory they hold.
-_SCANS_BEHIND = 8
 
 
 class Slam:
@@ -174,15 +74,14 @@ class Slam:
     def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
         self._config = make_config(config)
         require_no_trajectory(self._config)
-        with CompileAhead(parts_of(self._config)) as compiling, python_names():
+        with CompileAhead(parts_of(self._config)) as compiling:
             self._odometry = open_odometry(self._config, None)
             compiling.wait_for_all(logger.info)
         self._graph = begin_graph(self._config)
         self._log, self._faults = ScanLog(), Faults()
         self._imu = make_imu_stream(self._config, self._log.warn)
         localiser = make_localiser(self._config, self._imu)
-        self._stages = Stages(self._odometry, localiser, self._config.global_map, self._graph)
-        self._builder = BackgroundWorker("map", _SCANS_BEHIND)
+        self._pipeline = Pipeline(self._odometry, localiser, self._config.global_map, self._graph)
         self._blas = ThreadpoolController()
         self._count, self._longest_interval_s = 0, 0.0
         self._last_stamp: float | None = None
@@ -193,7 +92,7 @@ class Slam:
 
     def register_frame(
         self, points: ArrayLike | Scan, point_times: ArrayLike | None = None, stamp: float | None = None
-    ) -> RegisteredScan:
+    ) -> ScanEstimate:
         """Register the next scan, and return its pose at once; the map follows in the background.
 
         Points that are NaN, at the origin or beyond 10 km are left out. The arrays may be used again afterwards.
@@ -219,12 +118,15 @@ class Slam:
             if self._imu is not None:
                 scan = self._imu.take_up(scan)
             with self._failing(), self._blas.limit(limits=1, user_api="blas"):
-                estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
-                localised = self._stages.localise(estimated)
-                self._stages.follow(estimated, lambda: localised)
-                total_ms = 1e3 * (time.perf_counter() - started)
-                self._submit(estimated, localised, total_ms)
-            return RegisteredScan.of(scan.stamp, localised, self._graph is None)
+                estimate = self._pipeline.register(scan, started, self._log.add)
+            return replace(
+                estimate,
+                is_final=self._graph is None,
+                T_world_lidar=_read_only(estimate.T_world_lidar),
+                T_odom_lidar=_read_only(estimate.T_odom_lidar),
+                covariance=_read_only(estimate.covariance),
+                motion=SweepMotion(_read_only(estimate.motion.before), _read_only(estimate.motion.after)),
+            )
 
     def register_imu(self, stamp: float, gyroscope: ArrayLike, acceleration: ArrayLike) -> None:
         """Take the next sample of the IMU; with `odometry.method` `learned+imu` or `imu`.
@@ -269,7 +171,8 @@ class Slam:
         """
         with self._entered():
             self._settle()
-            cloud = self._built().correct()[1].cloud
+            tracked, closed = self._corrected()
+            cloud = corrected_map(tracked, closed, self._config.global_map).cloud
             return PointCloud(np.empty((0, 3)), np.empty((0, 3))) if cloud is None else cloud
 
     def save(self, directory: str | PathLike[str], overwrite: bool = False) -> None:
@@ -289,8 +192,11 @@ class Slam:
                 raise InputError("there is nothing to save: no scan with points was registered")
             for warning in self._imu.warnings if self._imu is not None else ():
                 self._log.warn(warning)
-            self._stages.map.slides.finish()
-            save_run(Path(directory), overwrite, self._config, self._built())
+            self._pipeline.map.slides.finish()
+            described = {"version": version("lidarslam"), "source": None}
+            with RunDirectory.create(Path(directory), overwrite) as run:
+                outcome = write_results(run, self._config, described, *self._corrected())
+            draw_report(Path(directory), outcome)
 
     def close(self) -> None:
         """End the threads, and let go of everything; no other method may be called afterwards."""
@@ -299,8 +205,7 @@ class Slam:
                 return
             self._closed = True
             try:
-                self._builder.close()
-                self._stages.close()
+                self._pipeline.close()
             except Exception as error:
                 if self._failure is None:
                     raise _map_error(error) from error
@@ -334,21 +239,11 @@ class Slam:
         self._last_stamp, self._longest_interval_s = seconds, longest_s
         return look_at(scan, self._faults)
 
-    def _submit(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
-        """Leave the rest to the background; an error of an earlier scan may be raised."""
-        try:
-            self._builder.submit(self._build, estimated, localised, total_ms)
-        except Exception as error:
-            raise _map_error(error) from error
-
-    def _build(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
-        """What of a scan is done in the background."""
-        self._log.add(self._stages.build(estimated, localised), total_ms)
-
-    def _built(self) -> Built:
-        """What there is so far, once the background is done."""
-        graph = self._graph if self._has_whole_graph() else None
-        return Built(self._config, copy.deepcopy(self._log), copy.copy(self._faults), self._stages.map, graph)
+    def _corrected(self) -> tuple[Tracked, GraphOutcome | None]:
+        """What there is so far, corrected by the loops that are closed, once the background is done."""
+        log, built = copy.deepcopy(self._log), self._pipeline.map
+        closed = loops_so_far(self._graph if self._has_whole_graph() else None, built.global_map, log)
+        return Tracked(TrackedScans.of(log, copy.copy(self._faults), built), built.global_map), closed
 
     def _has_whole_graph(self) -> bool:
         return self._graph is not None and len(self._graph.scan_poses) == len(self._log)
@@ -356,9 +251,7 @@ class Slam:
     def _settle(self) -> None:
         """Wait for the background, and add the last scan to the map."""
         try:
-            self._builder.wait()
-            self._stages.add_pending()
-            self._stages.wait_for_graph()
+            self._pipeline.settle()
         except Exception as error:
             known, self._failure = self._failure, self._failure or error
             if known is None:

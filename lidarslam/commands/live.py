@@ -74,7 +74,7 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
         with show_progress(topic or "live") as progress:
             progress.phase("loading the program")
             from lidarslam.live.live import execute
-            from lidarslam.live.session import LiveRequest
+            from lidarslam.run.request import LiveRequest
             from lidarslam.run.summary_text import format_outcome
             from lidarslam.storage.directory import RERUN
 

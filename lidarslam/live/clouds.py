@@ -107,11 +107,7 @@ class CloudDecoder:
         return before is not None and 0 < stamp_ns - before[0] < published_ns - before[1] + _AHEAD_NS
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
-        """Decode the points.
-
-        Raises:
-            InputError: the message is damaged or lacks a field.
-        """
+        """Decode the points; InputError where the message is damaged or lacks a field."""
         try:
             return decode(message, True, self._config.time_field)
         except InputError:

@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.scan import Scan
 from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
 from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
@@ -17,11 +18,15 @@ from lidarslam.live.clouds import CloudDecoder, LiveScan
 from lidarslam.live.dds import DdsNode, PublishedTopic
 from lidarslam.live.messages import PosePublisher
 from lidarslam.live.receiving import Arrived, ImuReceiver, IncomingQueue
-from lidarslam.live.session import LiveRequest, LiveSession
 from lidarslam.live.statistics import LiveCounts, LiveStatistics
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.imu_stream import ImuStream
+from lidarslam.run.request import LiveRequest
 
 logger = logging.getLogger(__name__)
+
+Register = Callable[[Scan, float], ScanEstimate]
+"""Gives the pose of the next scan, whose message was taken up at a reading of `time.perf_counter`."""
 
 ODOMETRY_TOPIC, TF_TOPIC, TF_STATIC_TOPIC = "/lidarslam/odometry", "/tf", "/tf_static"
 _POLL_S, _SHOWN_EVERY_S = 0.2, 1.0
@@ -37,12 +42,12 @@ _STATIC_WITHIN_S = 5.0
 
 
 class Follower:
-    """Takes the clouds of a topic through a session, and publishes their poses.
+    """Registers the clouds of a topic, and publishes their poses.
 
     Args:
         request: what is followed, and until when.
         node: where topics are subscribed to and published.
-        session: registers the scans.
+        register: registers the scans.
         decoder: makes scans of messages.
         imu: receives the samples beside them, with the stream that they go to.
     """
@@ -51,11 +56,11 @@ class Follower:
         self,
         request: LiveRequest,
         node: DdsNode,
-        session: LiveSession,
+        register: Register,
         decoder: CloudDecoder,
         imu: tuple[ImuReceiver, ImuStream] | None = None,
     ) -> None:
-        self._request, self._session, self._decoder, self._imu = request, session, decoder, imu
+        self._request, self._register_scan, self._decoder, self._imu = request, register, decoder, imu
         self._statistics = LiveStatistics()
         self._publish_odometry = node.publisher(ODOMETRY_TOPIC, ODOMETRY_TYPE).publish
         self._publish_tf = node.publisher(TF_TOPIC, TRANSFORMS_TYPE).publish if request.publish_tf else None
@@ -123,8 +128,7 @@ class Follower:
             self._poses = self._pose_publisher(live.frame_id)
         if self._imu is not None:
             self._wait_for_imu(self._imu, live)
-        localised = self._session.register(live.scan, started)
-        self._poses.publish(live.stamp_ns, localised)
+        self._poses.publish(live.stamp_ns, self._register_scan(live.scan, started))
         self._statistics.registered(live.scan.stamp, message.arrived_s)
         return True
 
@@ -142,11 +146,7 @@ class Follower:
             stream.place(None if T_recorded_imu is None else self._decoder.T_upright_recorded @ T_recorded_imu)
 
     def _pose_publisher(self, lidar_frame: str) -> PosePublisher:
-        """Once the frame of the LiDAR is known.
-
-        Raises:
-            InputError: no static transforms connect it with the base frame.
-        """
+        """Once the frame of the LiDAR is known; InputError: no static transforms connect it with the base frame."""
         body = self._request.base_frame or lidar_frame
         T_body_lidar = np.eye(4) if self._request.base_frame is None else self._static_transform(body, lidar_frame)
         if T_body_lidar is None:

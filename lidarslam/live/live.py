@@ -1,8 +1,9 @@
 """A live run on disk: from the clouds of a robot to a run directory."""
 
+import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from contextlib import closing, nullcontext
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -10,26 +11,27 @@ from threadpoolctl import threadpool_limits
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import look_at
 from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.receiving import IMU_DEPTH, ImuReceiver, IncomingQueue, find_imu, find_topic
-from lidarslam.live.session import LiveRequest, LiveSession, warm_up
 from lidarslam.live.statistics import LiveCounts
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.pipeline.compile_ahead import made_up_scans
+from lidarslam.pipeline.estimates import ScanEstimate
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.inertial import make_imu_stream
-from lidarslam.run.interruption import Interruptions
-from lidarslam.run.loop_closing import begin_graph, close_loops
-from lidarslam.run.results import RunOutcome, final_map, write_results
-from lidarslam.run.run import open_odometry, require_no_trajectory, viewing
+from lidarslam.run.request import LiveRequest
+from lidarslam.run.results import RunOutcome, Tracked, TrackedScans
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.storage.directory import RunDirectory
-from lidarslam.viewer.rerun_program import require_window
+from lidarslam.run.session import open_odometry, open_session, require_no_trajectory
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
     from lidarslam.live.dds import DdsNode
-    from lidarslam.live.following import Follower
+    from lidarslam.live.following import Follower, Register
     from lidarslam.pipeline.imu_stream import ImuStream
 
 
@@ -56,59 +58,52 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
             not usable.
     """
     node = _open_node(request.domain)
-    if request.rerun == "spawn":
-        require_window("serve a browser with --rerun web, or write a file with --rerun save")
-    config, log, faults = bounded(request.config), ScanLog(), Faults()
+    request = replace(request, config=bounded(request.config))
+    config, faults = request.config, Faults()
     require_no_trajectory(config)
-    with Interruptions() as interruptions:
-        with ExitStack() as stack:
-            compiling = stack.enter_context(CompileAhead(parts_of(config)))
-            show("loading the odometry")
-            odometry = open_odometry(config, None)
-            stack.callback(odometry.close)
-            directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
-            graph = begin_graph(config, directory.path)
-            if graph is not None:
-                stack.callback(graph.close)
-            compiling.wait_for_all(show)
-            show("warming up")
-            with closing(open_odometry(config, None)) as rehearsing:
-                warm_up(config, rehearsing)
-            show("waiting for clouds")
-            topic = find_topic(node.published, request.topic, request.domain, request.duration_s)
-            imu = _receive_imu(config, node, log)
-            show(f"{topic.name}: waiting for the first scan")
-            with viewing(request.rerun, config.viewer, topic.name, directory, log, page) as viewer:
-                with (
-                    threadpool_limits(1, "blas"),
-                    LiveSession(
-                        config, odometry, graph, log, faults, viewer, TileStore(request.out), imu and imu[1]
-                    ) as session,
-                ):
-                    if imu is not None:
-                        stack.enter_context(imu[0])
-                    decoder = CloudDecoder(config.reader, topic.message_type, faults)
-                    follower = _follower(request, node, session, decoder, imu)
-                    incoming = IncomingQueue(node.subscribe(topic).take, request.queue, follower.on_arrival)
-                    counts, is_interrupted = follower.follow(incoming, show)
-                    interruptions.protect_results()
-                    show("writing the results")
-                    tracked = session.finish()
-                _require_scans(topic.name, log, faults)
-                for warning in [*counts.warnings(), *(imu[1].warnings if imu is not None else ())]:
-                    log.warn(warning)
-                closed = close_loops(graph, tracked.global_map, log, viewer)
-                drawn = final_map(tracked, closed, config.global_map, directory)
-                if drawn.cloud is not None:
-                    viewer.show_final_map(drawn.cloud.points)
-            described = _describe(request, topic.name)
-            outcome = write_results(directory, config, described, tracked, closed, drawn, request.map_formats)
-        if request.report:
-            from lidarslam.viewer.run_report import Accuracy, leave_report
+    with open_session(request, show) as session:
+        log = session.log
+        session.begin_graph()
+        session.wait_for_loops()
+        show("warming up")
+        _warm_up(config)
+        show("waiting for clouds")
+        topic = find_topic(node.published, request.topic, request.domain, request.duration_s)
+        imu = _receive_imu(config, node, log)
+        show(f"{topic.name}: waiting for the first scan")
+        session.show(topic.name, page)
+        localiser, store = make_localiser(config, imu and imu[1]), TileStore(request.out)
+        pipeline = Pipeline(session.odometry, localiser, config.global_map, session.graph, store=store)
 
-            show("drawing the report")
-            leave_report(request.out, Accuracy(outcome.metrics))
+        def register(scan: Scan, started: float) -> ScanEstimate:
+            scan = look_at(scan, faults)
+            if imu is not None:
+                scan = imu[1].take_up(scan)
+            return pipeline.register(scan, started, lambda estimate, ms: session.take(estimate, ms, pipeline.map))
+
+        with threadpool_limits(1, "blas"), closing(pipeline), nullcontext() if imu is None else imu[0]:
+            decoder = CloudDecoder(config.reader, topic.message_type, faults)
+            follower = _follower(request, node, register, decoder, imu)
+            incoming = IncomingQueue(node.subscribe(topic).take, request.queue, follower.on_arrival)
+            counts, is_interrupted = follower.follow(incoming, show)
+            session.end_scans()
+            pipeline.finish()
+        _require_scans(topic.name, log, faults)
+        for warning in [*counts.warnings(), *(imu[1].warnings if imu is not None else ())]:
+            log.warn(warning)
+        tracked = Tracked(TrackedScans.of(log, faults, pipeline.map), pipeline.map.global_map)
+        outcome = session.finish(tracked, _describe(request, topic.name))
     return LiveOutcome(outcome, topic.name, counts, is_interrupted)
+
+
+def _warm_up(config: Config) -> None:
+    """Register made-up scans: the first calls load compiled loops, for seconds on a busy machine."""
+    with (
+        closing(open_odometry(config, None)) as odometry,
+        closing(Pipeline(odometry, make_localiser(config), config.global_map)) as pipeline,
+    ):
+        for scan in made_up_scans():
+            pipeline.register(scan, time.perf_counter(), lambda *_: None)
 
 
 def bounded(config: Config) -> Config:
@@ -125,13 +120,13 @@ def bounded(config: Config) -> Config:
 def _follower(
     request: LiveRequest,
     node: "DdsNode",
-    session: LiveSession,
+    register: "Register",
     decoder: CloudDecoder,
     imu: "tuple[ImuReceiver, ImuStream] | None",
 ) -> "Follower":
     from lidarslam.live.following import Follower  # loads cyclonedds
 
-    return Follower(request, node, session, decoder, imu)
+    return Follower(request, node, register, decoder, imu)
 
 
 def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> "tuple[ImuReceiver, ImuStream] | None":
@@ -162,11 +157,7 @@ def _open_node(domain: int) -> "DdsNode":
 
 
 def _require_scans(topic: str, log: ScanLog, faults: Faults) -> None:
-    """Check that there is something to write.
-
-    Raises:
-        InputError: no scan came that could be used.
-    """
+    """Check that there is something to write; InputError: no scan came that could be used."""
     if not log.points_read:
         why = "; ".join(faults.warnings()) or ("its scans had no valid point" if len(log) else "none came")
         raise InputError(f"{topic}: no scan could be used: {why}")

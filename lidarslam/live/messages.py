@@ -11,7 +11,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
-from lidarslam.pipeline.estimates import Localised
+from lidarslam.pipeline.estimates import ScanEstimate
 
 
 @cache
@@ -83,14 +83,14 @@ class PosePublisher:
         self._T_body_lidar = T_body_lidar
         self._adjoint = adjoint(T_body_lidar)
 
-    def publish(self, stamp_ns: int, localised: Localised) -> None:
+    def publish(self, stamp_ns: int, estimate: ScanEstimate) -> None:
         """Publish the pose of a scan."""
-        if localised.status is Status.LOST:
+        if estimate.status is Status.LOST:
             return
         # With A the adjoint of T_body_lidar, an error or velocity xi of the LiDAR is A xi of the body.
-        T, A = self._T_body_lidar @ localised.T_world_lidar @ inverse(self._T_body_lidar), self._adjoint
-        covariance = None if localised.covariance is None else A @ localised.covariance @ A.T
-        velocity = None if (latest := localised.motion.latest) is None else A @ latest
+        T, A = self._T_body_lidar @ estimate.T_world_lidar @ inverse(self._T_body_lidar), self._adjoint
+        covariance = None if estimate.covariance is None else A @ estimate.covariance @ A.T
+        velocity = None if estimate.velocity is None else A @ estimate.velocity
         self._odometry(serialize_odometry(stamp_ns, *self._frames, T, covariance, velocity))
         if self._transforms is not None:
             self._transforms(serialize_transform(stamp_ns, *self._frames, T))

@@ -15,28 +15,24 @@ from lidarslam.core.files import only_writer, remove_partial_files
 from lidarslam.core.state import Saved, decode, encode
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.core.text import safe_name
-from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.fetched import fetch
 from lidarslam.datasets.published.evalio import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat
-from lidarslam.mapping.consistency import PairTest
-from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.run.checkpoints import describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.request import RunRequest
-from lidarslam.run.run import open_odometry, require_apart
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
+from lidarslam.run.results import TrackedScans
+from lidarslam.run.session import RunSession, open_odometry, require_apart
+from lidarslam.run.tracking import NoScanError, Progress, track
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory, files_in, remove_run
 from lidarslam.storage.finished_run import read_summary
 from lidarslam.storage.state_file import read_state, write_state
 from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished, remove_unfinished
-from lidarslam.viewer.viewer import Viewer
 
 # The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.
 _PART = re.compile(r"\d{2,}_[\w.-]+")
@@ -61,11 +57,7 @@ class MergeRequest:
 
 
 def closing_loops(config: Config) -> Config:
-    """The configuration with the pose graph.
-
-    Raises:
-        ConfigError: the odometry is a trajectory of one recording.
-    """
+    """The configuration with the pose graph; ConfigError where the odometry is a trajectory of one recording."""
     if config.odometry.method == "external":
         raise ConfigError(
             "odometry.method is external: one trajectory is not that of several recordings; choose another"
@@ -124,37 +116,9 @@ def remove_part(path: Path) -> None:
     remove_run(path)
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedPart:
-    """What `Tracked` holds of a recording, but what is read from it again or drawn anew."""
-
-    log: ScanLog
-    asked: int
-    faults: Faults
-    views: Views
-    slides: list[PairTest]
-    stopped: str | None  # why it ended before its last scan
-    interrupted: bool  # whether that was an interruption
-
-    @classmethod
-    def of(cls, tracked: Tracked) -> "TrackedPart":
-        """A recording that was just tracked."""
-        interrupted = isinstance(tracked.error, KeyboardInterrupt)
-        log, slides = tracked.log, tracked.slides
-        return cls(log, tracked.asked, tracked.faults, tracked.views, slides, tracked.stopped, interrupted)
-
-    def write(self, unfinished: Unfinished, graph: KeyframeGraph) -> None:
-        """Leave it, and its graph, whose submaps are there already.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
-        write_state(unfinished.files.tracked, {"part": encode(TrackedPart, self), "graph": graph.state()})
-
-
-def read_part(saved: Saved) -> TrackedPart:
+def read_part(saved: Saved) -> TrackedScans:
     """The recording of a file; InputError where it is damaged."""
-    part: TrackedPart = decode(TrackedPart, saved.value("part"), saved.at("part"))
+    part: TrackedScans = decode(TrackedScans, saved.value("part"), saved.at("part"))
     return part
 
 
@@ -239,20 +203,21 @@ def _track(
     interruptions: Interruptions,
 ) -> PartDone:
     """Track a recording, and leave the result."""
-    graph, scans, log = _open_graph(request.config, unfinished), range(len(recording)), ScanLog()
+    graph, files = _open_graph(request.config, unfinished), unfinished.files
     with closing(graph), closing(open_odometry(request.config, None)) as odometry:
         try:
-            tracked = track(request, recording, scans, odometry, log, graph, Viewer(), progress, unfinished)
+            session = RunSession(request, RunDirectory(request.out), odometry, unfinished=unfinished)
+            scans = track(session, request, recording, range(len(recording)), progress, graph).scans
         except NoScanError as error:
             unfinished.end(stopped=False)
             return PartDone(0, f"{request.source}: interrupted" if error.interrupted else str(error), error.interrupted)
         interruptions.protect_results()
         graph.end_recording()
-        part = TrackedPart.of(tracked)
-        part.write(unfinished, graph)
-    if not part.interrupted:
-        unfinished.remove_checkpoint()
-    return PartDone(len(part.log), interrupted=part.interrupted)
+        write_state(files.tracked, {"part": encode(TrackedScans, scans), "graph": graph.state()})
+    if not scans.interrupted:
+        for path in (files.state, files.tiles):  # nothing goes on from the state
+            path.unlink(missing_ok=True)
+    return PartDone(len(scans.log), interrupted=scans.interrupted)
 
 
 def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidarslam.config.settings import dump_yaml
-from lidarslam.core.errors import InputError
 from lidarslam.core.state import Saved
 from lidarslam.core.text import count, joined
 from lidarslam.datasets.published.evalio import resolved
@@ -17,10 +16,9 @@ from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.merge.parts import MergeRequest, PartDone, read_part
 from lidarslam.run.loop_closing import FinishedGraph
 from lidarslam.run.request import RunRequest, describe_run
-from lidarslam.run.results import RunOutcome, draw, final_map, write_map, write_results
+from lidarslam.run.results import RunOutcome, Tracked, draw, unless_damaged, write_map, write_results
 from lidarslam.run.summary import GraphSummary, WrittenMap, graph_and_map_json, peak_rss_mb
 from lidarslam.run.summary_text import format_map
-from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
@@ -118,11 +116,9 @@ class Part:
 
     def tracked(self) -> Tracked:
         """The recording as it was tracked; its map is drawn anew from the graph."""
-        part = read_part(self.saved())
-        truth = unless_damaged(lambda: self.recording.ground_truth, part.log, "no metrics")
-        error = None if part.stopped is None else KeyboardInterrupt() if part.interrupted else InputError(part.stopped)
-        log, faults, views, slides = part.log, part.faults, part.views, part.slides
-        return Tracked(self.recording, truth, log, part.asked, faults, None, views, slides, error)
+        scans = read_part(self.saved())
+        truth = unless_damaged(lambda: self.recording.ground_truth, scans.log, "no metrics")
+        return Tracked(scans, recording=self.recording, truth=truth)
 
 
 def missing(parts: Sequence[Part]) -> list[str]:
@@ -183,14 +179,11 @@ def _write_run(part: Part, finished: FinishedGraph | None, index: int, is_joined
     tracked = part.tracked()
     closed = None if finished is None else finished.outcome([index])
     if closed is not None:
-        tracked.log.correct(closed.T_world_lidar)
+        tracked.scans.log.correct(closed.T_world_lidar)
     if not is_joined:
-        tracked.log.warn(_OF_ITS_OWN)
-    drawn = final_map(tracked, closed, part.request.config.global_map, part.directory)
+        tracked.scans.log.warn(_OF_ITS_OWN)
     request = part.request
-    return write_results(
-        part.directory, request.config, describe_run(request), tracked, closed, drawn, request.map_formats
-    )
+    return write_results(part.directory, request.config, describe_run(request), tracked, closed, request.map_formats)
 
 
 def _entry(part: Part, run: RunOutcome | None, is_joined: bool) -> MergedRecording:

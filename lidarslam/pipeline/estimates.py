@@ -1,4 +1,4 @@
-"""A scan on its way through the pipeline: with its odometry, with its pose, done."""
+"""A scan on its way through the pipeline: with its odometry, with its pose."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape
+from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.motion.prediction import GravityDirection
@@ -19,7 +19,7 @@ STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
 
 @dataclass(frozen=True, eq=False)
-class Estimated:
+class ScanOdometry:
     """A scan with its odometry."""
 
     scan: Scan  # as read
@@ -65,53 +65,57 @@ class SweepMotion:
         return np.asarray(share_after * self.after + (1.0 - share_after) * self.before, dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class Localised:
-    """The pose of a scan."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanEstimate:
+    """The pose of a scan as estimated when it came, and its quality."""
 
-    T_world_lidar: FloatArray  # (4, 4) at the stamp; the world is the LiDAR frame of the first scan
-    T_odom_lidar: FloatArray  # (4, 4), the odometry alone; where it measured nothing, the predicted motion
-    covariance: FloatArray | None  # (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none
-    motion: SweepMotion  # of the sensor during the sweep
-    # status, message: the tracking status, and its reason unless it is ok
+    stamp: float  # seconds
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]  # at the stamp; the world is the LiDAR frame of the first scan
+    # whether no later scan changes the pose: not with a pose graph, whose loops correct the earlier ones
+    is_final: bool = True
+    # status, message: ok, degraded or lost, and the reason unless it is ok; the pose of a lost scan is a prediction
     status: Status
     message: str
-    belongs_in_map: bool  # whether the pose is accurate enough to add the scan to the map
-    points_used: int  # number of correspondences that the pose was estimated from
+    # (6, 6) of the error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first, radians and metres; None where the
+    # scan was not registered to a map
+    covariance: Annotated[FloatArray, Shape(6, 6)] | None
+    degenerate: tuple[str, ...]  # of roll, pitch, yaw, x, y, z of the LiDAR: those that the scan does not constrain
+    points_used: int  # number of correspondences
     # residual_m, inlier_ratio: of the fit to the map or the previous scan; None when it could not be computed
     residual_m: float | None
     inlier_ratio: float | None
-    degenerate: tuple[str, ...]  # axes along which the scan does not constrain the motion
-    stage_ms: dict[str, float]  # wall time of the stages, see `STAGES`
+    T_odom_lidar: Annotated[FloatArray, TRANSFORM]  # the odometry alone; where it measured nothing, a prediction
+    is_odometry_asked: bool  # whether the odometry was asked for the motion
+    motion: SweepMotion  # of the sensor during the sweep
+    belongs_in_map: bool  # whether the pose is accurate enough to add the scan to the map
     is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
     gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not
     cell_m: float | None = None  # of the local map's surfels; None where there are none
-    turn_rate: FloatArray | None = None  # (3,) rad/s as the sweep alone shows it, in the LiDAR frame; None: unknown
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScanResult(Localised):
-    """A scan that is done: its pose, and beside `Localised`:"""
-
-    stamp: float  # seconds
-    points: FloatArray  # (N, 3) in the LiDAR frame at the stamp, deskewed, within the map's range, one a voxel
+    turn_rate: Annotated[FloatArray, Shape(3)] | None = None  # rad/s as the sweep alone shows it, in the LiDAR frame
+    stage_ms: dict[str, float]  # wall time of the stages so far, see `STAGES`
     # points_read, points_dropped: valid points of the raw scan, and invalid ones that were left out
     points_read: int
     points_dropped: int
-    is_odometry_asked: bool = True  # whether the odometry was asked for the motion
+    # in the LiDAR frame at the stamp, deskewed, within the map's range, one a voxel; none before the scan is in the map
+    points: Annotated[FloatArray, Shape(None, 3)] = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def velocity(self) -> FloatArray | None:
+        """(6,) of the LiDAR in its own frame, rotation first, rad/s and m/s; None where unknown."""
+        return self.motion.latest
 
 
-def graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:
-    """A scan as the pose graph takes it, with its deskewed points (N, 3) in the LiDAR frame."""
-    is_lost = localised.status is Status.LOST
-    measured = estimated.interval_s is not None and (localised.is_connected or is_lost)
+def graph_scan(odometry: ScanOdometry, estimate: ScanEstimate) -> GraphScan:
+    """A scan as the pose graph takes it."""
+    is_lost = estimate.status is Status.LOST
+    measured = odometry.interval_s is not None and (estimate.is_connected or is_lost)
     return GraphScan(
-        T_world_lidar=localised.T_world_lidar,
-        points=points,
-        covariance=localised.covariance,
-        T_prev_curr=estimated.motion.T_prev_curr if measured else None,
-        motion_covariance=estimated.motion.covariance if measured else None,
-        lost=is_lost or not localised.is_connected,
-        belongs_in_map=localised.belongs_in_map,
-        gravity=localised.gravity,
+        T_world_lidar=estimate.T_world_lidar,
+        points=estimate.points,
+        covariance=estimate.covariance,
+        T_prev_curr=odometry.motion.T_prev_curr if measured else None,
+        motion_covariance=odometry.motion.covariance if measured else None,
+        lost=is_lost or not estimate.is_connected,
+        belongs_in_map=estimate.belongs_in_map,
+        gravity=estimate.gravity,
     )

@@ -22,10 +22,20 @@ from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
-from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
+from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, SweepMotion
 
 
-class Localiser(Protocol):
+class Restorable(Protocol):
+    """Carries a state from scan to scan."""
+
+    def state(self) -> State | None:
+        """What it carries; None where it cannot be saved, nor a run resumed."""
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+
+
+class Localiser(Restorable, Protocol):
     """Estimates the pose of one scan after the other."""
 
     @property
@@ -35,31 +45,19 @@ class Localiser(Protocol):
     def sample(self, scan: Scan) -> SampledScan | None:
         """What can be computed of the next scan ahead of its pose, on another thread; None where nothing can."""
 
-    def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
+    def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """The pose of a scan, given the odometry of the next; None after the last."""
-
-    def state(self) -> State:
-        """What it carries from scan to scan."""
-
-    def restore(self, saved: Saved) -> None:
-        """Go on from a state, before the first scan."""
 
 
 @runtime_checkable
-class ScanMapper(Protocol):
+class ScanMapper(Restorable, Protocol):
     """A scan-to-map registration: with a local map, or in a map that is given."""
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map."""
 
-    def state(self) -> State | None:
-        """What it carries from scan to scan, the map included; None where it cannot be saved, nor a run resumed."""
 
-    def restore(self, saved: Saved) -> None:
-        """Go on from a state, before the first scan."""
-
-
-class InertialPrediction(Protocol):
+class InertialPrediction(Restorable, Protocol):
     """An IMU's part in the prior of each scan."""
 
     @property
@@ -71,12 +69,6 @@ class InertialPrediction(Protocol):
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
         """Follow the result of a scan."""
-
-    def state(self) -> State:
-        """What it carries from scan to scan."""
-
-    def restore(self, saved: Saved) -> None:
-        """Go on from a state, before the first scan."""
 
 
 class OdometryAlone(Stateful):
@@ -94,15 +86,16 @@ class OdometryAlone(Stateful):
     def sample(self, scan: Scan) -> None:
         """Nothing."""
 
-    def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
+    def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """Chain the motion, and compare the scan with the previous one."""
         started = time.perf_counter()
-        motion = estimated.motion
+        motion = odometry.motion
         self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
-        sweep = SweepMotion(estimated.velocity, following.velocity if following else None)
-        fit = self._check.check(sweep.compensate(self._check.sample(estimated.scan)), motion.T_prev_curr)
+        sweep = SweepMotion(odometry.velocity, following.velocity if following else None)
+        fit = self._check.check(sweep.compensate(self._check.sample(odometry.scan)), motion.T_prev_curr)
         status, message = _judge(motion, fit)
-        return Localised(
+        return ScanEstimate(
+            stamp=odometry.scan.stamp,
             T_world_lidar=self._T_odom_lidar,
             T_odom_lidar=self._T_odom_lidar,
             covariance=None,
@@ -114,7 +107,10 @@ class OdometryAlone(Stateful):
             residual_m=fit.residual_m,
             inlier_ratio=fit.inlier_ratio,
             degenerate=motion.degenerate,
-            stage_ms={"check": 1e3 * (time.perf_counter() - started)},
+            is_odometry_asked=motion.is_asked,
+            points_read=len(odometry.scan),
+            points_dropped=odometry.scan.dropped,
+            stage_ms=odometry.stage_ms | {"check": 1e3 * (time.perf_counter() - started)},
         )
 
 
@@ -154,11 +150,7 @@ class ScanToMap(Stateful):
         return self._mapper if isinstance(self._mapper, Mapper) else None
 
     def state(self) -> State:
-        """What it carries from scan to scan.
-
-        Raises:
-            OutputError: the mapper's cannot be saved.
-        """
+        """What it carries from scan to scan; OutputError where the mapper's cannot be saved."""
         state = super().state()
         if state["_mapper"] is None:
             raise OutputError("the mapping cannot save its state")
@@ -168,25 +160,26 @@ class ScanToMap(Stateful):
         """The points that are registered and inserted; see `Localiser`."""
         return None if self.mapper is None else self.mapper.sample(scan)
 
-    def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
+    def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """Refine the odometry's pose; where it measured nothing, the mapper predicts with the last velocity."""
         started = time.perf_counter()
-        measured, motion = estimated.interval_s is not None, estimated.motion
-        prior = self._prior(estimated, following)
+        measured, motion = odometry.interval_s is not None, odometry.motion
+        prior = self._prior(odometry, following)
         if self._inertial is not None:
-            prior = self._inertial.prior(estimated.scan, prior)
-        if self.mapper is None or estimated.sampled is None:
-            mapped = self._mapper.process(estimated.scan, prior)
+            prior = self._inertial.prior(odometry.scan, prior)
+        if self.mapper is None or odometry.sampled is None:
+            mapped = self._mapper.process(odometry.scan, prior)
         else:
-            mapped = self.mapper.process_sampled(estimated.sampled, prior)
+            mapped = self.mapper.process_sampled(odometry.sampled, prior)
             if self._elevation is not None:
-                self._elevation.add(estimated.sampled, mapped)
+                self._elevation.add(odometry.sampled, mapped)
         if self._inertial is not None:
-            self._inertial.update(estimated.scan, mapped)
+            self._inertial.update(odometry.scan, mapped)
         expected = inverse(self._T_world_last) @ mapped.T_world_predicted
         self._T_odom_lidar = self._T_odom_lidar @ (motion.T_prev_curr if measured else expected)
         self._T_world_last = mapped.state.T_world_lidar
-        return Localised(
+        return ScanEstimate(
+            stamp=odometry.scan.stamp,
             T_world_lidar=mapped.state.T_world_lidar,
             T_odom_lidar=self._T_odom_lidar,
             covariance=mapped.state.covariance[:6, :6] if mapped.registered else None,
@@ -198,19 +191,23 @@ class ScanToMap(Stateful):
             residual_m=mapped.fit.residual_m if mapped.fit else None,
             inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,
             degenerate=mapped.degenerate,
-            stage_ms={"refine": estimated.stage_ms.get("refine", 0.0) + 1e3 * (time.perf_counter() - started)},
+            is_odometry_asked=motion.is_asked,
+            points_read=len(odometry.scan),
+            points_dropped=odometry.scan.dropped,
+            stage_ms=odometry.stage_ms
+            | {"refine": odometry.stage_ms.get("refine", 0.0) + 1e3 * (time.perf_counter() - started)},
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
             cell_m=None if self.mapper is None else self.mapper.cell_m,
             turn_rate=mapped.turn_rate,
         )
 
-    def _prior(self, estimated: Estimated, following: Estimated | None) -> Prior:
-        smoothed = self._start.get(estimated.scan.stamp)
-        before = smoothed or estimated
+    def _prior(self, odometry: ScanOdometry, following: ScanOdometry | None) -> Prior:
+        smoothed = self._start.get(odometry.scan.stamp)
+        before = smoothed or odometry
         after = None if following is None else self._start.get(following.scan.stamp) or following
-        velocity = SweepMotion(before.velocity, after.velocity if after else None).mean(estimated.scan)
-        motion = smoothed or estimated.motion
+        velocity = SweepMotion(before.velocity, after.velocity if after else None).mean(odometry.scan)
+        motion = smoothed or odometry.motion
         return Prior(None if before.interval_s is None else motion.T_prev_curr, velocity, motion.covariance)
 
 

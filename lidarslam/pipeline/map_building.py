@@ -1,36 +1,19 @@
 """Building the global map: each scan is added one scan late, once the motion it was deskewed with is confirmed."""
 
 import logging
-from dataclasses import dataclass
-from typing import Annotated
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
-from lidarslam.core.state import TRANSFORM, Saved, Shape, Stateful
+from lidarslam.core.state import Saved, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.consistency import ConsistencyCheck
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.pipeline.estimates import Localised, SweepMotion
+from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class PendingScan:
-    """A scan on its way into the global map."""
-
-    number: int  # its index in the run, from 0
-    thinned: Scan  # its points within the map's range, one a voxel, as read
-    motion: SweepMotion  # the motion it was deskewed with
-    points: Annotated[FloatArray, Shape(None, 3)]  # of those, deskewed, in the LiDAR frame at the stamp
-    T_world_lidar: Annotated[FloatArray, TRANSFORM]
-
-    def __post_init__(self) -> None:
-        if len(self.points) != len(self.thinned):
-            raise ValueError(f"{len(self.points)} deskewed points of {len(self.thinned)}")
 
 
 class MapBuilder(Stateful):
@@ -46,7 +29,8 @@ class MapBuilder(Stateful):
     global_map: GlobalMap | None  # None until a scan was added
     views: Views  # range images of some scans, for the removal of moving objects
     slides: ConsistencyCheck  # pairs of scans, for the detection of slips
-    _pending: PendingScan | None
+    # on its way into the map: its points within the map's range, one a voxel, as read; and its pose
+    _pending: tuple[Scan, ScanEstimate] | None
     _scans: int
 
     def __init__(self, config: GlobalMapConfig, store: TileStore | None = None) -> None:
@@ -60,18 +44,9 @@ class MapBuilder(Stateful):
         self.slides = ConsistencyCheck()
 
     def restore(self, saved: Saved) -> None:
-        """Go on from a state.
-
-        Raises:
-            InputError: it is damaged, or the file of the tiles is.
-        """
+        """Go on from a state; InputError where it is damaged, or the file of the tiles is."""
         self.global_map = self._new_map(1.0) if saved.has("global_map") else None
         super().restore(saved)
-
-    @property
-    def scans(self) -> int:
-        """How many came."""
-        return self._scans
 
     def _new_map(self, voxel_size_m: float) -> GlobalMap:
         return GlobalMap(voxel_size_m, self._config.most_points, self._store)
@@ -89,10 +64,9 @@ class MapBuilder(Stateful):
         squared = squared_ranges(thinned.points)
         return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
 
-    def add(self, thinned: Scan, points: FloatArray, localised: Localised) -> None:
+    def add(self, thinned: Scan, estimate: ScanEstimate) -> None:
         """Take the next scan; it enters the map with `add_pending`, if its pose is good enough."""
-        if localised.belongs_in_map:
-            self._pending = PendingScan(self._scans, thinned, localised.motion, points, localised.T_world_lidar)
+        self._pending = (thinned, estimate) if estimate.belongs_in_map else None
         self._scans += 1
 
     def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray, float, PointAttributes] | None:
@@ -101,15 +75,16 @@ class MapBuilder(Stateful):
         Where tracking was lost right after it, the motion after its stamp is unknown: it is deskewed again with the
         motion before.
         """
-        scan, self._pending = self._pending, None
-        if scan is None or self.voxel_size_m is None:  # no scan had a point so far
+        pending, self._pending = self._pending, None
+        if pending is None or self.voxel_size_m is None:  # no scan had a point so far
             return None
-        points = SweepMotion(scan.motion.before, None).compensate(scan.thinned) if next_is_lost else scan.points
+        thinned, estimate = pending
+        points = SweepMotion(estimate.motion.before, None).compensate(thinned) if next_is_lost else estimate.points
         if self.global_map is None:
             self.global_map = self._new_map(self.voxel_size_m)
-        attributes = scan.thinned.attributes(self._config.fields)
-        self.global_map.add(points, scan.T_world_lidar, attributes)
-        self.slides.add(points, scan.number, scan.T_world_lidar)
+        number, attributes = self._scans - 1, thinned.attributes(self._config.fields)
+        self.global_map.add(points, estimate.T_world_lidar, attributes)
+        self.slides.add(points, number, estimate.T_world_lidar)
         if self._config.leave_out_moved:
-            self.views.add(points, scan.number)
-        return points, scan.T_world_lidar, self.voxel_size_m, attributes
+            self.views.add(points, number)
+        return points, estimate.T_world_lidar, self.voxel_size_m, attributes

@@ -15,7 +15,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Shape, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.interface import Motion, SkippingOdometry
-from lidarslam.pipeline.estimates import Localised
+from lidarslam.pipeline.estimates import ScanEstimate
 
 # Scans in a row that have to be ok before one goes without the odometry.
 _LEAST_OK = 10
@@ -51,7 +51,7 @@ class OdometryGate(Stateful):
 
     def __init__(self, odometry: SkippingOdometry) -> None:
         self._odometry = odometry
-        self._waiting: deque[tuple[float, Callable[[], Localised]]] = deque()
+        self._waiting: deque[Callable[[], ScanEstimate]] = deque()
         self._ok, self._error_m, self._cell_m = 0, 0.0, 0.0
         self._stamp = self._interval_s = self._T_world_last = self._velocity = None
         self._last_stamp = 0.0
@@ -71,9 +71,9 @@ class OdometryGate(Stateful):
         while self._may_be_skipped() and self._waiting:
             self._take()
 
-    def follow(self, stamp: float, localised: Callable[[], Localised]) -> None:
+    def follow(self, estimate: Callable[[], ScanEstimate]) -> None:
         """Take the result of the next scan, which is computed on another thread."""
-        self._waiting.append((stamp, localised))
+        self._waiting.append(estimate)
         if len(self._waiting) > _MOST_WAITING:
             self._take()
 
@@ -97,18 +97,17 @@ class OdometryGate(Stateful):
         return self._ok + len(self._waiting) >= _LEAST_OK and error_m < _LARGEST_ERROR * self._cell_m
 
     def _take(self) -> None:
-        stamp, result = self._waiting.popleft()
-        localised = result()
-        self._cell_m = localised.cell_m or 0.0
-        if localised.status is not Status.OK or not localised.is_connected:
+        estimate = self._waiting.popleft()()
+        self._cell_m = estimate.cell_m or 0.0
+        if estimate.status is not Status.OK or not estimate.is_connected:
             self._ok, self._T_world_last, self._velocity = 0, None, None
             return
-        before, self._T_world_last = self._T_world_last, localised.T_world_lidar
-        interval_s, self._last_stamp = stamp - self._last_stamp, stamp
+        before, self._T_world_last = self._T_world_last, estimate.T_world_lidar
+        interval_s, self._last_stamp = estimate.stamp - self._last_stamp, estimate.stamp
         if before is None:
             self._ok = 1
             return
-        motion = log(inverse(before) @ localised.T_world_lidar)
+        motion = log(inverse(before) @ estimate.T_world_lidar)
         if self._velocity is not None:
             error = log(inverse(exp(self._velocity * interval_s)) @ exp(motion))
             error_m = float(np.linalg.norm(error[3:]) + _RANGE_M * np.linalg.norm(error[:3]))

@@ -7,9 +7,10 @@ graph on a fourth.
 
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from typing import Protocol
 
 from threadpoolctl import threadpool_limits
@@ -17,18 +18,28 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
+from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.pose_graph.keyframes import GraphScan
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline import threads
-from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, graph_scan
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
-from lidarslam.pipeline.stages import Stages
+from lidarslam.pipeline.map_correction import MapCorrection
+from lidarslam.pipeline.odometry_gate import OdometryGate
+from lidarslam.pipeline.threads import BackgroundWorker
 
-# Scans that may wait for the map, which now and then takes as long as several scans.
+# Scans that may wait for the map, which now and then takes as long as several scans; to bound the memory they hold.
 _SCANS_BEHIND = 8
+# Calls that may wait for the graph, which takes as long for a loop closure as for all scans up to the next keyframe.
+_GRAPH_CALLS_BEHIND = 64
+
+Take = Callable[[ScanEstimate, float], None]
+"""Called with a scan that is in the map, and the milliseconds from its arrival to its pose."""
 
 
 class Checkpointer(Protocol):
@@ -44,16 +55,22 @@ class Checkpointer(Protocol):
 class Pipeline(Stateful):
     """Turns a stream of scans into a stream of poses, a global map and a pose graph.
 
+    Recorded scans go through `run`; scans that come one after the other through `register`, which returns the pose at
+    once. The state is without that of odometry and graph.
+
     Args:
         odometry, localiser: estimate the poses.
         config: of the global map.
         graph: built along the way; complete when the last result has come.
-        checkpointer: saves the state now and then, without that of odometry and graph.
+        checkpointer: saves the state now and then.
         store: of the global map, see `MapBuilder`.
     """
 
-    _stages: Stages
-    held: Estimated | None  # the last scan that was read: its result waits for the next one
+    map: MapBuilder  # the global map, and what is kept beside it
+    held: ScanOdometry | None  # the last scan that `run` has read: its result waits for the next one
+    _localiser: Localiser
+    _correction: MapCorrection | None
+    _measured_stamp: float | None  # of the last scan, unless its motion was only predicted
 
     def __init__(
         self,
@@ -64,66 +81,153 @@ class Pipeline(Stateful):
         checkpointer: Checkpointer | None = None,
         store: TileStore | None = None,
     ) -> None:
-        self._stages = Stages(odometry, localiser, config, graph, store)
+        self._odometry, self._localiser, self._graph = odometry, localiser, graph
         self._checkpointer = checkpointer
+        self._map_worker = BackgroundWorker("map", _SCANS_BEHIND)
+        self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
+        mapper = localiser.mapper
+        self._correction = None if graph is None or mapper is None or not mapper.kept_scans else MapCorrection(mapper)
+        self._measured_stamp = None
+        self.map = MapBuilder(config, store)
         self.held = None
         self._error: LidarSlamError | None = None  # that ended the scans
 
-    @property
-    def map(self) -> MapBuilder:
-        """The global map, and what is kept beside it."""
-        return self._stages.map
-
-    def run(self, scans: Iterable[Scan]) -> Generator[ScanResult, None, None]:
+    def run(self, scans: Iterable[Scan]) -> Generator[ScanEstimate, None, None]:
         """Process the scans in order; each result comes while later scans' odometry is at work.
 
         An error of the reader is raised after the results of the scans before it.
         """
-        jobs: deque[Future[ScanResult]] = deque()
+        jobs: deque[Future[ScanEstimate]] = deque()
         # Matrices are small: BLAS threads would mostly wait, and take the cores from the other threads.
         with (
-            closing(self._stages),
+            closing(self),
             threadpool_limits(1, "blas"),
             ThreadPoolExecutor(1, "map") as mapping,
             ThreadPoolExecutor(1, "registration") as registration,
         ):
 
-            def submit(estimated: Estimated, following: Estimated | None) -> None:
-                localised = registration.submit(self._stages.localise, estimated, following)
-                self._stages.follow(estimated, localised.result)
-                jobs.append(mapping.submit(self._build, estimated, localised))
+            def submit(odometry: ScanOdometry, following: ScanOdometry | None) -> None:
+                estimate = registration.submit(self._localise, odometry, following)
+                self._follow(estimate.result)
+                jobs.append(mapping.submit(lambda: self._build(odometry, estimate.result())))
 
-            for number, estimated in enumerate(self._estimate(scans), start=1):
+            for number, odometry in enumerate(self._estimate_all(scans), start=1):
                 if number % threads.EVERY_SCANS == 0:
                     threads.return_free_memory()
-                previous, self.held = self.held, estimated
+                previous, self.held = self.held, odometry
                 if previous is None:
                     continue
-                submit(previous, estimated)
+                submit(previous, odometry)
                 while jobs and (jobs[0].done() or len(jobs) > _SCANS_BEHIND):
                     yield jobs.popleft().result()
                 if self._checkpointer is not None and self._checkpointer.is_due():
                     while jobs:
                         yield jobs.popleft().result()
-                    self._stages.wait_for_graph()
+                    self._graph_worker.wait()
                     self._checkpointer.save(self)
             if self.held is not None:
                 submit(self.held, None)
             while jobs:
                 yield jobs.popleft().result()
-            self._stages.finish()
+            self.finish()
         if self._error is not None:
             raise self._error
 
-    def _estimate(self, scans: Iterable[Scan]) -> Iterator[Estimated]:
+    def register(self, scan: Scan, started: float, take: Take) -> ScanEstimate:
+        """The pose of the next scan at once; the map follows in the background.
+
+        Args:
+            scan: the next one.
+            started: reading of `time.perf_counter` when it arrived.
+            take: called on the thread of the map.
+        """
+        odometry = self._estimate(scan, _ms_since(started))
+        estimate = self._localise(odometry, None)
+        self._follow(lambda: estimate)
+        total_ms = _ms_since(started)
+        self._map_worker.submit(lambda: take(self._build(odometry, estimate), total_ms))
+        return estimate
+
+    def settle(self) -> None:
+        """Wait until all registered scans are in the map and the graph, and raise an error of theirs."""
+        self._map_worker.wait()
+        self._add_pending()
+        self._graph_worker.wait()
+
+    def finish(self) -> None:
+        """As `settle`, and look at the last pair of scans; more may follow."""
+        self.settle()
+        self.map.slides.finish()
+
+    def close(self) -> None:
+        """Wait for map and graph, and end their threads."""
+        with closing(self._graph_worker), closing(self._map_worker):
+            pass
+
+    def _estimate_all(self, scans: Iterable[Scan]) -> Iterator[ScanOdometry]:
         """The odometry of one scan after the other; an error ends them and is kept."""
         started = time.perf_counter()
         try:
             for scan in scans:
-                yield self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
+                yield self._estimate(scan, _ms_since(started))
                 started = time.perf_counter()
         except LidarSlamError as error:
             self._error = error
 
-    def _build(self, estimated: Estimated, localised: Future[Localised]) -> ScanResult:
-        return self._stages.build(estimated, localised.result())
+    def _estimate(self, scan: Scan, read_ms: float) -> ScanOdometry:
+        """The odometry of the next scan, which took so long to read; thinned for registration, which is busier."""
+        started = time.perf_counter()
+        sampled = self._localiser.sample(scan)
+        stage_ms = {"read": read_ms, "refine": _ms_since(started)}
+        if isinstance(self._odometry, OdometryGate):
+            self._odometry.wait()
+        started = time.perf_counter()
+        motion = self._odometry.estimate(scan)
+        stage_ms["odometry"] = _ms_since(started)
+        measured, previous = motion.failure is None, self._measured_stamp
+        interval_s = scan.stamp - previous if measured and previous is not None else None
+        self._measured_stamp = scan.stamp if measured or not motion.is_asked else None
+        return ScanOdometry(scan, motion, interval_s, stage_ms, sampled)
+
+    def _follow(self, estimate: Callable[[], ScanEstimate]) -> None:
+        """Let the odometry know the pose of the next scan, which may be computed on another thread."""
+        if isinstance(self._odometry, OdometryGate):
+            self._odometry.follow(estimate)
+
+    def _localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
+        """The pose of a scan; the odometry of the following one gives the motion after the stamp, where it is known."""
+        if self._correction is not None:
+            self._correction.before_scan()
+        return self._localiser.localise(odometry, following)
+
+    def _build(self, odometry: ScanOdometry, estimate: ScanEstimate) -> ScanEstimate:
+        """Deskew a scan, add the scan before to the map, and both to the graph."""
+        started = time.perf_counter()
+        thinned = self.map.thin(odometry.scan)
+        estimate = replace(estimate, points=estimate.motion.compensate(thinned))
+        deskew_ms, started = _ms_since(started), time.perf_counter()
+        self._add_pending(next_is_lost=estimate.status is Status.LOST)
+        self.map.add(thinned, estimate)
+        if self._graph is not None:
+            arrived = graph_scan(odometry, estimate)
+            cell_m = None if self._correction is None else estimate.cell_m
+            drawing = self._graph_worker.submit(_give, self._graph, arrived, cell_m)
+            if self._correction is not None:
+                self._correction.add(drawing)
+        return replace(estimate, stage_ms=estimate.stage_ms | {"deskew": deskew_ms, "map": _ms_since(started)})
+
+    def _add_pending(self, next_is_lost: bool = False) -> None:
+        """Add the last scan to the map, unless it is in there."""
+        added = self.map.add_pending(next_is_lost)
+        if added is not None and self._graph is not None:
+            self._graph_worker.submit(self._graph.draw, *added)
+
+
+def _give(graph: KeyframeGraph, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
+    """Give the graph a scan; the local map of surfels, where there is one and loop closures change it."""
+    graph.add(scan)
+    return None if cell_m is None else graph.redrawn_local_map(cell_m)
+
+
+def _ms_since(started: float) -> float:
+    return 1e3 * (time.perf_counter() - started)

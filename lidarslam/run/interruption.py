@@ -7,14 +7,13 @@ import signal
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator
 from types import FrameType
 from typing import Any
 
 logger = logging.getLogger(__name__)
 
 _REQUESTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)  # of a program that does not handle them
 # Requests while results are written: so many, each at least so long after the one before, abandon them. A key that is
 # held down or hit repeatedly is one request.
 _INSISTENT = 3
@@ -45,20 +44,32 @@ def _is_postponed(number: int, frame: FrameType | None) -> bool:
 
 
 @contextlib.contextmanager
-def ended_like_interrupted() -> Iterator[None]:
-    """For the time of the block; a signal that is ignored, as with `nohup`, stays ignored."""
+def handling(handle: Callable[[int, FrameType | None], Any], replaced: Container[Any] | None = None) -> Iterator[None]:
+    """Handle requests to end for the time of the block, in place of these handlers, or of any.
+
+    A signal that is ignored, as with `nohup`, stays ignored.
+    """
     if threading.current_thread() is not threading.main_thread():  # signals go to the main thread
         yield
         return
-    earlier = [(number, signal.getsignal(number)) for number in _REQUESTS]
-    taken = [(number, handler) for number, handler in earlier if handler in _DEFAULTS]
-    for number, _ in taken:
-        signal.signal(number, interrupt)
+    earlier = {number: signal.getsignal(number) for number in _REQUESTS}
+    taken = {
+        number: handler
+        for number, handler in earlier.items()
+        if handler is not signal.SIG_IGN and (replaced is None or handler in replaced)
+    }
+    for number in taken:
+        signal.signal(number, handle)
     try:
         yield
     finally:
-        for number, handler in taken:
+        for number, handler in taken.items():
             signal.signal(number, handler)
+
+
+def ended_like_interrupted() -> contextlib.AbstractContextManager[None]:
+    """For the time of the block, all requests raise KeyboardInterrupt."""
+    return handling(interrupt, (signal.SIG_DFL, signal.default_int_handler))  # of a program that does not handle them
 
 
 class Interruptions:
@@ -70,20 +81,14 @@ class Interruptions:
     def __init__(self) -> None:
         self._is_writing = False
         self._insisted, self._last_s = 0, -_APART_S
-        self._taken: dict[int, Any] = {}  # the handlers to put back
+        self._handling = handling(self._handle, (interrupt, signal.default_int_handler))
 
     def __enter__(self) -> "Interruptions":
-        if threading.current_thread() is threading.main_thread():
-            earlier = {number: signal.getsignal(number) for number in _REQUESTS}
-            raising = (interrupt, signal.default_int_handler)
-            self._taken = {number: handler for number, handler in earlier.items() if handler in raising}
-            for number in self._taken:
-                signal.signal(number, self._handle)
+        self._handling.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._taken.items():
-            signal.signal(number, handler)
+        self._handling.__exit__(None, None, None)
 
     def protect_results(self) -> None:
         """From here on no request ends anything, unless it is insistent."""

@@ -11,7 +11,6 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
-from lidarslam.core.state import Saved
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.loops.closure import GivenLoops, LoopClosure, RelativePose
 from lidarslam.run.scan_log import ScanLog
@@ -90,18 +89,6 @@ def begin_graph(
 
     local_radius_m = config.mapping.radius_m if config.mapping.enabled else 0.0
     return SlamGraph(config.pose_graph, directory, file, local_radius_m, given)
-
-
-def restore_graph(config: Config, saved: Saved, file: Path, given: GivenLoops | None = None) -> "SlamGraph | None":
-    """A pose graph with a state, whose submaps lie in the file.
-
-    Raises:
-        InputError: one of them is damaged.
-    """
-    graph = begin_graph(config, file=file, takes_gnss=True, given=given)
-    if graph is not None:
-        graph.restore(saved)
-    return graph
 
 
 def close_loops(

@@ -13,7 +13,7 @@ from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
 
 if TYPE_CHECKING:  # what a bar does not need takes a while to load
-    from lidarslam.pipeline.estimates import ScanResult
+    from lidarslam.pipeline.estimates import ScanEstimate
 
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
 
@@ -60,7 +60,7 @@ class RunProgress:
         self._task = bar.add_task(one_line(name), total=None, state="")
         self._lost = 0
 
-    def __call__(self, number: int, total: int, result: "ScanResult") -> None:
+    def __call__(self, number: int, total: int, result: "ScanEstimate") -> None:
         """Show that a scan is done, its number from 1, and how many there are."""
         self._lost += result.status is Status.LOST
         lost = f" [red]{self._lost} lost[/]" if self._lost else ""

@@ -1,33 +1,88 @@
 """The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from lidarslam.config.settings import Config, dump_yaml
-from lidarslam.core.errors import OutputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_own_folder
 from lidarslam.core.geometry import inverse
 from lidarslam.core.text import count
-from lidarslam.core.trajectory import format_kitti, format_tum
+from lidarslam.core.trajectory import Trajectory, format_kitti, format_tum
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat
-from lidarslam.mapping.consistency import find_contradictions
+from lidarslam.mapping.consistency import PairTest, find_contradictions
 from lidarslam.mapping.global_map.drawing import DrawnMap, TiledMap, drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
-from lidarslam.mapping.global_map.moved_points import PlacedViews
+from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.tile_store import Tile
 from lidarslam.mapping.pose_graph.correction import format_g2o
+from lidarslam.pipeline.map_building import MapBuilder
+from lidarslam.run.elevation import Elevation
 from lidarslam.run.loop_closing import GraphOutcome
+from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
-from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import MAP_INDEX, MAP_TILES, RunDirectory
 
 logger = logging.getLogger(__name__)
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedScans:
+    """The scans of a recording after the pipeline; a merge keeps them on disk."""
+
+    log: ScanLog
+    asked: int  # number of scans that were asked for
+    faults: Faults  # what was left out of them, and what is wrong with them
+    views: Views  # range images of some scans, for the removal of moving objects
+    slides: list[PairTest]  # pairs of scans, for the detection of slips
+    stopped: str | None = None  # why they ended before the last one
+    interrupted: bool = False  # whether that was an interruption
+
+    @classmethod
+    def of(
+        cls,
+        log: ScanLog,
+        faults: Faults,
+        built: MapBuilder,
+        asked: int | None = None,
+        error: InputError | KeyboardInterrupt | None = None,
+    ) -> "TrackedScans":
+        """All that came, unless another number was asked for; `error` ended them early."""
+        stopped = None if error is None else str(error) or "interrupted"
+        asked = len(log) + faults.left_out if asked is None else asked
+        return cls(log, asked, faults, built.views, built.slides.tests, stopped, isinstance(error, KeyboardInterrupt))
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What results are written of."""
+
+    scans: TrackedScans
+    global_map: GlobalMap | None = None  # of the poses before loop closure; None when no scan was added
+    # recording, truth: of the scans, and its ground truth; scans may come from elsewhere
+    recording: Recording | None = None
+    truth: Trajectory | None = None
+    elevation: Elevation | None = None  # the error of the sensor's elevations; None where nothing shows it
+
+
+def unless_damaged(read: Callable[[], T], log: ScanLog, consequence: str) -> T | None:
+    """Something that came with the recording; None and a warning where it is damaged."""
+    try:
+        return read()
+    except InputError as error:
+        log.warn(f"{consequence}: {error}")
+        return None
 
 
 @dataclass(frozen=True)
@@ -38,14 +93,6 @@ class RunOutcome:
     metrics: TrajectoryMetrics | None  # its errors; None without ground truth
     stopped: str | None = None  # why it ended before its last scan, None when it did not
     is_resumable: bool = False  # whether it can be continued from a checkpoint
-
-
-def final_map(
-    tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig, directory: RunDirectory | None = None
-) -> DrawnMap:
-    """The map of a run whose poses are final; a pose graph has drawn it anew. Tiles go to the directory."""
-    views = tracked.views.placed(tracked.log.trajectory.T_world_lidar)
-    return draw(tracked.global_map if closed is None else closed.global_map, views, config, directory)
 
 
 def draw(
@@ -63,27 +110,39 @@ def draw(
     return drawn
 
 
+def corrected_map(
+    tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig, directory: RunDirectory | None = None
+) -> DrawnMap:
+    """The map of a run whose poses are final, which a pose graph may have drawn. Tiles go to the directory."""
+    views = tracked.scans.views.placed(tracked.scans.log.trajectory.T_world_lidar)
+    return draw(tracked.global_map if closed is None else closed.global_map, views, config, directory)
+
+
 def write_results(
     directory: RunDirectory,
     config: Config,
     described: dict[str, Any],
     tracked: Tracked,
-    closed: GraphOutcome | None,
-    drawn: DrawnMap,
+    closed: GraphOutcome | None = None,
     map_formats: Sequence[MapFormat] = (),
+    show: Callable[[DrawnMap], None] = lambda _: None,
 ) -> RunOutcome:
-    """Write everything; the poses are final. A map that cannot be written costs no other file.
+    """Draw the map, and write everything; the poses are final. A map that cannot be written costs no other file.
 
     Args:
         directory: of the run.
         config, described: the settings, and what was run, for config.yaml.
-        tracked, closed, drawn: the results.
+        tracked, closed: the results.
         map_formats: further formats of the map.
+        show: called with the map.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    log, failed = tracked.log, drawn.failure
+    scans, log = tracked.scans, tracked.scans.log
+    drawn = corrected_map(tracked, closed, config.global_map, directory)
+    show(drawn)
+    failed = drawn.failure
     if failed is not None:
         log.warn(f"the map is an overview without its tiles: {failed}")
     logger.info("writing the results of %s", count(len(log), "scan"))
@@ -97,18 +156,18 @@ def write_results(
     except OutputError as error:
         written, failed = WrittenMap(0, drawn.voxel_size_m, drawn.moved), error
         log.warn(f"there is no map: {error}")
-    log.warnings.extend(tracked.faults.warnings())
+    log.warnings.extend(scans.faults.warnings())
     if drawn.warning is not None:
         log.warn(drawn.warning)
     if drawn.cloud is not None and not len(drawn.cloud):
         log.warn("the map is empty: min_range_m, max_range_m and min_hits of global_map leave no point")
-    skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
-    contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
+    skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out
+    contradictions = find_contradictions(scans.slides, log.trajectory.T_world_lidar)
     summary = summarise(log, written, skipped, closed, contradictions, tracked.elevation)
     directory.write_json(files.SUMMARY, summary.to_json())
     if failed is not None:
         raise OutputError(f"{failed}; the other results are there") from failed
-    return RunOutcome(summary, metrics, tracked.stopped)
+    return RunOutcome(summary, metrics, scans.stopped)
 
 
 def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFormat] = ()) -> WrittenMap:
@@ -128,7 +187,7 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFor
 
 def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:
     """Write final poses and odometry, and metrics.json where there is ground truth."""
-    log, recording, truth = tracked.log, tracked.recording, tracked.truth
+    log, recording, truth = tracked.scans.log, tracked.recording, tracked.truth
     trajectory = log.trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
@@ -185,11 +244,7 @@ class TileWriter:
         }
 
     def finish(self, tiled: TiledMap) -> None:
-        """Write the index.
-
-        Raises:
-            OutputError: it could not be written.
-        """
+        """Write the index; OutputError where it could not be written."""
         index = {
             "frame": "world",  # of trajectory.tum
             "tile_edge_m": round(tiled.tiling.edge_m, 9),

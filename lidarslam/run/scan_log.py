@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.estimates import STAGES, ScanResult
+from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.storage.directory import SIGMAS
 
 COLUMNS = (
@@ -66,7 +66,7 @@ class ScanLog(Stateful):
     def __len__(self) -> int:
         return len(self._rows) // _ROW.itemsize
 
-    def add(self, result: ScanResult, total_ms: float = 0.0) -> None:
+    def add(self, result: ScanEstimate, total_ms: float = 0.0) -> None:
         """Log one scan; `total_ms` is the wall time since the scan before was done."""
         row = (
             result.stamp,

@@ -40,10 +40,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield _loops(summary.graph)
     if outcome.metrics is not None:
         yield from _accuracy(outcome.metrics)
-    for warning in summary.warnings:
-        yield f"warning: {warning}"
-    yield from _lost(summary)
-    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
+    yield from format_end(out, summary)
     yield f"next: {command_line(as_typed('lidarslam'), 'view', str(out))}"
     if outcome.metrics is not None:
         yield f"      {command_line(as_typed('lidarslam'), 'evaluate', str(out))}"
@@ -105,7 +102,10 @@ def _accuracy(metrics: TrajectoryMetrics) -> Iterator[str]:
     yield from (f"{name}: {text}" for name, text in metrics.plugin_lines())
 
 
-def _lost(summary: RunSummary) -> Iterator[str]:
+def format_end(out: Path, summary: RunSummary) -> Iterator[str]:
+    """Warnings, lost scans, and where the files are."""
+    for warning in summary.warnings:
+        yield f"warning: {warning}"
     for stretch in summary.lost[:_LISTED]:
         yield f"LOST on {scan_span(stretch.first, stretch.last)}: {stretch.reason}"
     if more := max(0, len(summary.lost) - _LISTED):
@@ -113,3 +113,4 @@ def _lost(summary: RunSummary) -> Iterator[str]:
     if summary.lost_scans:
         share = f"{summary.lost_scans:,} of {count(summary.scans, 'scan')}"
         yield f"tracking was lost on {share}; {SUMMARY} and {SCANS_CSV} list them"
+    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"

@@ -45,11 +45,7 @@ def latest_run() -> Path | None:
 
 
 def unfinished_run(source: Path, sequence: str | None = None) -> Path:
-    """The only unfinished run of a recording in `runs`.
-
-    Raises:
-        InputError: there is none, or there are several.
-    """
+    """The only unfinished run of a recording in `runs`; InputError where there is none, or there are several."""
     found = [path for path in sorted(RUNS.glob("*/")) if _is_of(path, source, sequence)]
     if not found:
         raise InputError(

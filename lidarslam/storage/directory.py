@@ -125,11 +125,7 @@ class RunDirectory:
         self._written.add(name)
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a text file.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+        """Write a text file; OutputError where it cannot be written."""
         try:
             with self.replacing(name) as partial:
                 partial.write_text(text, encoding="utf-8", newline="", errors="backslashreplace")

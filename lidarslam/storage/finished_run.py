@@ -98,11 +98,7 @@ def is_run(path: Path) -> bool:
 
 
 def load_run(path: Path) -> FinishedRun:
-    """Read a run directory.
-
-    Raises:
-        InputError: there is no run, or a file of it is damaged.
-    """
+    """Read a run directory; InputError where there is no run, or a file of it is damaged."""
     trajectory = read_trajectory(path)
     statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
     lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
@@ -278,11 +274,7 @@ def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """The content of a run's summary.json, empty when there is none.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """The content of a run's summary.json, empty when there is none; InputError where it is damaged."""
     file = path / SUMMARY
     if not file.is_file():
         return {}

@@ -14,8 +14,7 @@ from lidarslam.core.files import ONE_READER, cannot_write, replacing
 from lidarslam.core.json_text import ANY_OBJECT, parse_json
 from lidarslam.core.state import Saved, State
 
-# An .npz file holds a checksum of each of its members, and is refused without its end. They are not compressed: the
-# size of the file bounds what it takes to read it.
+# An .npz file holds a checksum of each of its members, and is refused without its end.
 _TREE, _ARRAY = "tree", "array"
 _DAMAGE = (
     OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, NotImplementedError, RuntimeError,
@@ -43,15 +42,9 @@ def write_state(path: Path, state: State) -> None:
 
 
 def read_state(path: Path) -> Saved:
-    """Read what `write_state` wrote.
-
-    Raises:
-        InputError: there is no such file, or it is damaged.
-    """
+    """Read what `write_state` wrote; InputError where there is no such file, or it is damaged."""
     try:
         with ONE_READER, np.load(path, allow_pickle=False) as file:
-            if any(member.compress_type != zipfile.ZIP_STORED for member in file.zip.infolist()):
-                raise ValueError("its arrays are compressed")
             values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT, any_number=True), file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

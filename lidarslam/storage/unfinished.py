@@ -9,8 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ConfigDict, NonNegativeInt, TypeAdapter, with_config
-from typing_extensions import TypedDict
+from pydantic import TypeAdapter
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
@@ -28,24 +27,6 @@ _LISTED = 3
 Standing = Literal["at work", "stopped", "over an earlier run"]
 
 
-@with_config(ConfigDict(extra="allow"))
-class _Description(TypedDict, total=False):
-    source: str
-    reader: dict[str, Any]
-    merge: Literal["all", "part"]
-    sources: list[str]
-    parts: list[str]
-
-
-class _About(TypedDict):
-    description: _Description
-    standing: Standing
-    resumed_after: list[NonNegativeInt]
-
-
-_SHAPE = TypeAdapter(_About)
-
-
 @dataclass(frozen=True)
 class About:
     """Which run is unfinished; the content of run.json."""
@@ -56,15 +37,10 @@ class About:
 
     @classmethod
     def read(cls, run: Path) -> "About | None":
-        """Of the run in a directory; None where none is unfinished.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Of the run in a directory; None where none is unfinished; InputError where the file is damaged."""
         path = run / ABOUT
         try:
-            values = read_json(path, _SHAPE, any_path=True)
-            return cls({**values["description"]}, values["standing"], tuple(values["resumed_after"]))
+            return read_json(path, TypeAdapter(About), any_path=True)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError) as error:
@@ -90,7 +66,7 @@ class About:
                 f"this run did not finish; resume it with lidarslam run {source} --out {run} --resume"
                 " and the options it was begun with"
             )
-        sources = " ".join(self.description.get("sources", ["SOURCE..."]))
+        sources = " ".join(self.description["sources"])
         out = run if self.description["merge"] == "all" else run.parent
         return (
             f"this merge did not finish; resume it with lidarslam merge {sources} --out {out} --resume"
@@ -145,52 +121,27 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-@dataclass(frozen=True)
 class CheckpointFiles:
-    """The files of a run's checkpoint, there or not."""
+    """The files of a run's checkpoint, there or not.
 
-    run: Path  # the directory of the run
+    Attributes:
+        run, folder: the directory of the run, and in it that of the other files.
+        state, submaps, tiles: after the last scans; of the pose graph; of the global map.
+        tracked: a recording of a merge that was tracked.
+    """
 
-    @property
-    def folder(self) -> Path:
-        """Where the others lie."""
-        return self.run / UNFINISHED
-
-    @property
-    def state(self) -> Path:
-        """The state after the last scans."""
-        return self.run / STATE
-
-    @property
-    def submaps(self) -> Path:
-        """The submaps of the pose graph."""
-        return self.folder / "submaps.bin"
-
-    @property
-    def tiles(self) -> Path:
-        """The tiles of the global map."""
-        return self.folder / "tiles.bin"
-
-    @property
-    def tracked(self) -> Path:
-        """A recording of a merge that was tracked."""
-        return self.folder / "tracked.npz"
+    def __init__(self, run: Path) -> None:
+        self.run, self.folder, self.state = run, run / UNFINISHED, run / STATE
+        self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"
+        self.tracked = self.folder / "tracked.npz"
 
     def require_own(self) -> None:
-        """Before anything is resumed from them, or locked.
-
-        Raises:
-            InputError: their folder is a link.
-        """
+        """Before anything is resumed from them, or locked; InputError where their folder is a link."""
         if self.folder.is_symlink():
             raise InputError(f"{self.folder}: is a link to another place; begin again with --overwrite")
 
     def make_folder(self) -> None:
-        """Make the folder, unless it exists; a link there is replaced.
-
-        Raises:
-            OutputError: it cannot be made.
-        """
+        """Make the folder, unless it exists; a link there is replaced; OutputError where it cannot be made."""
         try:
             make_own_folder(self.folder)
         except OSError as error:
@@ -306,11 +257,6 @@ class Unfinished:
             replace(self.about, standing="stopped").write(self.run)
         else:
             self.files.remove()
-
-    def remove_checkpoint(self) -> None:
-        """All scans are tracked: nothing goes on from the state."""
-        for path in (self.files.state, self.files.tiles):
-            path.unlink(missing_ok=True)
 
 
 def _holds_results(run: Path) -> bool:

@@ -1,11 +1,9 @@
 """The data of a training: recordings and simulations, prepared once, also side by side, and kept on disk."""
 
-import contextlib
 import hashlib
 import json
 import random
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,6 +28,7 @@ from lidarslam.odometry.network.checkpoint import Kind, read_tensor_file, write_
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.training.preparation import PreparedRecording, prepare
 from lidarslam.pipeline.threads import in_order
+from lidarslam.run.interruption import handling
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredients_of, mixture
 
@@ -103,11 +102,7 @@ class Stretch:
 
 
 def recorded(source: Path, reader: ReaderConfig) -> Stretch:
-    """All of a recording.
-
-    Raises:
-        InputError: it cannot be read, or has fewer than two scans.
-    """
+    """All of a recording; InputError where it cannot be read, or has fewer than two scans."""
     recording = open_recording(source, reader)
     if len(recording) < 2:
         raise InputError(f"{source}: training needs pairs of scans, this recording has {len(recording)}")
@@ -278,7 +273,8 @@ def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, c
         show(done, total)
 
     prepare_one = partial(_prepare_one, config=config, cache=cache.absolute())
-    with show_count("preparing side by side") as show, _interrupted_at_once(), open_tasks(where) as tasks:
+    at_once = handling(signal.default_int_handler)  # a training's own first Ctrl-C only notes the request
+    with show_count("preparing side by side") as show, at_once, open_tasks(where) as tasks:
         for _ in tasks.run(prepare_one, wanted, count):
             pass
     if not all(file_of(piece, config, cache).is_file() for piece in wanted):
@@ -287,18 +283,3 @@ def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, c
 
 def _prepare_one(piece: Stretch, config: TrainingConfig, cache: Path) -> None:
     prepared_piece(piece, config, cache, lambda _: None)
-
-
-@contextlib.contextmanager
-def _interrupted_at_once() -> Iterator[None]:
-    """For the time of the block, a training's first Ctrl-C ends it; a request that is ignored stays ignored."""
-    if threading.current_thread() is not threading.main_thread():  # signals go to the main thread
-        yield
-        return
-    asking = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
-    earlier = [(number, signal.signal(number, signal.default_int_handler)) for number in asking]
-    try:
-        yield
-    finally:
-        for number, handler in earlier:
-            signal.signal(number, handler)

@@ -83,11 +83,7 @@ _SHAPE = TypeAdapter(Progress)
 
 
 def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
-    """Write the file, whole or not at all.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write the file, whole or not at all; OutputError where it cannot be written."""
     tensors: dict[str, Tensor] = {_NETWORK + name: value for name, value in network.state_dict().items()}
     for number, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"{_OPTIMIZER}{number}/{name}": torch.as_tensor(value) for name, value in moments.items()}

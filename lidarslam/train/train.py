@@ -1,7 +1,6 @@
 """One training on disk: from the options of `lidarslam train` and recordings to weights."""
 
 import contextlib
-import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights
 from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.training import Validation, make_optimizer
+from lidarslam.run.interruption import handling
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import directory as files
@@ -214,17 +214,8 @@ def _interruption() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked.set()
 
-    if threading.current_thread() is not threading.main_thread():  # signals go to the main thread
+    with handling(note):
         yield asked.is_set
-        return
-    # A request that is ignored, as nohup asks, stays ignored.
-    asking = (n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN)
-    earlier = [(number, signal.signal(number, note)) for number in asking]
-    try:
-        yield asked.is_set
-    finally:
-        for number, handler in earlier:
-            signal.signal(number, handler)
 
 
 def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: Any) -> bool:

@@ -12,7 +12,7 @@ from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.estimates import STAGES, ScanResult
+from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.viewer.rerun_program import GRPC_PORT, open_window
 from lidarslam.viewer.rerun_recording import (
     BACKGROUND,
@@ -61,7 +61,7 @@ class RerunViewer(Viewer):
         path = rr.LineStrips3D([reference.positions], colors=[REFERENCE_COLOUR], labels=["ground truth"])
         self._recording.log("world/ground_truth", path, static=True)
 
-    def show_scan(self, index: int, result: ScanResult) -> None:
+    def show_scan(self, index: int, result: ScanEstimate) -> None:
         """The scan at its pose, the next piece of the trajectory, the next value of every plot."""
         set_stamp(self._recording, index, result.stamp)
         T = result.T_world_lidar

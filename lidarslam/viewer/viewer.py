@@ -5,7 +5,7 @@ from typing import Literal
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 
 RerunMode = Literal["off", "save", "web", "spawn"]
 
@@ -20,7 +20,7 @@ class Viewer:
     def show_reference(self, reference: Trajectory) -> None:
         """The true trajectory, in the run's world."""
 
-    def show_scan(self, index: int, result: ScanResult) -> None:
+    def show_scan(self, index: int, result: ScanEstimate) -> None:
         """One scan."""
 
     def show_map(self, points: FloatArray) -> None:

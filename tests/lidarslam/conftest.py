@@ -12,8 +12,11 @@ import pytest
 from click.testing import CliRunner
 
 from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 
 
 class Files(dict[str, Any]):
@@ -33,6 +36,26 @@ def _differing(left: object, right: object) -> str:
         names = [name for name in sorted({*left, *right}) if left.get(name) != right.get(name)]
         return "; ".join(f"{name}: {_differing(left.get(name), right.get(name))}" for name in names)
     return f"{str(left)[:200]} != {str(right)[:200]}"
+
+
+def scan_estimate(stamp: float, T_world_lidar: FloatArray, status: Status = Status.OK, **values: Any) -> ScanEstimate:
+    """A scan with a pose, with further values where they matter."""
+    given: dict[str, Any] = {
+        "T_odom_lidar": T_world_lidar,
+        "covariance": None,
+        "motion": SweepMotion(None, None),
+        "message": "",
+        "belongs_in_map": True,
+        "points_used": 90,
+        "residual_m": None,
+        "inlier_ratio": None,
+        "degenerate": (),
+        "stage_ms": {},
+        "is_odometry_asked": True,
+        "points_read": 100,
+        "points_dropped": 1,
+    }
+    return ScanEstimate(stamp=stamp, T_world_lidar=T_world_lidar, status=status, **given | values)
 
 
 @pytest.fixture(scope="session")

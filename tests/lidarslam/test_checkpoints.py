@@ -267,27 +267,3 @@ def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(
             unfinished.begin(0)
             with pytest.raises(InputError, match="did not finish"):
                 require_whole(mixed)
-
-
-def test_what_differs_is_named_and_not_too_much_of_it(tmp_path: Path) -> None:
-    with claim(tmp_path, {"a": {"b": 1, "c": 2}, "d": 3, "e": 4}) as unfinished:
-        unfinished.begin(0)
-    other = {"a": {"b": 0, "c": 0}, "e": 0, "f": 0}
-    with (
-        pytest.raises(InputError, match=r"begun with a\.b 1 \(now 0\), a\.c 2 \(now 0\), d 3 \(now None\) and 2 more"),
-        claim(tmp_path, other, resume=True),
-    ):
-        pass
-
-
-def test_results_of_another_command_in_the_place_of_a_killed_run_are_whole(tmp_path: Path) -> None:
-    """A merge saves nothing, and is not taken for the run that was killed there."""
-    with claim(tmp_path, {}) as unfinished:
-        unfinished.begin(0)
-    with pytest.raises(RuntimeError), RunDirectory.create(tmp_path, overwrite=True):
-        raise RuntimeError
-    with pytest.raises(InputError, match="did not finish"):
-        require_whole(tmp_path)
-    with RunDirectory.create(tmp_path, overwrite=True):
-        pass
-    require_whole(tmp_path)

@@ -1,7 +1,6 @@
 """Files damaged at random: every command ends with a status and at most one line of error, and writes nothing else."""
 
 import contextlib
-import json
 import os
 import re
 import resource
@@ -25,7 +24,6 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.simulation.recorder import Rig, SimulatedScan
 from lidarslam.simulation.writers import FORMATS, write_kitti, write_ply_scans
 from lidarslam.storage.finished_run import load_map
-from lidarslam.storage.unfinished import Unfinished
 
 pytestmark = pytest.mark.slow
 
@@ -311,59 +309,6 @@ def test_a_damaged_run(
         ends_well("run", small_recording, "--out", tmp_path / "out", "--overwrite", "--config", path, *FAST)
     ends_well("evaluate", tmp_path / "run", "--reference-map", whole_run / "map.ply")
     assert {path.name for path in tmp_path.iterdir()} <= {"run", "out", "here"}
-
-
-@pytest.fixture(scope="session")
-def killed_run(tmp_path_factory: pytest.TempPathFactory, small_recording: Path) -> Path:
-    """A run with a checkpoint after its fourth scan, as a kill before its end leaves it, not to be written to."""
-    out = tmp_path_factory.mktemp("runs") / "killed"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Unfinished, "end", lambda *_, **__: None)
-        assert ends_well("run", small_recording, "--out", out, *RESUMED, "--set", "checkpoints.every_scans=2") == 0
-    return out
-
-
-RESUMED = (*FAST, "--pose-graph", "--set", "global_map.most_points=2000")
-CHECKPOINT = ("run.json", "state.npz", "submaps.bin", "tiles.bin")
-
-
-@fuzzed
-@given(st.sampled_from(CHECKPOINT), changes)
-@example("run.json", seed(DEEP))
-@example("run.json", seed('{"standing": "at work", "description": {}, "resumed_after": [1e999]}'))
-@example("run.json", seed('{"standing": "at work", "description": {"merge": "all", "sources": 5}}'))
-@example("run.json", seed('{"standing": "stopped", "description": {}, "resumed_after": [' + "9" * 5_000 + "]}"))
-def test_a_damaged_checkpoint(
-    tmp_path: Path, small_recording: Path, killed_run: Path, monkeypatch: pytest.MonkeyPatch, name: str, made: list
-) -> None:
-    """A run that is resumed all the same comes to its results."""
-    out = tmp_path / "out"
-    shutil.rmtree(out, ignore_errors=True)
-    shutil.copytree(killed_run, out)
-    path = out / "unfinished" / name
-    path.write_bytes(changed(path.read_bytes(), made))
-    with nothing_else_changes(tmp_path, monkeypatch):
-        ends_well("info", out)
-        ends_well("evaluate", out / "trajectory.tum", "--reference", small_recording / "ground_truth.tum")
-        ends_well("evaluate", out)
-        ends_well("view", out, "--picture", out / "picture.png")
-        ends_well("merge", small_recording, killed_run, "--out", out)
-        if ends_well("run", small_recording, "--out", out, *RESUMED, "--resume") == 0:
-            assert (out / "trajectory.tum").read_bytes() == (killed_run / "trajectory.tum").read_bytes()
-            assert (out / "map" / "index.json").read_bytes() == (killed_run / "map" / "index.json").read_bytes()
-
-
-@fuzzed
-@given(changes)
-@example(seed(DEEP))
-@example(seed('{"methods": {"a": {"run": "../../x"}}}'))
-@example(seed('{"methods": {"a": {"run": "a\\u0000"}}}'))
-def test_a_damaged_comparison(tmp_path: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch, made: list) -> None:
-    comparison = json.dumps({"methods": {"a": {"run": "room/a"}, "b": {"run": None}}})
-    (tmp_path / "comparison.json").write_bytes(changed(comparison.encode(), made))
-    shutil.copytree(whole_run, tmp_path / "room" / "a", dirs_exist_ok=True)
-    with nothing_else_changes(tmp_path, monkeypatch):
-        ends_well("view", tmp_path, "--picture", tmp_path / "out" / "picture.png")
 
 
 @pytest.fixture(scope="session")

@@ -74,7 +74,7 @@ def test_the_second_and_third_wait_for_the_results(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     at_scan(monkeypatch, 4)
-    pressed_at(monkeypatch, "lidarslam.run.run.write_results", 2)
+    pressed_at(monkeypatch, "lidarslam.run.session.write_results", 2)
     result = run()
     assert result.exit_code == 1
     told = [record.message for record in caplog.records if WRITING in record.message]
@@ -90,7 +90,7 @@ def test_the_second_and_third_wait_for_the_results(
 def test_the_last_scan_is_done_and_ctrl_c_only_waits(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pressed_at(monkeypatch, "lidarslam.run.run.final_map", 1)
+    pressed_at(monkeypatch, "lidarslam.run.results.corrected_map", 1)
     assert run().exit_code == 0
     assert sum(WRITING in record.message for record in caplog.records) == 1
     assert not (tmp_path / "run" / "unfinished").exists()
@@ -101,7 +101,7 @@ def test_who_insists_abandons_the_results_and_can_resume(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_scan(monkeypatch, 4)
-    pressed_at(monkeypatch, "lidarslam.run.run.write_results", 3)
+    pressed_at(monkeypatch, "lidarslam.run.session.write_results", 3)
     result = run("--set", "checkpoints.every_scans=2")
     assert result.exit_code == 1
     assert "interrupted, no results were written; continue from the last checkpoint with --resume" in result.output
@@ -134,7 +134,7 @@ def test_resuming_is_not_promised_without_a_checkpoint(
 def test_before_the_first_scan_nothing_is_kept(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for place in ("lidarslam.run.run.open_odometry", "lidarslam.run.tracking.prefetch"):
+    for place in ("lidarslam.run.session.open_odometry", "lidarslam.run.tracking.prefetch"):
         with monkeypatch.context() as patch:
             pressed_at(patch, place, 1)
             result = run()

@@ -31,7 +31,9 @@ from lidarslam.live.messages import PosePublisher, serialize_transform
 from lidarslam.live.receiving import IncomingQueue, Received, find_imu, find_topic
 from lidarslam.live.statistics import LiveStatistics, count_missing
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.pipeline.estimates import Localised, SweepMotion
+from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
+
+from .conftest import scan_estimate
 
 LIDARSLAM = [sys.executable, "-m", "lidarslam"]
 PLAY = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "play_bag.py")]
@@ -344,19 +346,12 @@ def test_it_waits_no_longer_than_it_is_told() -> None:
         find_topic(lambda: [], "/points", 3, 0.3)
 
 
-def test_while_it_waits_it_says_what_it_sees(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr("lidarslam.live.receiving._PATIENCE_S", 0.0)
-    seen = iter([[Topic("/rear")], [Topic("/rear")], [Topic("/rear"), Topic("/front")]])
-    assert find_topic(lambda: next(seen), "/front", 3).name == "/front"
-    assert caplog.messages == ["waiting for /front in domain 3; clouds are published on /rear"]
-
-
-def localised(T: np.ndarray, status: Status = Status.OK) -> Localised:
+def localised(T: np.ndarray, status: Status = Status.OK) -> ScanEstimate:
     """A pose with a covariance, and a velocity."""
     velocity = np.array([0.0, 0.0, 0.5, 2.0, 0.0, 0.0])
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-4
     motion = SweepMotion(velocity, velocity)
-    return Localised(T, T, covariance, motion, status, "", True, 9, 0.01, 0.9, (), {})
+    return scan_estimate(0.0, T, status, covariance=covariance, motion=motion)
 
 
 def test_the_pose_of_the_body_follows_from_that_of_the_lidar() -> None:

@@ -20,7 +20,7 @@ from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.methods.external import ExternalOdometry
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 
@@ -77,7 +77,7 @@ def pipeline_of(odometry: ExternalOdometry, graph: Any, keeper: Keeper | None = 
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), graph, keeper)
 
 
-def poses(results: list[ScanResult]) -> FloatArray:
+def poses(results: list[ScanEstimate]) -> FloatArray:
     return np.array([result.T_world_lidar for result in results])
 
 

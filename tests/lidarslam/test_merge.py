@@ -25,7 +25,7 @@ from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeRequest
 from lidarslam.merge.writing import MergeOutcome, format_merge
-from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion import Motion, mount_pose
 from lidarslam.simulation.recorder import Simulation
@@ -302,22 +302,6 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: l
     assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
 
 
-def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path: Path) -> None:
-    @contextmanager
-    def interrupt(name: str) -> Iterator[Progress]:
-        def tell(number: int, _total: int, _result: ScanResult) -> None:
-            if name.startswith("2/") and number == 2:
-                raise KeyboardInterrupt
-
-        yield tell
-
-    outcome = merge(request(tmp_path / "out", *rooms, settings=FAST), interrupt)
-    assert [recording.scans for recording in outcome.summary.recordings] == [5, 2, 0]
-    assert any("in room 1: stopped after 2 scans: interrupted" in line for line in outcome.stopped)
-    assert any("in room 2: not begun" in line for line in outcome.stopped)
-    assert len(read_tum(tmp_path / "out" / "02_in_room_1" / "trajectory.tum")) == 2
-
-
 def test_an_interrupted_merge_goes_on_where_it_was(
     rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
 ) -> None:
@@ -328,7 +312,7 @@ def test_an_interrupted_merge_goes_on_where_it_was(
 
     @contextmanager
     def interrupt(name: str) -> Iterator[Progress]:
-        def tell(number: int, _total: int, _result: ScanResult) -> None:
+        def tell(number: int, _total: int, _result: ScanEstimate) -> None:
             seen.append((name[:2], number))
             if ("1/", 5) in seen and seen[-1] == ("2/", 3):  # not when it is resumed
                 raise KeyboardInterrupt

@@ -10,8 +10,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.interface import Motion
-from lidarslam.pipeline.estimates import Localised, SweepMotion
 from lidarslam.pipeline.odometry_gate import OdometryGate
+
+from .conftest import scan_estimate
 
 CELL_M = 0.4
 VELOCITY = np.array([0.0, 0.0, 0.2, 5.0, 0.0, 0.0])
@@ -41,13 +42,6 @@ class Asked:
         """Nothing."""
 
 
-def localised(T_world_lidar: FloatArray, status: Status = Status.OK, cell_m: float | None = CELL_M) -> Localised:
-    unknown = SweepMotion(None, None)
-    return Localised(
-        T_world_lidar, T_world_lidar, None, unknown, status, "", True, 1, None, None, (), {}, cell_m=cell_m
-    )
-
-
 def asked(
     poses: Sequence[FloatArray],
     statuses: dict[int, Status] | None = None,
@@ -65,8 +59,9 @@ def asked(
         assert motion.is_asked == (float(stamp) in odometry.asked)
         done = index - behind + 1
         if done >= 0:
-            result = localised(poses[done], (statuses or {}).get(done, Status.OK), cell_m)
-            gate.follow(float(times[done]), lambda result=result: result)
+            status = (statuses or {}).get(done, Status.OK)
+            result = scan_estimate(float(times[done]), poses[done], status, cell_m=cell_m)
+            gate.follow(lambda result=result: result)
     assert sorted(odometry.asked + odometry.skipped) == times.tolist()
     return [times.tolist().index(stamp) for stamp in odometry.asked]
 
@@ -117,6 +112,7 @@ def test_only_results_that_can_matter_are_waited_for() -> None:
         gate.estimate(Scan(np.ones((5, 3)), stamp))
         if index < 8:
             assert not taken
-        gate.follow(stamp, lambda index=index, pose=pose: (taken.append(index), localised(pose))[1])
+        result = scan_estimate(stamp, pose, cell_m=CELL_M)
+        gate.follow(lambda index=index, result=result: (taken.append(index), result)[1])
     gate.state()
     assert taken == list(range(12))

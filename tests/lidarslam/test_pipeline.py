@@ -20,7 +20,7 @@ from lidarslam.mapping.pose_graph.keyframes import GraphScan
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
-from lidarslam.pipeline.estimates import STAGES, ScanResult
+from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import EVERY_SCANS
@@ -82,10 +82,6 @@ def test_free_memory_is_returned(true_odometry: ExternalOdometry, room_scans: li
     assert psutil.Process().memory_info().rss < before - 100e6
 
 
-def test_no_scans_give_no_results(true_odometry: ExternalOdometry) -> None:
-    assert list(make_pipeline(true_odometry).run([])) == []
-
-
 class _Astray:
     """True motions, but for one scan whose motion is wrong or not measured."""
 
@@ -103,7 +99,7 @@ class _Astray:
         pass
 
 
-def statuses(results: list[ScanResult]) -> list[Status]:
+def statuses(results: list[ScanEstimate]) -> list[Status]:
     return [result.status for result in results]
 
 

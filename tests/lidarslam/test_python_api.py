@@ -20,7 +20,7 @@ from lidarslam.core.trajectory import read_tum, write_tum
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.run.run import open_odometry
+from lidarslam.run.session import open_odometry
 from lidarslam.storage.finished_run import load_run
 
 # Nothing but NumPy and compiled loops, so that tests are fast.
@@ -114,7 +114,7 @@ def test_saved_runs_are_like_others(slam: Slam, tmp_path: Path, room_scans: list
     out = tmp_path / "run"
     slam.save(out)
     register(slam, room_scans[10:])
-    with pytest.raises(OutputError, match="replace it with overwrite"):
+    with pytest.raises(OutputError, match="replace it with --overwrite"):
         slam.save(out)
     slam.save(str(out), overwrite=True)
     names = {
@@ -288,7 +288,7 @@ class _Breaks:
 def test_after_a_break_the_results_so_far_can_be_saved(
     slam: Slam, tmp_path: Path, room_scans: list[Scan], error: BaseException
 ) -> None:
-    slam._stages._odometry = _Breaks(slam._odometry, error)
+    slam._pipeline._odometry = _Breaks(slam._odometry, error)
     with pytest.raises(type(error)):
         register(slam, room_scans)
     with pytest.raises(LidarSlamError, match=r"broken off \((no more memory|KeyboardInterrupt)\)"):
@@ -301,7 +301,7 @@ def test_after_a_break_the_results_so_far_can_be_saved(
 def test_an_error_in_the_background_is_raised_once(slam: Slam, room_scans: list[Scan]) -> None:
     register(slam, room_scans[:3])
     slam.trajectory()
-    slam._stages.map.thin = None  # type: ignore[assignment]
+    slam._pipeline.map.thin = None  # type: ignore[assignment]
     slam.register_frame(room_scans[3])
     with pytest.raises(LidarSlamError, match="building the map failed: TypeError"):
         slam.map()

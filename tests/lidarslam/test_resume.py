@@ -399,16 +399,6 @@ def test_a_run_that_is_stopped_can_be_resumed_as_well(
     assert_same(out, expected.out)
 
 
-def test_a_run_that_is_stopped_as_it_writes_its_results_writes_them(
-    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path
-) -> None:
-    expected, out = whole("constant velocity"), tmp_path / "run"
-    ended = run(source, out, *expected.arguments, kill_at=round(0.55 * expected.ended.events), signal=signal.SIGINT)
-    assert ended.status == expected.ended.status
-    assert "the results so far are being written" in ended.said
-    assert_same(out, expected.out)
-
-
 @pytest.fixture(scope="module")
 def killed_once(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path_factory: pytest.TempPathFactory
@@ -492,16 +482,6 @@ def test_damage_is_told_in_one_line(
     ended = run(source, killed, *arguments, "--overwrite")
     assert ended.status == whole("constant velocity").ended.status
     assert_same(killed, whole("constant velocity").out)
-
-
-def test_damaged_submaps_are_told(run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path) -> None:
-    expected, out = whole("pose graph"), tmp_path / "run"
-    assert run(source, out, *expected.arguments, kill_at=expected.ended.events // 2).status == KILLED
-    path = out / "unfinished" / "submaps.bin"
-    path.write_bytes(b"\0" * 1000 + path.read_bytes()[1000:])
-    ended = run(source, out, *expected.arguments, "--resume")
-    assert ended.status == 1
-    assert "submaps.bin: is damaged (block 0)" in ended.said
 
 
 def test_a_run_killed_before_its_first_state_begins_again(

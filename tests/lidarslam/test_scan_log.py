@@ -5,36 +5,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
-from lidarslam.pipeline.estimates import ScanResult, SweepMotion
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import Milliseconds, WrittenMap, summarise
 from lidarslam.run.summary_text import format_times
 
+from .conftest import scan_estimate
 
-def result(stamp: float, status: Status = Status.OK, **values: Any) -> ScanResult:
+
+def result(stamp: float, status: Status = Status.OK, **values: Any) -> ScanEstimate:
     given = {
         "T_world_lidar": exp(np.full(6, 0.1 * stamp)),
         "T_odom_lidar": exp(np.full(6, 0.2 * stamp)),
-        "covariance": None,
-        "motion": SweepMotion(None, None),
-        "status": status,
-        "message": "",
-        "belongs_in_map": True,
-        "points_used": 90,
         "residual_m": 0.0123456,
-        "inlier_ratio": None,
-        "degenerate": (),
         "stage_ms": {"read": 1.234, "map": 2.0},
-        "stamp": stamp,
-        "points": np.zeros((3, 3)),
-        "points_read": 100,
-        "points_dropped": 1,
     }
-    return ScanResult(**given | values)
+    return scan_estimate(stamp, status=status, **given | values)
 
 
 @pytest.fixture
@@ -89,22 +78,6 @@ def test_a_restored_log_goes_on_alike(log: ScanLog) -> None:
     np.testing.assert_array_equal(restored.trajectory.T_world_lidar, log.trajectory.T_world_lidar)
 
 
-def test_a_state_of_another_length_is_refused(log: ScanLog) -> None:
-    state = log.state()
-    with pytest.raises(InputError, match="rows of the log"):
-        ScanLog().restore(Saved(state | {"rows": state["rows"][:1]}))
-    with pytest.raises(InputError, match="rows of the log"):
-        ScanLog().restore(Saved(state | {"rows": np.zeros((2, 3))}))
-
-
-def test_an_empty_log(log: ScanLog) -> None:
-    empty = ScanLog()
-    assert (len(empty), empty.points_read, len(empty.trajectory)) == (0, 0, 0)
-    restored = ScanLog()
-    restored.restore(Saved(empty.state()))
-    assert restored.format_csv() == empty.format_csv()
-
-
 def corridor_log(open_scans: int) -> ScanLog:
     """Eleven scans a metre apart along x, the last of which hardly constrain it."""
     log = ScanLog()
@@ -123,9 +96,3 @@ def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_su
     assert summary.to_json()["unconstrained_m"] == pytest.approx(open_scans, abs=1e-9)
     assert summary.went_astray == unknown
     assert any("the length is uncertain" in warning for warning in summary.warnings) == unknown
-
-
-def test_a_single_scan_has_no_way() -> None:
-    log = ScanLog()
-    log.add(result(1.0, degenerate=("x",)))
-    assert summarise(log, WrittenMap(0, None, 0), skipped=0).unconstrained_m == 0.0

@@ -73,27 +73,6 @@ def test_a_file_cut_short_is_damaged(tmp_path: Path, share: float) -> None:
         read_state(path)
 
 
-def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
-    path = tmp_path / "state.npz"
-    np.savez(path, tree=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match="is damaged"):
-        read_state(path)
-
-
-def test_compressed_arrays_are_not_opened(tmp_path: Path) -> None:
-    """A kilobyte of them may hold a gigabyte."""
-    write_state(tmp_path / "state.npz", STATE)
-    with np.load(tmp_path / "state.npz") as file:
-        np.savez_compressed(tmp_path / "state.npz", **dict(file))
-    with pytest.raises(InputError, match="its arrays are compressed"):
-        read_state(tmp_path / "state.npz")
-
-
-def test_objects_are_not_written(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
-        write_state(tmp_path / "state.npz", {"a": np.array([object()])})
-
-
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_failed_write_leaves_the_earlier_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     path = tmp_path / "state.npz"
@@ -108,8 +87,3 @@ def test_a_failed_write_leaves_the_earlier_state(tmp_path: Path, monkeypatch: py
     monkeypatch.undo()
     assert read_state(path).value("number") == 1
     assert [entry.name for entry in tmp_path.iterdir()] == ["state.npz"]
-
-
-def test_no_state_is_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_state(tmp_path / "state.npz")

@@ -28,9 +28,9 @@ from lidarslam.odometry.training.pairs import AUGMENTATION, Pairs
 from lidarslam.odometry.training.training import summarise, validate
 from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import data as training_data
-from lidarslam.train.data import Stretch, file_of, hold_out, prepared, recorded, simulated
+from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
-from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
+from lidarslam.train.settings import LOSSES, load_train_config
 from lidarslam.train.train import TrainRequest, execute
 
 TINY = (
@@ -249,16 +249,6 @@ def test_prepared_recordings_that_do_not_fit_are_made_anew(room_folder: Path, tm
     assert all(torch.equal(value, getattr(again, key)) for key, value in vars(first).items())
 
 
-def test_a_prepared_recording_under_the_name_of_another_is_made_anew(room_folder: Path, tmp_path: Path) -> None:
-    config = load_train_config(None, TINY)
-    one, other = (replace(recorded(room_folder, config.reader), first=first, stop=first + 3) for first in (0, 3))
-    prepared([one], config.training, tmp_path, lambda _: None)
-    (expected,) = prepared([other], config.training, tmp_path, lambda _: None)
-    shutil.copy(file_of(one, config.training, tmp_path), file_of(other, config.training, tmp_path))
-    (again,) = prepared([other], config.training, tmp_path, lambda _: None)
-    assert torch.equal(again.points, expected.points)
-
-
 def test_long_recordings_become_pieces() -> None:
     stretch = Stretch("long", {}, lambda: pytest.fail("opened"), 100, 1301)
     pieces = list(stretch.pieces())
@@ -310,12 +300,6 @@ def test_named_losses() -> None:
     assert training("alignment") == (None, 1.0)
     refined = [*LOSSES["paper"], "training.geometric.plane_to_plane=false"]
     assert load_train_config(None, refined).training.geometric == LossConfig(plane_to_plane=False, robust=False)
-
-
-def test_a_written_configuration_is_read_back(tmp_path: Path) -> None:
-    config = TrainConfig(simulated=SimulatedConfig(recordings=3))
-    (tmp_path / "config.yaml").write_text(dump_train_yaml(config, {"sources": []}))
-    assert load_train_config(tmp_path / "config.yaml") == config
 
 
 def train(*arguments: object) -> Result:

@@ -27,9 +27,8 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.request import RunRequest, describe_run
-from lidarslam.run.results import RunOutcome, final_map, write_results
+from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, unless_damaged, write_results
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage.directory import RunDirectory
 
 PEER_KEY = "peer"
@@ -75,11 +74,8 @@ def execute_peer(
     estimated = estimate(peer, prefetch(scans), samples, lambda number: progress(number, len(chosen)), range_m)
     with Interruptions() as interruptions, RunDirectory.create(request.out, request.overwrite) as directory:
         interruptions.protect_results()
-        tracked = _track(request, recording, chosen, estimated)
-        if errors:
-            tracked = replace(tracked, error=errors[0])
-        drawn = final_map(tracked, None, request.config.global_map, directory)
-        return write_results(directory, request.config, describe_peer(request, peer, range_m), tracked, None, drawn)
+        tracked = _track(request, recording, chosen, estimated, errors[0] if errors else None)
+        return write_results(directory, request.config, describe_peer(request, peer, range_m), tracked)
 
 
 def _until_damaged(scans: Iterator[Scan], errors: list[InputError]) -> Iterator[Scan]:
@@ -89,7 +85,9 @@ def _until_damaged(scans: Iterator[Scan], errors: list[InputError]) -> Iterator[
         errors.append(error)
 
 
-def _track(request: RunRequest, recording: Recording, chosen: range, estimated: Estimate) -> Tracked:
+def _track(
+    request: RunRequest, recording: Recording, chosen: range, estimated: Estimate, error: InputError | None
+) -> Tracked:
     """The scans that have a pose through the pipeline."""
     config, faults, log = request.config, Faults(), ScanLog()
     covered = set(estimated.trajectory.stamps.tolist())
@@ -112,9 +110,8 @@ def _track(request: RunRequest, recording: Recording, chosen: range, estimated: 
     if unplaced:
         log.warn(f"{count(unplaced, 'scan')} without a pose")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
-    built = pipeline.map
-    asked = len(chosen) - unplaced
-    return Tracked(recording, truth, log, asked, faults, built.global_map, built.views, built.slides.tests, None)
+    scans = TrackedScans.of(log, faults, pipeline.map, len(chosen) - unplaced, error)
+    return Tracked(scans, pipeline.map.global_map, recording, truth)
 
 
 def estimate(
