@@ -27,6 +27,9 @@ and one of them has a SystemError (python/cpython#106905).
 _PARTIAL = ".partial-"
 _LOCKED = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 _POLL_S = 0.2
+# Ten million poses and more, in a file and in a line.
+_LONGEST_BYTES, _LONGEST_LINE = 1 << 30, 1 << 16
+_MARK = b"\xef\xbb\xbf"  # of byte order
 
 
 @contextlib.contextmanager
@@ -189,11 +192,6 @@ def read_array(file: IO[bytes]) -> NDArray[Any]:
     """
     with ONE_READER:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-
-
-# Ten million poses and more, in a file and in a line.
-_LONGEST_BYTES, _LONGEST_LINE = 1 << 30, 1 << 16
-_MARK = b"\xef\xbb\xbf"  # of byte order
 
 
 def bounded_lines(path: Path) -> Iterator[str]:

@@ -20,6 +20,10 @@ _STEERING_BUT_LINES = re.compile(f"(?!\n)[{_UNSEEN}]")
 # Longer lines are cut in the middle.
 _LONGEST = 2_000
 _TAIL = 400
+# Bytes; file systems allow 255, and a number, a time or a suffix may follow.
+_LONGEST_NAME = 120
+_SEPARATORS = re.compile(r"[/\\]+")
+_NAME_REMEDY = "name it with letters, digits, '-', '_', '.' or '+', without a dot at the beginning"
 
 
 def one_line(text: str, longest: int = _LONGEST) -> str:
@@ -89,12 +93,6 @@ def _spelt(match: re.Match[str]) -> str:
     return match.group().encode("unicode_escape").decode("ascii")
 
 
-# Bytes; file systems allow 255, and a number, a time or a suffix may follow.
-_LONGEST_NAME = 120
-_SEPARATORS = re.compile(r"[/\\]+")
-_REMEDY = "name it with letters, digits, '-', '_', '.' or '+', without a dot at the beginning"
-
-
 def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
     """The name, if it is a safe component of a path: no separator, no control character, not hidden, not too long.
 
@@ -108,7 +106,9 @@ def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
     """
     fault = _name_fault(name, reserved)
     if fault is not None:
-        raise ConfigError(f"{what} {name[:_LONGEST_NAME]!r}: cannot be the name of a folder, as it {fault}; {_REMEDY}")
+        raise ConfigError(
+            f"{what} {name[:_LONGEST_NAME]!r}: cannot be the name of a folder, as it {fault}; {_NAME_REMEDY}"
+        )
     return name
 
 

@@ -7,6 +7,8 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 
+AXES = ("roll", "pitch", "yaw", "x", "y", "z")
+
 
 class Status(StrEnum):
     """Quality of a scan's pose.
@@ -18,9 +20,6 @@ class Status(StrEnum):
     OK = "ok"
     DEGRADED = "degraded"
     LOST = "lost"
-
-
-AXES = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
 def lever_scale(lever_m: float) -> FloatArray:

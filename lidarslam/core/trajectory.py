@@ -22,6 +22,20 @@ TextFormat = Literal["tum", "kitti"]
 
 # KITTI's LiDAR turns ten times a second.
 _KITTI_RATE_HZ = 10.0
+# Survey coordinates are far below; squares of much larger numbers overflow.
+_FARTHEST_M = 1e9
+_FORMATS = {
+    8: "; a TUM trajectory has lines `stamp tx ty tz qx qy qz qw`",
+    12: "; a KITTI trajectory has the first three rows of a pose matrix a line",
+}
+# By the columns that were expected and those that came.
+_OTHER_FORMAT = {
+    (8, 12): (
+        "; it is in KITTI's format, which has no stamps, and often holds the poses of a camera: give the LiDAR's as TUM"
+        " text, a line `stamp tx ty tz qx qy qz qw` for each scan"
+    ),
+    (12, 8): "; it looks like a TUM trajectory, `stamp tx ty tz qx qy qz qw`",
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,23 +188,6 @@ def chain(T_world_first: FloatArray, relative_motions: FloatArray) -> FloatArray
     for T_prev_curr in relative_motions:
         poses.append(poses[-1] @ T_prev_curr)
     return np.stack(poses)
-
-
-# Survey coordinates are far below; squares of much larger numbers overflow.
-_FARTHEST_M = 1e9
-
-_FORMATS = {
-    8: "; a TUM trajectory has lines `stamp tx ty tz qx qy qz qw`",
-    12: "; a KITTI trajectory has the first three rows of a pose matrix a line",
-}
-# By the columns that were expected and those that came.
-_OTHER_FORMAT = {
-    (8, 12): (
-        "; it is in KITTI's format, which has no stamps, and often holds the poses of a camera: give the LiDAR's as TUM"
-        " text, a line `stamp tx ty tz qx qy qz qw` for each scan"
-    ),
-    (12, 8): "; it looks like a TUM trajectory, `stamp tx ty tz qx qy qz qw`",
-}
 
 
 def parse_numbers(path: Path, columns: int) -> FloatArray:

@@ -30,6 +30,32 @@ _SNAPPED = np.cos(np.deg2rad(20.0))
 KITTI_DEG = 0.205
 # Keeps the division finite for the origin, a driver's mark for "no return", which has to stay the origin.
 _SMALLEST_RHO_M = 1e-30
+# A plane that faces up within this may be the ground of a sensor that is upright, or held at an angle.
+_UPRIGHT = np.cos(np.deg2rad(50.0))
+# Ground is taken from planes that face farther from up than this: normals of a few points are off by some degrees.
+_TURNED = np.cos(np.deg2rad(60.0))
+# No sensor but one that flies is farther above the ground.
+_MOST_HEIGHT_M = 4.0
+# Ground is seen within this of the spin axis, and the scans agree within as much.
+_ALIKE = np.cos(np.deg2rad(25.0))
+# A plane opposite with more than this share of the surfaces is a ceiling, or the other wall.
+_MOST_OPPOSITE = 0.01
+# A sensor that looks farther from its equator than the first on one side and less than the second on the other sees
+# the ceiling and not the floor, or the other way round; strays are left out.
+_FAR_TO_ONE_SIDE, _NEAR_TO_OTHER, _STRAY_SHARE = np.sin(np.deg2rad(35.0)), np.sin(np.deg2rad(9.0)), 0.005
+_SCANS = 5
+_ENOUGH_SCANS, _SOME_SCANS = 4, 2
+# Points farther than so many median ranges are left out; cells are this share of the median range.
+_FAR, _CELL_SHARE, _LEAST_CELL_M = 4.0, 1.0 / 30.0, 0.05
+_MOST_READ, _MOST_POINTS, _MOST_NORMALS, _NEIGHBOURS = 40_000, 8000, 3000, 10
+# Neighbours lie in a plane when the least variance is this share of the next.
+_FLAT = 0.05
+# A plane's normals are within this of one another, its points within a step of height of one another.
+_PARALLEL, _STEP_M = np.cos(np.deg2rad(15.0)), 0.3
+_ROUNDS, _SEEDS, _FEWEST = 3, 48, 10
+_SECTORS, _IN_SECTOR = 12, 2
+# Points this far beneath a plane, and by this share of their range, are beyond it.
+_BENEATH_M, _BENEATH_SHARE = 0.5, 0.05
 
 
 def transform_of(mounting: Mounting) -> FloatArray:
@@ -108,34 +134,6 @@ def _raise(points: NDArray[np.floating], sine: float, cosine: float, corrected: 
         rho = np.sqrt(x * x + y * y)
         scale = cosine - sine * (z / (rho if rho > _SMALLEST_RHO_M else _SMALLEST_RHO_M))
         corrected[n, 0], corrected[n, 1], corrected[n, 2] = x * scale, y * scale, rho * sine + z * cosine
-
-
-# A plane that faces up within this may be the ground of a sensor that is upright, or held at an angle.
-_UPRIGHT = np.cos(np.deg2rad(50.0))
-# Ground is taken from planes that face farther from up than this: normals of a few points are off by some degrees.
-_TURNED = np.cos(np.deg2rad(60.0))
-# No sensor but one that flies is farther above the ground.
-_MOST_HEIGHT_M = 4.0
-# Ground is seen within this of the spin axis, and the scans agree within as much.
-_ALIKE = np.cos(np.deg2rad(25.0))
-# A plane opposite with more than this share of the surfaces is a ceiling, or the other wall.
-_MOST_OPPOSITE = 0.01
-# A sensor that looks farther from its equator than the first on one side and less than the second on the other sees
-# the ceiling and not the floor, or the other way round; strays are left out.
-_FAR_TO_ONE_SIDE, _NEAR_TO_OTHER, _STRAY_SHARE = np.sin(np.deg2rad(35.0)), np.sin(np.deg2rad(9.0)), 0.005
-_SCANS = 5
-_ENOUGH_SCANS, _SOME_SCANS = 4, 2
-# Points farther than so many median ranges are left out; cells are this share of the median range.
-_FAR, _CELL_SHARE, _LEAST_CELL_M = 4.0, 1.0 / 30.0, 0.05
-_MOST_READ, _MOST_POINTS, _MOST_NORMALS, _NEIGHBOURS = 40_000, 8000, 3000, 10
-# Neighbours lie in a plane when the least variance is this share of the next.
-_FLAT = 0.05
-# A plane's normals are within this of one another, its points within a step of height of one another.
-_PARALLEL, _STEP_M = np.cos(np.deg2rad(15.0)), 0.3
-_ROUNDS, _SEEDS, _FEWEST = 3, 48, 10
-_SECTORS, _IN_SECTOR = 12, 2
-# Points this far beneath a plane, and by this share of their range, are beyond it.
-_BENEATH_M, _BENEATH_SHARE = 0.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)

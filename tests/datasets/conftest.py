@@ -220,6 +220,25 @@ class BagKit:
             ],
         )
 
+    def imu(self, stamp_ns: int, frame_id: str, angular_velocity: np.ndarray, acceleration: np.ndarray) -> Any:
+        """A sensor_msgs/Imu."""
+        header = self.header(stamp_ns)
+        header.frame_id = frame_id
+        w, a = (
+            self.new("geometry_msgs/Vector3", **dict(zip("xyz", values.tolist(), strict=True)))
+            for values in (angular_velocity, acceleration)
+        )
+        return self.new(
+            "sensor_msgs/Imu",
+            header=header,
+            orientation=self.new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.full(9, 1.0),
+            angular_velocity=w,
+            angular_velocity_covariance=np.full(9, 2.0),
+            linear_acceleration=a,
+            linear_acceleration_covariance=np.full(9, 3.0),
+        )
+
     def serialize(self, message: Any) -> bytes:
         """The bytes of a message."""
         serialize = self.store.serialize_cdr if self.ros2 else self.store.serialize_ros1

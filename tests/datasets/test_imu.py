@@ -32,20 +32,8 @@ class Samples:
     def messages(self, kit, frame_id="imu", order=None):
         found = []
         for number in range(len(self.w)) if order is None else order:
-            stamp_ns = self.stamps_ns[number]
-            header = kit.header(stamp_ns)
-            header.frame_id = frame_id
-            w, a = self.w[number].tolist(), (self.a[number] / (9.80665 if self.in_g else 1.0)).tolist()
-            message = kit.new(
-                "sensor_msgs/Imu",
-                header=header,
-                orientation=kit.new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-                orientation_covariance=np.full(9, 1.0),
-                angular_velocity=kit.new("geometry_msgs/Vector3", x=w[0], y=w[1], z=w[2]),
-                angular_velocity_covariance=np.full(9, 2.0),
-                linear_acceleration=kit.new("geometry_msgs/Vector3", x=a[0], y=a[1], z=a[2]),
-                linear_acceleration_covariance=np.full(9, 3.0),
-            )
+            acceleration = self.a[number] / (9.80665 if self.in_g else 1.0)
+            message = kit.imu(self.stamps_ns[number], frame_id, self.w[number], acceleration)
             found.append((STAMP_NS + IMU_PERIOD_NS * len(found) + 1_000_000, message))
         return found
 

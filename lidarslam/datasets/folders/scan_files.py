@@ -22,6 +22,26 @@ _MOST_SCANS = 10**9
 
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 KITTI_FIELDS = ("x", "y", "z", "intensity")
+TableReader = Callable[[Path], NDArray[np.void]]
+# Fields of the float32 numbers of a .bin point, by how many there are; in the order of preference.
+_BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
+_MOST_RINGS = 256
+_WIDEST_ARRAY = 16
+# Bytes; no format has a point with so many fields.
+_WIDEST_POINT = 1 << 16
+_LONGEST_HEADER = 1 << 16
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDER = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_KINDS = {"F": "f", "I": "i", "U": "u"}
+_SIZES = ("1", "2", "4", "8")
+# LZF's longest copy is of 264 bytes and takes three.
+_MOST_OF_A_BYTE = 88
 
 
 def natural_key(name: str) -> list[tuple[bool, int, str]]:
@@ -85,29 +105,6 @@ def read_bin(path: Path, columns: int = len(KITTI_FIELDS)) -> NDArray[np.float32
             " the file is damaged or of another format: copy it again or remove it"
         )
     return np.frombuffer(data, dtype="<f4").astype(np.float32, copy=False).reshape(-1, columns)
-
-
-TableReader = Callable[[Path], NDArray[np.void]]
-
-# Fields of the float32 numbers of a .bin point, by how many there are; in the order of preference.
-_BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
-_MOST_RINGS = 256
-_WIDEST_ARRAY = 16
-# Bytes; no format has a point with so many fields.
-_WIDEST_POINT = 1 << 16
-_LONGEST_HEADER = 1 << 16
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "int64": "i8", "uint64": "u8",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
-_BYTE_ORDER = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-_KINDS = {"F": "f", "I": "i", "U": "u"}
-_SIZES = ("1", "2", "4", "8")
-# LZF's longest copy is of 264 bytes and takes three.
-_MOST_OF_A_BYTE = 88
 
 
 def read_ascii_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:

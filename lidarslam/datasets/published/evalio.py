@@ -33,6 +33,11 @@ DATA_SETS = tuple(one.name for one in CATALOGUE if one.reader == "evalio")
 # Published where no program can download.
 _BY_HAND = ("botanic_garden",)
 _LISTED = 6
+_POINT = attrgetter("x", "y", "z", "intensity", "row")
+_FIELDS = (*((name, "float64") for name in ("x", "y", "z", "intensity")), ("t", "ns"), ("row", "uint8"))
+# Their true orientations are missing or made up.
+_POSITIONS_ALONE = ("enwide", "fomo")
+_UNREADABLE = "scans were left out: evalio could not read on"
 
 
 def data_folder() -> Path:
@@ -120,13 +125,6 @@ def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
     names = [f"{PREFIX}{data_set}/{name}" for name in known.get(data_set, ())]
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return f": {', '.join(names[:_LISTED])}{more}" if names else ""
-
-
-_POINT = attrgetter("x", "y", "z", "intensity", "row")
-_FIELDS = (*((name, "float64") for name in ("x", "y", "z", "intensity")), ("t", "ns"), ("row", "uint8"))
-# Their true orientations are missing or made up.
-_POSITIONS_ALONE = ("enwide", "fomo")
-_UNREADABLE = "scans were left out: evalio could not read on"
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

@@ -13,6 +13,9 @@ from lidarslam.core.text import count
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps
 
+# Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
+_SWEEP_TOLERANCE = 0.25
+
 
 def read_calibration(path: Path) -> dict[str, FloatArray]:
     """The arrays of a calibration file by name; lines without numbers, such as the date, are left out.
@@ -67,10 +70,6 @@ def read_raw_calibration(path: Path) -> FloatArray:
     if path.name == "calib_cam_to_cam.txt":
         return _rigid(path, _entry(path, arrays, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
     return _rigid(path, _entry(path, arrays, "R", 9).reshape(3, 3), _entry(path, arrays, "T", 3))
-
-
-# Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
-_SWEEP_TOLERANCE = 0.25
 
 
 @dataclass(frozen=True, eq=False)

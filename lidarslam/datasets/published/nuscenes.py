@@ -34,6 +34,7 @@ _TAIL = 100  # bytes
 _LONGEST_RECORD = 1 << 13  # bytes; those of the data set have some hundred
 
 T = TypeVar("T")
+_FIELDS = ("x", "y", "z", "intensity", "ring")
 
 
 class _Scene(TypedDict):
@@ -141,9 +142,6 @@ def _select(
                     yield parse_json(text[start:end], shape)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
-
-
-_FIELDS = ("x", "y", "z", "intensity", "ring")
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

@@ -14,7 +14,7 @@ from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1.reader import Compression, decompressors
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2 import reader
+from rosbags.rosbag2 import reader as rosbag2_reader
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd  # type: ignore[attr-defined] # Python's, or as in Python
 
 from lidarslam.core.errors import InputError
@@ -27,6 +27,13 @@ from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 MOST_BYTES = 1 << 28
 # How many times as large a file may become that is compressed as a whole; clouds do not become twenty times as large.
 _MOST_GROWTH = 100
+_STORAGE_SUFFIXES = (".db3", ".mcap")
+_LAST_MESSAGES_NS = 1_000_000_000
+_REPAIR = {
+    ".bag": "rosbag reindex {}",
+    ".mcap": "mcap recover {} -o recovered.mcap",
+    ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
+}
 
 
 def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
@@ -79,20 +86,11 @@ class _UnpackedFile(RawIOBase):
         return len(data)
 
 
-reader.zstd = SimpleNamespace(open=_UnpackedFile, decompress=unpacked_message)  # type: ignore[attr-defined,assignment]
+rosbag2_reader.zstd = SimpleNamespace(open=_UnpackedFile, decompress=unpacked_message)  # type: ignore[attr-defined,assignment]
 DECOMPRESSORS["lz4"] = lambda data, _: unpacked(data, LZ4FrameDecompressor)
 DECOMPRESSORS["zstd"] = lambda data, _: unpacked_message(data)
 decompressors[Compression.LZ4.value] = lambda data: unpacked(data, LZ4FrameDecompressor)
 decompressors[Compression.BZ2.value] = lambda data: unpacked(data, BZ2Decompressor)
-
-
-_STORAGE_SUFFIXES = (".db3", ".mcap")
-_LAST_MESSAGES_NS = 1_000_000_000
-_REPAIR = {
-    ".bag": "rosbag reindex {}",
-    ".mcap": "mcap recover {} -o recovered.mcap",
-    ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
-}
 
 
 class BagFile:

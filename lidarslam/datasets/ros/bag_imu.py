@@ -23,6 +23,12 @@ _TOPIC = "tf_static"
 
 Edges = dict[str, dict[str, FloatArray]]
 """T_from_to (4, 4) by the names of both frames, in both directions."""
+IMU_TYPE = "sensor_msgs/msg/Imu"
+# Enough for the median of a rate.
+_SAMPLES_LOOKED_AT = 200
+# Behind the header, in float64: orientation 4, its covariance 9, angular velocity 3, covariance 9, acceleration 3, 9.
+_NUMBERS = 37
+ANGULAR_VELOCITY, ACCELERATION = slice(13, 16), slice(25, 28)
 
 
 def static_transform(bag: BagFile, target: str, source: str) -> FloatArray | None:
@@ -71,14 +77,6 @@ def _matrix(transform: Any) -> FloatArray:
     if not np.isfinite(T).all():
         raise ValueError("a transform that is not finite")
     return T
-
-
-IMU_TYPE = "sensor_msgs/msg/Imu"
-# Enough for the median of a rate.
-_SAMPLES_LOOKED_AT = 200
-# Behind the header, in float64: orientation 4, its covariance 9, angular velocity 3, covariance 9, acceleration 3, 9.
-_NUMBERS = 37
-ANGULAR_VELOCITY, ACCELERATION = slice(13, 16), slice(25, 28)
 
 
 class CloudTopic(NamedTuple):

@@ -44,6 +44,7 @@ _POINT = np.dtype({"names": _NAMES, "formats": ("u4", "f4", "f4", "f4", "u1", "u
 _FIELDS = tuple(PointField(name, str(_POINT[name])) for name in _NAMES)
 _CDR_ALIGNED_POINT = 20
 ByteOrder = Literal["<", ">"]
+_PACKET_BYTES = 1206
 
 
 def behind_header(raw: bytes, ros2: bool, alignment: int) -> tuple[ByteOrder, int]:
@@ -87,9 +88,6 @@ def _points(raw: bytes, start: int, count: int, timebase: int, order: ByteOrder,
     times = cloud[TIME_FIELD].astype(np.uint64) + np.uint64(timebase)
     reflectivity = cloud["reflectivity"].astype(np.float32)
     return DecodedCloud(coordinates(cloud), TIME_FIELD, times, cloud["line"].copy(), _FIELDS, reflectivity)
-
-
-_PACKET_BYTES = 1206
 
 
 def decode_scan_message(raw: bytes, ros2: bool) -> DecodedCloud:

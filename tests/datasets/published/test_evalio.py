@@ -35,25 +35,8 @@ def _T_world_imu(seconds: float) -> np.ndarray:
 def _imu_messages(kit: Any, samples: int) -> tuple[list[tuple[int, Any]], np.ndarray]:
     """Messages, and their content (N, 6): angular velocity, acceleration."""
     content = np.random.default_rng(3).normal(size=(samples, 6))
-
-    def vector(values: np.ndarray) -> Any:
-        return kit.new("geometry_msgs/Vector3", x=values[0], y=values[1], z=values[2])
-
-    messages = []
-    for index, row in enumerate(content):
-        stamp = START_NS + index * IMU_PERIOD_NS
-        message = kit.new(
-            "sensor_msgs/Imu",
-            header=kit.header(stamp),
-            orientation=kit.new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-            orientation_covariance=np.zeros(9),
-            angular_velocity=vector(row[:3]),
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=vector(row[3:]),
-            linear_acceleration_covariance=np.zeros(9),
-        )
-        messages.append((stamp, message))
-    return messages, content
+    stamps = [START_NS + index * IMU_PERIOD_NS for index in range(samples)]
+    return [(ns, kit.imu(ns, "imu", row[:3], row[3:])) for ns, row in zip(stamps, content, strict=True)], content
 
 
 def _quaternion(T: np.ndarray) -> str:
@@ -69,12 +52,22 @@ def evalio_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def hilti(evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]) -> SimpleNamespace:
+def make_sequence(evalio_data: Path, make_bag_kit: Callable[[str], Any]) -> Callable[[str], tuple[Path, Any]]:
+    """The folder DATASET/SEQUENCE, and a kit that writes bags of ROS 1 to it."""
+
+    def make(name: str) -> tuple[Path, Any]:
+        kit = make_bag_kit("bag")
+        kit.folder = evalio_data / name
+        kit.folder.mkdir(parents=True)
+        return kit.folder, kit
+
+    return make
+
+
+@pytest.fixture
+def hilti(make_sequence: Callable[[str], tuple[Path, Any]], make_sweep: Callable[..., Any]) -> SimpleNamespace:
     """Three scans of basement_2; its columns hold the returns alone, in the order of firing."""
-    folder = evalio_data / "hilti_2022" / "basement_2"
-    folder.mkdir(parents=True)
-    kit = make_bag_kit("bag")
-    kit.folder = folder
+    folder, kit = make_sequence("hilti_2022/basement_2")
     sweeps, clouds = [], []
     for index in range(3):
         stamp = START_NS + index * PERIOD_NS
@@ -132,14 +125,9 @@ def test_the_description_names_data_set_and_sensor(hilti: SimpleNamespace) -> No
     assert info.imu == ImuSummary("Bosch BMI085", 100, 400.0, has_extrinsic=True)
 
 
-def test_newer_college_2021(
-    evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]
-) -> None:
+def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
     """Organised clouds with holes; the truth is of a frame of its own, in a table with seconds and nanoseconds."""
-    folder = evalio_data / "newer_college_2021" / "stairs"
-    folder.mkdir(parents=True)
-    kit = make_bag_kit("bag")
-    kit.folder = folder
+    folder, kit = make_sequence("newer_college_2021/stairs")
     sweep = make_sweep("ouster", START_NS, height=16, width=50, holes=True)
     sweep.records["x"][~np.isfinite(sweep.records["x"])] = 0.0  # the driver marks no return by zeros
     for axis in "yz":
@@ -164,13 +152,8 @@ def test_newer_college_2021(
     np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], T @ T_truth_lidar, atol=1e-5)
 
 
-def test_enwide_has_true_positions_alone(
-    evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]
-) -> None:
-    folder = evalio_data / "enwide" / "field_d"
-    folder.mkdir(parents=True)
-    kit = make_bag_kit("bag")
-    kit.folder = folder
+def test_enwide_has_true_positions_alone(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
+    folder, kit = make_sequence("enwide/field_d")
     sweep = make_sweep("ouster", START_NS, height=16, width=50)
     clouds = [(START_NS, kit.cloud(sweep.records, START_NS))]
     imu, _ = _imu_messages(kit, 3)
@@ -183,14 +166,9 @@ def test_enwide_has_true_positions_alone(
     assert "The truth has positions alone" in recording.describe().notes[-1]
 
 
-def test_mcd_stamps_the_end_of_a_sweep(
-    evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]
-) -> None:
+def test_mcd_stamps_the_end_of_a_sweep(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
     """The LiDAR and the IMU are in a bag each."""
-    folder = evalio_data / "multi_campus" / "ntu_day_01"
-    folder.mkdir(parents=True)
-    kit = make_bag_kit("bag")
-    kit.folder = folder
+    folder, kit = make_sequence("multi_campus/ntu_day_01")
     sweep = make_sweep("ouster", START_NS, height=16, width=50)
     clouds = [(START_NS, kit.cloud(sweep.records, START_NS + PERIOD_NS))]
     imu, content = _imu_messages(kit, 3)
