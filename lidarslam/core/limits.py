@@ -9,10 +9,10 @@ def require_range_left(min_range_m: float, max_range_m: float) -> None:
         )
 
 
-def require_lost_worse(lost_below: float, degraded_below: float, suffix: str = "") -> None:
-    """The threshold of lost must not exceed that of degraded; both names have the suffix."""
+def require_lost_worse(lost_below: float, degraded_below: float) -> None:
+    """The threshold of lost must not exceed that of degraded."""
     if lost_below > degraded_below:
         raise ValueError(
-            f"lost_below{suffix}={lost_below:g} must not exceed degraded_below{suffix}={degraded_below:g},"
+            f"lost_below={lost_below:g} must not exceed degraded_below={degraded_below:g},"
             " as a lost scan is worse than a degraded one"
         )

@@ -184,16 +184,6 @@ def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
     )
 
 
-def test_points_in_no_order_are_noted(tmp_path):
-    info = open_recording(record(tmp_path / "none", order="none")).describe()
-    assert "not in the order of one turn" in info.notes[0]
-
-
-def test_none_is_none(tmp_path):
-    recording = open_recording(record(tmp_path / "raw"), ReaderConfig(time_reference="none"))
-    assert next(recording.scans()).time_offsets is None
-
-
 def test_clouds_of_a_bag(bag_kit):
     messages = []
     for number in range(60):

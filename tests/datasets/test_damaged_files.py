@@ -228,44 +228,6 @@ def test_damaged_bags(bag_kit, make_sweep, damage, what):
         check(file)
 
 
-@fuzzed
-@given(
-    height=st.sampled_from([0, 1, 4, 2**32 - 1]),
-    width=st.sampled_from([0, 1, 50, 49, 51, 10**6, 2**32 - 1]),
-    point_step=st.sampled_from([0, 1, 12, 22, 21, 23, 2**32 - 1]),
-    row_step=st.sampled_from([0, 1, 1100, 1099, 2**32 - 1]),
-    big=st.booleans(),
-    size=st.sampled_from([0, 1, 4399, 4400, 5000]),
-    field=st.integers(0, 5),
-    name=st.sampled_from(["", "x", "w", "time", "ring"]),
-    offset=st.sampled_from([0, 4, 21, 2**32 - 1]),
-    datatype=st.integers(0, 255),
-    count=st.sampled_from([0, 1, 2**32 - 1]),
-)
-def test_clouds_that_say_what_is_not_so(
-    ros2_kit, make_sweep, height, width, point_step, row_step, big, size, field, name, offset, datatype, count
-):
-    """A message whose numbers lie: every field of PointCloud2 that says where the points are."""
-    sweep = make_sweep("velodyne", STAMP_NS)
-    good = ros2_kit.cloud(sweep.records, STAMP_NS)
-    fields = list(good.fields)
-    fields[field % len(fields)] = ros2_kit.new(
-        "sensor_msgs/PointField", name=name, offset=offset, datatype=datatype, count=count
-    )
-    data = np.resize(good.data, size)
-    lying = ros2_kit.cloud(
-        sweep.records, STAMP_NS + 10**8, height=height, width=width, point_step=point_step, row_step=row_step,
-        is_bigendian=big, data=data, fields=fields,
-    )  # fmt: skip
-    clouds = [(STAMP_NS, good), (STAMP_NS + 10**8, lying)]
-    folder = ros2_kit.folder / "drive"
-    if folder.exists():
-        for path in folder.iterdir():
-            path.unlink()
-        folder.rmdir()
-    assert check(ros2_kit.write({"/points": clouds})) >= 1
-
-
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "plain.bin"])
 def test_a_header_that_promises_more_than_there_is(tmp_path, table, encode, name):
     """One point more, and so many that making room for them would fill any memory."""

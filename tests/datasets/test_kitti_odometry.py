@@ -76,15 +76,6 @@ def test_a_single_sequence_folder_reads_the_same(tmp_path, rng, monkeypatch, unc
         assert recording.name == "kitti_04"
 
 
-def test_poses_beside_the_scans_are_found(tmp_path, rng, uncorrected):
-    _write_sequence(tmp_path, rng)
-    folder = tmp_path / "sequences" / "04"
-    (tmp_path / "poses" / "04.txt").rename(folder / "poses.txt")
-    recording = open_recording(folder)
-    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
-    assert recording.describe().ground_truth.name == "poses.txt"
-
-
 def test_gaps_in_the_numbers_keep_stamps_and_truth_in_step(tmp_path, rng, uncorrected):
     clouds = _write_sequence(tmp_path, rng, numbers=(1, 2, 4), rows=9, poses=7)
     recording = open_recording(tmp_path)

@@ -337,25 +337,3 @@ def test_real_angular_velocities_are_those_of_the_poses(real_data, name):
     assert np.rad2deg(np.std(turns - measured, axis=0)).max() < 0.1  # a tenth of the turns about z
     assert np.rad2deg(np.std(turns, axis=0)[2]) > 0.5
     assert np.median(imu.accelerations[:, 2]) == pytest.approx(9.81, abs=0.2)
-
-
-@pytest.mark.real_data
-def test_own_oxts_stamps_go_with_the_speed_better_than_those_of_the_scans(real_data):
-    recording = _drive(real_data, "0005")
-    truth = recording.ground_truth
-    folder = real_data / "kitti_raw_0005" / "2011_09_26" / "2011_09_26_drive_0005_sync" / "oxts" / "data"
-    speed = np.array([np.linalg.norm(np.loadtxt(path)[8:11]) for path in sorted(folder.glob("*.txt"))])
-    steps = np.linalg.norm(log(truth.relative_motions())[:, 3:], axis=1)
-    mean_speed = 0.5 * (speed[1:] + speed[:-1])
-    scan_stamps = np.array([scan.stamp for scan in recording.scans()])
-    own, scan = (np.std(steps - mean_speed * np.diff(stamps)) for stamps in (truth.stamps, scan_stamps))
-    assert own < 0.65 * scan
-
-
-@pytest.mark.real_data
-def test_the_drive_without_stamps(real_data):
-    recording = _drive(real_data, "stop")
-    info = recording.describe()
-    assert (info.scans, info.first_stamp, info.ground_truth) == (78, 0.0, None)
-    assert info.duration_s == pytest.approx(7.7)
-    assert any("10 scans a second" in note for note in info.notes)

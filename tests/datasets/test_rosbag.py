@@ -62,14 +62,6 @@ def test_every_driver_in_every_kind_of_bag(bag_kit, driver, make_sweep):
         assert_scan(scan, sweep, first_ns + i * PERIOD_NS)
 
 
-def test_stamp_and_offset_add_up_to_the_clock(ros2_kit, make_sweep):
-    first_ns = STAMP_NS + 987_654_321
-    sweep = make_sweep("hesai", first_ns)
-    scan = next(open_recording(ros2_kit.write({"/points": recorded(ros2_kit, [sweep], first_ns)})).scans())
-    for offset, reading in zip(scan.time_offsets[::37], sweep.times[::37], strict=True):
-        assert abs(Fraction(scan.stamp) + Fraction(offset) - Fraction(reading)) < Fraction(1, 10**12)
-
-
 @pytest.mark.parametrize("package", ["livox_ros_driver", "livox_ros_driver2"])
 @pytest.mark.parametrize("clock_ns", [0, 2_000_000, -STAMP_NS, 55_000_000_000 - STAMP_NS])
 def test_livox_custom_message(bag_kit, rng, package, clock_ns):
@@ -322,27 +314,6 @@ def test_simulated_time_from_zero(ros2_kit, reference, count):
     for scan in scans:
         np.testing.assert_allclose(scan.time_offsets, seconds, rtol=0.0, atol=1e-9)
     assert recording.describe().point_time.reference == reference
-
-
-def test_time_is_learned_from_the_first_scan_that_has_it(ros2_kit, make_sweep):
-    sweeps = [make_sweep("ouster", ns) for ns in stamps_ns(3)]
-    sweeps[0].records["t"] = 0
-    scans = list(open_recording(ros2_kit.write({"/points": recorded(ros2_kit, sweeps)})).scans())
-    assert (scans[0].time_offsets == 0.0).all()
-    assert_scan(scans[2], sweeps[2], stamps_ns(3)[2])
-
-
-def test_time_options(ros2_kit, make_sweep):
-    path = ros2_kit.write({"/points": recorded(ros2_kit, [make_sweep("ouster", STAMP_NS)])})
-
-    def offsets(**options):
-        return next(open_recording(path, ReaderConfig(**options)).scans()).time_offsets
-
-    assert offsets(time_reference="none") is None
-    assert offsets().max() == pytest.approx(0.1)
-    assert offsets(time_unit="ns", time_reference="relative").max() == pytest.approx(0.1)
-    with pytest.raises(InputError, match=r"drive: the points have no time field 'stamp'; their fields are: x, y, z"):
-        offsets(time_field="stamp")
 
 
 def test_empty_clouds_are_scans_without_points(ros2_kit, make_sweep):

@@ -145,20 +145,6 @@ def test_reads_every_format_with_times_and_rings(formats, tmp_path, rng, suffix)
         assert info.first.rings is not None
 
 
-def test_invalid_points_go_with_their_times_and_rings(formats, tmp_path, rng):
-    table = _rich(rng)
-    table["x"][10] = np.nan
-    for name in "xyz":
-        table[name][20] = 0.0
-    table["t"][20] = 4_000_000_000  # drivers leave anything in points without a return
-    _write(formats, tmp_path, "scan_0.ply", table)
-    scan = next(open_recording(tmp_path).scans())
-    assert scan.dropped == 2
-    kept = np.delete(np.arange(200), [10, 20])
-    np.testing.assert_array_equal(scan.rings, table["ring"][kept])
-    np.testing.assert_allclose(scan.time_offsets, table["t"][kept] * 1e-9, atol=1e-12)
-
-
 def test_time_options(formats, tmp_path, rng):
     table = _rich(rng)
     _write(formats, tmp_path, "scan_0.npy", table)

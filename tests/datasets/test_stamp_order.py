@@ -36,15 +36,6 @@ def test_one_stray_stamp_costs_no_other_scan(place, stray):
     assert f"number {place}, stamped {stray:.9f}" in faults.warnings()[0]
 
 
-def test_stamps_that_repeat_or_step_back_are_left_out():
-    taken, faults = kept([0.0, 0.1, 0.1, 0.05, 0.2])
-    assert taken == [0.0, 0.1, 0.2]
-    assert faults.warnings() == (
-        "2 scans were left out: their stamps are not after those of the scans before;"
-        " the first: number 2, stamped 0.100000000, after 0.100000000",
-    )
-
-
 @pytest.mark.parametrize("jump_s", [3.0, 3600.0, YEAR_S])
 def test_a_clock_set_forward_for_good_is_followed(jump_s):
     stamps = clock(10) + clock(10, first=1000.0 + jump_s)

@@ -8,7 +8,6 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import open_recording
 
 pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
@@ -118,14 +117,6 @@ def test_a_part_of_a_capture(capture):
     untimed = open_recording(path, ReaderConfig(time_reference="none"))
     assert next(untimed.scans()).time_offsets is None
     assert untimed.describe().point_time is None
-
-
-def test_info_of_a_capture(capture):
-    path, _ = capture
-    info = open_recording(path).describe()
-    assert (info.reader, info.scans) == ("packets", 4)
-    assert info.rate_hz == pytest.approx(10.0, rel=0.02)
-    assert "time in s, relative; +0.0 to +102.2 ms" in describe_source(path, ReaderConfig())
 
 
 def scan_message(kit, sent, stamp_ns):
