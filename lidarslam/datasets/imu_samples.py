@@ -114,23 +114,17 @@ def read_imu_csv(path: Path) -> ImuSamples | None:
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
     if rows and any(character.isalpha() and character not in "eEnainf" for character in rows[0]):
         rows = rows[1:]  # the names of the columns
-    try:
-        table = np.array([row.split(",") for row in rows], dtype=np.float64).reshape(len(rows), len(COLUMNS))
-    except ValueError:
-        wrong = next(row for row in rows if not _is_sample(row))
-        expected = "stamp, wx, wy, wz, ax, ay, az"
-        raise InputError(f"{path}: expected lines `{expected}`, got {wrong[:60]!r}; mend it or move it away") from None
+    table = np.empty((len(rows), len(COLUMNS)))
+    for number, row in enumerate(rows):
+        try:
+            table[number] = np.array(row.split(","), dtype=np.float64).reshape(len(COLUMNS))
+        except ValueError:
+            said = f"expected lines `stamp, wx, wy, wz, ax, ay, az`, got {row[:60]!r}"
+            raise InputError(f"{path}: {said}; mend it or move it away") from None
     stamps = table[:, 0]
     if len(stamps) and np.nanmedian(stamps) > _NANOSECONDS_FROM:
         stamps = np.array([int(row.split(",")[0]) / 10**9 for row in rows])
     return usable_samples(stamps, table[:, 1:4], table[:, 4:], _extrinsic(path, comments))
-
-
-def _is_sample(row: str) -> bool:
-    try:
-        return len([float(word) for word in row.split(",")]) == len(COLUMNS)
-    except ValueError:
-        return False
 
 
 def _extrinsic(path: Path, comments: Sequence[str]) -> FloatArray | None:

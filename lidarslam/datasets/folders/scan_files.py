@@ -210,7 +210,9 @@ def read_ply(path: Path) -> NDArray[np.void]:
     """
     data = read_bytes(path)
     try:
-        lines, length = _split_header(data)
+        lines, length = _split_header(data, "end_header")
+        if lines[0] != ["ply"]:
+            raise ValueError("expected a header that begins with `ply`")
         encoding, rows, dtype, skipped, further = _ply_header(lines)
         if dtype.itemsize > _WIDEST_POINT:
             raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
@@ -226,17 +228,17 @@ def read_ply(path: Path) -> NDArray[np.void]:
         raise InputError(f"{path}: not a readable PLY file: {error}; copy it again or remove it") from None
 
 
-def _split_header(data: bytes) -> tuple[list[list[str]], int]:
-    """The words of each header line and the header's length in bytes."""
-    lines: list[list[str]] = []
+def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
+    """The words of each header line up to the one that begins with the last word, and the header's length in bytes."""
+    lines: list[list[str]] = [[]]
     at = 0
-    while not lines or lines[-1] != ["end_header"]:
+    while lines[-1][:1] != [last]:
         end = data.find(b"\n", at, _LONGEST_HEADER)
-        if end < 0 or (lines and lines[0] != ["ply"]):
-            raise ValueError("expected a header from `ply` to `end_header`, found none")
+        if end < 0:
+            raise ValueError(f"expected a header that ends in a line `{last}`, found none")
         lines.append(data[at:end].decode("ascii", errors="replace").split())
         at = end + 1
-    return lines, at
+    return lines[1:], at
 
 
 def _ply_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], tuple[int, int], int]:
@@ -300,16 +302,8 @@ def read_pcd(path: Path) -> NDArray[np.void]:
 
 
 def _pcd_header(data: bytes) -> _Header:
-    entries: dict[str, list[str]] = {}
-    at = 0
-    while "DATA" not in entries:
-        end = data.find(b"\n", at, _LONGEST_HEADER)
-        if end < 0:
-            raise ValueError("expected a header that ends in a DATA line, found none")
-        words = data[at:end].decode("ascii", errors="replace").split()
-        at = end + 1
-        if words and not words[0].startswith("#"):
-            entries[words[0].upper()] = words[1:]
+    lines, length = _split_header(data, "DATA")
+    entries = {words[0].upper(): words[1:] for words in lines if words and not words[0].startswith("#")}
     names = entries.get("FIELDS") or entries.get("COLUMNS") or []
     sizes, kinds = entries.get("SIZE", []), entries.get("TYPE", [])
     counts = entries.get("COUNT", ["1"] * len(names))
@@ -323,7 +317,7 @@ def _pcd_header(data: bytes) -> _Header:
         raise ValueError(f"expected DATA ascii, binary or binary_compressed, got {encoding!r}")
     if not points[0].isdecimal():
         raise ValueError(f"expected a number of POINTS, got {points[0][:40]!r}: it is invalid")
-    return _Header(_pcd_row_type(names, sizes, kinds, counts), int(points[0]), encoding, at)
+    return _Header(_pcd_row_type(names, sizes, kinds, counts), int(points[0]), encoding, length)
 
 
 def _pcd_row_type(names: list[str], sizes: list[str], kinds: list[str], counts: list[str]) -> np.dtype[np.void]:

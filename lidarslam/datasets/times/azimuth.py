@@ -142,12 +142,11 @@ def offsets_from_order(points: FloatArray, rings: NDArray[np.generic] | None, pe
 
     Points without a return get NaN; None where the points are not in the order of firing.
     """
-    found = is_return(points)
-    turned = turned_angles(points[found], None if rings is None else rings[found])
-    if turned is None:
+    order = sweep_order(points, rings)
+    if order is None:
         return None
     offsets = np.full(len(points), np.nan)
-    offsets[found] = turned * (period_s / turned.max())
+    offsets[is_return(points)] = order.turned_deg * (period_s / order.turned_deg.max())
     return offsets
 
 
