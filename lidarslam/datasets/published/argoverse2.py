@@ -19,7 +19,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.published.stamped_files import poses_wxyz
-from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.recording import PointField
 from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows
 
@@ -29,17 +29,8 @@ _POSITION, _QUATERNION = ("tx_m", "ty_m", "tz_m"), ("qw", "qx", "qy", "qz")
 _SENSOR = "up_lidar"
 
 
-def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a log, the folder with sensors/lidar.
-
-    Raises:
-        InputError: it has no sweep, or pyarrow is not installed.
-    """
-    return Argoverse2Recording(source, config)
-
-
 class Argoverse2Recording(FileRecording):
-    """One log."""
+    """One log: the folder with sensors/lidar."""
 
     reader = "argoverse-2"
 
@@ -113,6 +104,9 @@ class Argoverse2Recording(FileRecording):
             "There is no calibration/egovehicle_SE3_sensor.feather; points and poses are in the vehicle's frame,"
             " not that of the upper LiDAR.",
         )
+
+
+open_recording = Argoverse2Recording
 
 
 def _read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse, make_transform, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
@@ -21,7 +20,6 @@ from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import increasing, read_table, stamped_scans
-from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
@@ -37,19 +35,8 @@ _ANGULAR_VELOCITY, _ACCELERATION = slice(8, 11), slice(11, 14)
 _NS = 1e-9
 
 
-def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open the folder of a sequence, such as KAIST01.
-
-    Raises:
-        InputError: it holds no scans, or their names are no stamps.
-    """
-    if not (source / SCANS).is_dir():
-        raise InputError(f"{source}: expected a sequence of MulRan with a folder {SCANS} in it, found none")
-    return MulRanRecording(source, config)
-
-
 class MulRanRecording(FileRecording):
-    """One sequence."""
+    """One sequence: the folder, such as KAIST01, with Ouster in it."""
 
     reader = "mulran"
     imu_name = "xsens_imu.csv"
@@ -107,3 +94,6 @@ class MulRanRecording(FileRecording):
 
     def _notes(self) -> Iterator[str]:
         yield "A scan's name is taken for the start of its sweep; the data set does not say which instant it is."
+
+
+open_recording = MulRanRecording

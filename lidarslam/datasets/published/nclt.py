@@ -22,7 +22,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bytes
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import increasing, read_table, stamped_scans
-from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.recording import PointField
 from lidarslam.datasets.stored_recording import FileRecording
 
 SCANS = "velodyne_sync"
@@ -36,19 +36,8 @@ _T_LIDAR_IMU = inverse(_T_BODY_LIDAR) @ make_transform(np.eye(3), _IMU_IN_BODY)
 _US = 1e-6
 
 
-def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open the folder of a session, such as 2012-01-08.
-
-    Raises:
-        InputError: it holds no scans, or their names are no stamps.
-    """
-    if not (source / SCANS).is_dir():
-        raise InputError(f"{source}: expected a session of NCLT with a folder {SCANS} in it, found none")
-    return NcltRecording(source, config)
-
-
 class NcltRecording(FileRecording):
-    """One session."""
+    """One session: the folder, such as 2012-01-08, with velodyne_sync in it."""
 
     reader = "nclt"
     imu_name = "ms25.csv"
@@ -99,3 +88,6 @@ class NcltRecording(FileRecording):
 
     def _notes(self) -> Iterator[str]:
         yield "Points have no times in this layout. The body's axes are turned so that z points up."
+
+
+open_recording = NcltRecording

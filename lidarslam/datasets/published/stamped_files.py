@@ -20,7 +20,7 @@ def stamped_scans(folder: Path) -> tuple[list[Path], FloatArray]:
     """
     files = np.array([path for path in folder.glob("*.bin") if not path.name.startswith(".")], dtype=object)
     if not len(files):
-        raise InputError(f"{folder}: holds no .bin scan")
+        raise InputError(f"{folder}: holds no .bin scan; give the folder of one sequence, above it")
     stamps = stamps_from_names([path.stem for path in files])
     if stamps is None or len(np.unique(stamps)) < len(stamps):
         raise InputError(f"{folder}: expected scans named by their stamps, such as 1561000444390857630.bin")
