@@ -105,19 +105,27 @@ def test_all_points_at_one_place_are_told():
 
 
 class Recorded:
-    """Scans with these stamps."""
+    """A recording of these scans."""
 
-    def __init__(self, stamps):
-        self.stamps = stamps
+    def __init__(self, *scans):
+        self._scans = scans
+
+    def __len__(self):
+        return len(self._scans)
 
     def scans(self, start, stop, step, _):
-        return (Scan(np.ones((3, 3)), stamp) for stamp in self.stamps[start:stop:step])
+        return iter(self._scans[start:stop:step])
+
+
+def taken(recording):
+    """The scans that are taken in, and what is said of them."""
+    faults = Faults()
+    return list(take_in(recording, range(len(recording)), faults)), faults
 
 
 @pytest.mark.parametrize(("period_s", "told"), [(1e-6, True), (0.9e-3, True), (1e-3, False), (0.1, False)])
 def test_stamps_that_no_lidar_has_are_told_once(period_s, told):
-    faults = Faults()
-    scans = list(take_in(Recorded([1000.0 + period_s * number for number in range(8)]), range(8), faults))
+    scans, faults = taken(Recorded(*(Scan(np.ones((3, 3)), 1000.0 + period_s * number) for number in range(8))))
     assert len(scans) == 8
     assert len(faults.warnings()) == told
     if told:
@@ -128,13 +136,9 @@ def test_a_driver_that_hangs_repeats_a_scan_which_counts_once(rng):
     """The same points with new stamps would be a sensor at rest."""
     first, second = rng.uniform(-8.0, 8.0, (2, 1000, 3))
 
-    class Hanging:
-        def scans(self, *_):
-            clouds = (first, second, second, second, first)
-            return (Scan(points.copy(), 0.1 * number) for number, points in enumerate(clouds))
-
-    faults = Faults()
-    assert [scan.stamp for scan in take_in(Hanging(), range(5), faults)] == [0.0, 0.1, 0.4]
+    clouds = (first, second, second, second, first)
+    scans, faults = taken(Recorded(*(Scan(points.copy(), 0.1 * number) for number, points in enumerate(clouds))))
+    assert [scan.stamp for scan in scans] == [0.0, 0.1, 0.4]
     assert faults.left_out == 2
     assert faults.warnings() == (
         "2 scans were left out: they have the points of the scan before, as from a driver that hangs;"
@@ -153,39 +157,25 @@ def spinning(times_sign=1.0, mirror=1.0):
     return Scan(points, 1.0, time_offsets=offsets, rings=np.tile(np.arange(16, dtype=np.int32), len(azimuths)))
 
 
-class OneScan:
-    def __init__(self, scan):
-        self.scan = scan
-
-    def __len__(self):
-        return 1
-
-    def scans(self, *_, **__):
-        return iter([self.scan])
-
-
 @pytest.mark.parametrize(
     ("scan", "told"),
     [(spinning(), False), (spinning(mirror=-1.0), True), (spinning(times_sign=-1.0), True)],
     ids=["clockwise", "mirrored", "reversed"],
 )
 def test_mirrored_axes_and_reversed_times_turn_the_other_way(scan, told):
-    faults = Faults()
-    list(take_in(OneScan(scan), range(1), faults))
+    _, faults = taken(Recorded(scan))
     assert len(faults.warnings()) == told
     if told:
         assert faults.warnings()[0].startswith("1 scan turns counter-clockwise as seen from above")
 
 
 def test_a_sensor_upside_down_turns_the_other_way_and_is_right():
-    faults = Faults()
-    list(take_in(MountedRecording(OneScan(spinning()), "upside-down"), range(1), faults))
+    _, faults = taken(MountedRecording(Recorded(spinning()), "upside-down"))
     assert faults.warnings() == ()
 
 
 def test_the_strokes_of_a_scanning_mirror_are_no_turn():
     scan = spinning(mirror=-1.0)
     bent = scan.points + [0.0, 0.0, 2.0] * np.sin(9.0 * np.arctan2(scan.points[:, 1], scan.points[:, 0]))[:, None]
-    faults = Faults()
-    list(take_in(OneScan(replace(scan, points=bent)), range(1), faults))
+    _, faults = taken(Recorded(replace(scan, points=bent)))
     assert faults.warnings() == ()

@@ -45,7 +45,7 @@ def add_edges(edges: Edges, raw: bytes, ros2: bool) -> None:
     """Add the transforms of a serialised message, as far as it is sound."""
     with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
         for stamped in deserialize(raw, TRANSFORMS_TYPE, ros2).transforms:
-            parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+            parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
             T_parent_child = _matrix(stamped.transform)
             edges.setdefault(parent, {})[child] = T_parent_child
             edges.setdefault(child, {})[parent] = inverse(T_parent_child)
@@ -53,19 +53,15 @@ def add_edges(edges: Edges, raw: bytes, ros2: bool) -> None:
 
 def chain(edges: Edges, target: str, source: str) -> FloatArray | None:
     """T_target_source (4, 4) along the edges; None where they do not connect the two."""
-    reached = {_name(target): np.eye(4)}
-    waiting = [_name(target)]
+    reached = {target.lstrip("/"): np.eye(4)}
+    waiting = [target.lstrip("/")]
     while waiting:
         frame = waiting.pop()
         for other, T_frame_other in edges.get(frame, {}).items():
             if other not in reached:
                 reached[other] = reached[frame] @ T_frame_other
                 waiting.append(other)
-    return reached.get(_name(source))
-
-
-def _name(frame_id: str) -> str:
-    return frame_id.lstrip("/")
+    return reached.get(source.lstrip("/"))
 
 
 def _matrix(transform: Any) -> FloatArray:
