@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.odometry.alignment import alignment as search
 from lidarslam.odometry.alignment.alignment import (
     DOUBTFUL,
     Alignment,
@@ -29,6 +30,11 @@ def street(box_room) -> list[SweepImages]:
     boxes = [((x - 0.15, y - 0.15, -5.0), (x + 0.15, y + 0.15, 5.0)) for x, y in poles]
     scene = type(box_room)((-np.inf, -6.0, -1.8), (np.inf, 6.0, np.inf), (*pilasters, *boxes))
     return scene.sweeps(2, TWIST)
+
+
+@pytest.fixture
+def no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "STEPS_M", ())
 
 
 def moved(along_m: float) -> FloatArray:
