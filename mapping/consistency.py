@@ -57,7 +57,7 @@ _LEAST_WAY_M = 0.2
 # a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
-# A stretch is contradicted by so many pairs, in runs of at least so many.
+# A stretch is contradicted by so many pairs, in runs of at least so many; or by one that another confirms.
 _LEAST_PAIRS, _FEW_PAIRS = 2, 4
 
 
@@ -399,7 +399,13 @@ def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) ->
         else:
             stretches.append([one])
     least = _LEAST_PAIRS if len(known) >= _FEW_PAIRS else 1
-    return tuple(_together(stretch) for stretch in stretches if len(stretch) >= least)
+    return tuple(_together(pairs) for pairs in stretches if len(pairs) >= least or _is_confirmed(pairs[0], known))
+
+
+def _is_confirmed(pair: Contradiction, known: Sequence[Contradiction]) -> bool:
+    """Whether another pair with the same first scan peaks at the same shift, though not as clearly."""
+    others = (other for other in known if other is not pair and other.first == pair.first)
+    return any(abs(other.shift_m - pair.shift_m) < (_TOLERANCE_BINS + 0.5) * BIN_M for other in others)
 
 
 def _together(pairs: list[Contradiction]) -> Contradiction:

@@ -244,7 +244,9 @@ class Tracker(Stateful):
         if not self._state.fits_poorly(near.status, near.quality) or self._budget.is_spent:
             return near
         turning = matcher.register_turning(self.predict(matcher.scan, prior, matcher.last, LARGEST_PROCESS_NOISE))
-        is_better = turning.is_reliable and turning.quality > _BETTER * near.quality
+        away_m = float(np.linalg.norm(turning.T_world_lidar[:3, 3] - near.T_world_lidar[:3, 3]))
+        is_near = near.status is not Status.LOST and away_m < matcher.scan.cell_m  # the same optimum
+        is_better = (turning.is_reliable or is_near) and turning.quality > _BETTER * near.quality
         return replace(turning, prediction=prediction) if is_better else near
 
     def _or_displaced(self, best: Attempt, others: Sequence[Attempt]) -> Attempt:
