@@ -140,9 +140,18 @@ class OdometryNoise:
 
     def rejects(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
         """Whether a registered motion (4, 4) fails the gate of an odometry that was consistent so far."""
-        if prior.T_prev_curr is None or self.agreed < _PROVEN_AFTER:
-            return False
-        return _squared_error(prior, T_prev_curr, config) > _GATE * self.variance
+        return self.is_proven(prior) and not self._agrees(prior, T_prev_curr, config)
+
+    def confirms(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
+        """Whether a registered motion (4, 4) passes that gate."""
+        return self.is_proven(prior) and self._agrees(prior, T_prev_curr, config)
+
+    def is_proven(self, prior: Prior) -> bool:
+        """Whether there is an odometry, which was consistent so far."""
+        return prior.T_prev_curr is not None and self.agreed >= _PROVEN_AFTER
+
+    def _agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
+        return _squared_error(prior, T_prev_curr, config) <= _GATE * self.variance
 
 
 def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> float:

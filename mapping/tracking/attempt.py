@@ -19,8 +19,9 @@ from lidarslam.mapping.tracking.fit import Fit
 _MOST_SIGMAS = 5.0
 _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
 # How much faster than predicted a sensor may move and turn, m/s and rad/s, and for how long after it was tracked; then
-# it may have been carried anywhere.
+# it may have been carried anywhere. The same where a consistent odometry measured the motion since.
 _MORE_SPEED_M_S, _MORE_TURN_RAD_S, _REACH_S = 3.0, np.deg2rad(200.0), 1.0
+_ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S = 0.3, np.deg2rad(20.0), 3.0
 # A turn that a gyroscope measured is known to this.
 _MEASURED_TURN = np.deg2rad(5.0)
 # Share of inliers that a scan needs at its prediction after a lost one.
@@ -86,15 +87,18 @@ class Attempt:
         sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
         return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
 
-    def is_reachable(self, tracked_s: float | None, turn_is_measured: bool) -> bool:
+    def is_reachable(self, tracked_s: float | None, turn_is_measured: bool, motion_is_measured: bool) -> bool:
         """Whether the sensor can have moved here since the time at which it was tracked; anywhere if it never was."""
         since_s = np.inf if tracked_s is None else self.prediction.stamp - tracked_s
-        if since_s > _REACH_S:
+        speed, turn, reach_s = float(np.linalg.norm(self.prediction.velocity[3:])), _MORE_TURN_RAD_S, _REACH_S
+        speed += _MORE_SPEED_M_S
+        if motion_is_measured:
+            speed, turn, reach_s = _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S
+        if since_s > reach_s:
             return True
         angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
-        speed = float(np.linalg.norm(self.prediction.velocity[3:]))
-        most = _MEASURED_TURN if turn_is_measured else _LEAST_JUMP[0] + _MORE_TURN_RAD_S * since_s
-        return bool(angle < most and distance_m < _LEAST_JUMP[3] + (_MORE_SPEED_M_S + speed) * since_s)
+        most = _MEASURED_TURN if turn_is_measured else _LEAST_JUMP[0] + turn * since_s
+        return bool(angle < most and distance_m < _LEAST_JUMP[3] + speed * since_s)
 
     def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:
         """Velocity (6,) after a jump or a relocalisation from the last scan's state.

@@ -54,6 +54,7 @@ class Tracker(Stateful):
     _odometry_noise: OdometryNoise
     _velocity_bias: VelocityBias
     _prediction_error_m: float
+    _is_measured: bool  # whether a consistent odometry measured every motion since the sensor was tracked
 
     def __init__(self, config: MappingConfig, budget: Budget | None = None) -> None:
         self._config = config
@@ -67,6 +68,7 @@ class Tracker(Stateful):
         self._odometry_noise = OdometryNoise()
         self._velocity_bias = VelocityBias()
         self._prediction_error_m = _UNKNOWN_ERROR_M
+        self._is_measured = False
 
     @property
     def is_unconfirmed(self) -> bool:
@@ -96,6 +98,7 @@ class Tracker(Stateful):
     ) -> Attempt:
         """Register a scan near its prediction, else relocalise it; the status is lost where neither is reliable."""
         matcher = ScanMatcher(scan, last, local_map, self._config, self._budget)
+        self._is_measured &= self._odometry_noise.is_proven(prior)
         if self._state.is_lost and self.is_searching:  # which has all the time of a lost scan
             found = self._found(matcher, prediction, prior)
             self._in_vain = found is None and not self.is_searching
@@ -130,6 +133,7 @@ class Tracker(Stateful):
         T_world_lidar, velocity, covariance = registration.T_world_lidar, registration.velocity, registration.covariance
         state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
         self._state.registered(attempt.status, attempt.relocalised, attempt.quality, scan.stamp)
+        self._is_measured |= not self._state.is_unconfirmed
         if attempt.status is Status.OK or attempt.relocalised:
             self._end_search()
         if attempt.relocalised or jumped or not self._state.velocity_known or prior.inertial is not None:
@@ -137,6 +141,7 @@ class Tracker(Stateful):
         elif is_timed:
             self._velocity_bias = self._velocity_bias.updated(last, state, scan.seen_from_s)
             state = self._velocity_bias.corrected(state)
+        motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not attempt.relocalised:
             self._update_noise(state, prior, last)
         error_m = displacement_m(attempt.correction, scan.range_m)
@@ -146,8 +151,10 @@ class Tracker(Stateful):
             velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
             state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
-        # A young map that is not added to would stay one.
-        fits = attempt.status is Status.OK or attempt.local_map.is_young
+        # A young map that is not added to would stay one; and in one that ends, as at the next flight of stairs, scans
+        # fit ever worse.
+        is_confirmed = self._odometry_noise.confirms(replace(prior, caution=_WEAK_CAUTION), motion, self._config)
+        fits = attempt.status is Status.OK or attempt.local_map.is_young or is_confirmed
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
             state=state,
@@ -176,6 +183,7 @@ class Tracker(Stateful):
     def loses(self, has_points: bool) -> bool:
         """Update with a scan that was not registered; true after so many that the map is to be given up."""
         self._prediction_error_m = _UNKNOWN_ERROR_M
+        self._is_measured &= has_points
         self._state.lost(has_points)
         return has_points and self._state.gives_up and not self.is_searching
 
@@ -281,7 +289,8 @@ class Tracker(Stateful):
             self._search.begin(matcher.search(prediction, self._map_is_due), prediction)
             self._map_is_due = False
         found, tracked_s = self._search.go_on(matcher, prediction, self._budget), self._state.tracked_s
-        return found if found and found.is_reachable(tracked_s, prior.inertial is not None) else None
+        is_inertial = prior.inertial is not None
+        return found if found and found.is_reachable(tracked_s, is_inertial, self._is_measured) else None
 
     def _end_search(self) -> None:
         self._search.drop()
