@@ -1,5 +1,6 @@
 """Where a scan is expected, from what its odometry says and how far that is to be trusted."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -195,6 +196,20 @@ def test_the_noise_of_an_odometry_follows_its_errors():
         )
     assert 50.0 < noise.variance < 200.0
     assert noise.updated(measured(), MOVED, CONFIG) == noise
+
+
+def test_an_odometry_confirms_and_rejects_motions_once_it_was_consistent_for_long():
+    prior, near, far = measured(MOVED, covariance=isotropic(0.01)), MOVED, MOVED @ exp([0.0] * 5 + [0.8])
+    prior, noise = replace(prior, caution=2.0), OdometryNoise()
+    assert not noise.confirms(prior, near, CONFIG)
+    assert not noise.rejects(prior, far, CONFIG)
+    for _ in range(10):
+        noise = noise.updated(prior, near, CONFIG)
+    assert noise.confirms(prior, near, CONFIG)
+    assert not noise.rejects(prior, near, CONFIG)
+    assert noise.rejects(prior, far, CONFIG)
+    assert not noise.confirms(prior, far, CONFIG)
+    assert not noise.confirms(measured(), near, CONFIG)
 
 
 def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_not_change():

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.mapping.consistency import ConsistencyCheck, Contradiction, Surfels, find_contradictions, shift_profile
+from lidarslam.mapping.consistency import (
+    ConsistencyCheck,
+    Contradiction,
+    PairTest,
+    Surfels,
+    find_contradictions,
+    shift_profile,
+)
 
 # A street of 120 m with buildings, parked vans and posts, driven through at 8 m/s.
 SCANS, STEP_M = 40, 0.8
@@ -113,6 +120,22 @@ def test_a_bare_tunnel_says_nothing(street):
     near = [points[np.linalg.norm(points, axis=1) < 60.0] for points in bare]
     assert len(check(near, poses([0.5 * STEP_M] * (SCANS - 1))).tests) == 0
     assert found(near, poses([0.5 * STEP_M] * (SCANS - 1))) == ()
+
+
+@pytest.mark.parametrize(("confirmed", "stretches"), [(True, 1), (False, 0)])
+def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, stretches):
+    shift_m, standing = 0.4, np.tile(np.eye(4), (31, 1, 1))
+
+    def pair(first, second, shift_m, votes, votes_at_pose):
+        near = np.zeros(41)
+        near[20], near[20 + round(10 * shift_m)] = votes_at_pose, votes
+        return PairTest(first, second, np.array([1.0, 0.0, 0.0]), np.zeros(3), shift_m, votes, near)
+
+    contradicting, weaker = pair(0, 20, shift_m, 14.0, 4.0), pair(0, 10, shift_m, 16.0, 12.0)
+    other = weaker if confirmed else pair(0, 10, 0.0, 12.0, 12.0)
+    agreeing = [pair(10, 20, 0.0, 20.0, 20.0), pair(20, 30, 0.0, 20.0, 20.0)]
+    found = find_contradictions([contradicting, other, *agreeing], standing)
+    assert [one.shift_m for one in found] == [shift_m] * stretches
 
 
 def test_poses_that_were_corrected_are_judged_as_corrected(scans):

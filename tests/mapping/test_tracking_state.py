@@ -1,8 +1,16 @@
 """What makes tracking look around, and what makes it sure again."""
 
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
 import pytest
 
+from lidarslam.core.geometry import make_transform
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.tracking.attempt import Attempt
+from lidarslam.mapping.tracking.fit import NO_FIT
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 
@@ -99,3 +107,16 @@ def test_in_a_map_begun_anew_nothing_is_usual_yet():
     state = settled()
     state.map_restarted()
     assert not state.fits_poorly(Status.OK, 0.2)
+
+
+@pytest.mark.parametrize(("since_s", "away_m", "measured", "reachable"), [
+    (0.5, 1.5, False, True), (0.5, 3.0, False, False), (1.5, 30.0, False, True),
+    (0.5, 0.6, True, True), (0.5, 1.5, True, False), (1.5, 1.5, True, False), (3.5, 30.0, True, True),
+])  # fmt: skip
+def test_a_place_is_reachable_within_the_uncertainty_of_the_motion_since(
+    since_s: float, away_m: float, measured: bool, reachable: bool
+) -> None:
+    prediction = Prediction(10.0 + since_s, np.eye(4), np.zeros(6), np.eye(12))
+    found = replace(prediction, T_world_lidar=make_transform(np.eye(3), np.array([0.0, 0.0, away_m])))
+    attempt = Attempt(prediction, cast(Any, None), cast(Any, found), NO_FIT, Status.OK, relocalised=True)
+    assert attempt.is_reachable(10.0, turn_is_measured=False, motion_is_measured=measured) == reachable
