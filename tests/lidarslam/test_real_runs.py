@@ -67,3 +67,13 @@ def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noi
     result = run(stairs, tmp_path / "run")
     assert result["ate_rmse_m"] < 0.03
     assert result["lost_scans"] == 0
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [3, 4])
+def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: Path, tmp_path: Path, step: int) -> None:
+    """The map grows with degraded scans that the odometry confirms, without which the next flight fits none."""
+    result = run(real_data / "sim_stairs", tmp_path / "run", "--step", str(step))
+    assert result["ate_rmse_m"] < 0.3
+    assert result["lost_scans"] == 0
