@@ -1,6 +1,6 @@
 """LiDAR SLAM: trajectories and maps of recorded runs and in a program's own loop, and how good they are.
 
-The names below are loaded when they are first used; `docs/python.md` shows them at work.
+The names below are loaded when they are first used; `docs/python.md` shows them in use.
 """
 
 from typing import TYPE_CHECKING

@@ -31,12 +31,12 @@ from lidarslam.viewer.rerun_environment import keep_rerun_to_itself, leave_if_ab
 
 logger = logging.getLogger(__name__)
 
-# Bytes of addresses that libraries alone take.
+# Bytes of address space that libraries alone take.
 _LEAST_ADDRESSES = 1 << 30
 
 
 class _Group(click.Group):
-    """Turns errors that the user can mend into one line on standard error; exit status 1, or 2 of a wrong usage."""
+    """Turns errors that the user can correct into one line on standard error; exit status 1, or 2 of a wrong usage."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not args:  # the help
@@ -87,7 +87,7 @@ def _usage_in_one_line() -> Iterator[None]:
 
 
 def _prepare_streams() -> None:
-    """Open closed standard streams, whose numbers the next file would get, and spell out unknown characters."""
+    """Open closed standard streams, whose numbers the next file would get, and escape unknown characters."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
@@ -109,7 +109,7 @@ def _drop_unwritable_output() -> None:
 
 
 def _require_address_space() -> None:
-    """Refuse to begin where libraries cannot be loaded: OpenBLAS waits for memory then, and for ever.
+    """Refuse to begin where libraries cannot be loaded: OpenBLAS then waits for memory forever.
 
     Raises:
         InputError: the address space is limited to less than they take.

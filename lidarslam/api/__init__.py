@@ -1,1 +1,1 @@
-"""What `lidarslam` offers to Python programs; its names are exported by the package's root."""
+"""The Python interface of `lidarslam`; its names are exported by the package's root."""

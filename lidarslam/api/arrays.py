@@ -1,4 +1,4 @@
-"""Scans from arrays: what a caller hands over is checked before it is used."""
+"""Scans from arrays, which are checked before they are used."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ _TRANSPOSED, _MOST_COLUMNS = 3, 32
 _LONGEST_OFFSET_S = 10.0
 # Of a cloud as KITTI stores it: x, y, z, intensity.
 _WITH_INTENSITY = 4
-# Thousands of years are no time in seconds.
+# Larger numbers, thousands of years, are not in seconds.
 _LATEST_STAMP_S = 1e11
-# Stamps jitter; a sweep that is longer than so many intervals between stamps has other units.
+# Stamps jitter; a sweep that is longer than this many intervals between stamps has other units.
 _MOST_INTERVALS = 4.0
 
 

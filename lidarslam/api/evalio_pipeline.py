@@ -2,7 +2,7 @@
 
     python -m lidarslam.api.evalio_pipeline run -p lidarslam -d DATASET -o DIR
 
-This is evalio's command line with the pipeline. Where evalio loads beside the installed rerun-sdk,
+This is evalio's command line with the pipeline. Where evalio loads with the installed rerun-sdk,
 `EVALIO_CUSTOM=lidarslam.api.evalio_pipeline evalio run ...` is the same.
 """
 
@@ -63,7 +63,7 @@ class LidarSlam(Pipeline):
         return dict(_DEFAULTS)
 
     def set_params(self, params: Mapping[str, bool | int | float | str]) -> dict[str, bool | int | float | str]:
-        """Take the parameters; those that there are not are returned."""
+        """Take the parameters; unknown ones are returned."""
         self._parameters.update({name: value for name, value in params.items() if name in _DEFAULTS})
         return {name: value for name, value in params.items() if name not in _DEFAULTS}
 

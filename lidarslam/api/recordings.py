@@ -22,7 +22,7 @@ class OpenRecording:
         self._faults = Faults()
 
     def __len__(self) -> int:
-        """How many scans there are; iterating leaves out those that cannot be read."""
+        """Number of scans; iterating leaves out those that cannot be read."""
         return len(self._chosen)
 
     def __iter__(self) -> Iterator[Scan]:

@@ -101,14 +101,14 @@ class Slam:
             points: (N, 3) x, y, z: metres, in the LiDAR frame (x forward, z up; others are turned by
                 `reader.mounting`) of the instant each was measured at; (N, 4) with the intensity, which goes into the
                 map; of more columns only x, y, z are taken. Or a `Scan` in that frame, which has times and stamp of its
-                own and whatever else goes into maps, and which the settings of the reader leave as it is.
+                own and the attributes that go into maps, and which the settings of the reader leave as it is.
             point_times: (N,) seconds from the stamp at which each point was measured; None when the points are
                 motion compensated, or the times unknown.
             stamp: seconds, after that of the scan before; the pose belongs to this instant. None, then for all scans:
                 they come at `reader.rate_hz`, 10 Hz unless it is configured.
 
         Raises:
-            InputError: an array or the stamp is not as described. Nothing has changed; go on with the next scan.
+            InputError: an array or the stamp is not as described. Nothing has changed; continue with the next scan.
             LidarSlamError: registration is not possible any more, or this object is closed.
         """
         with self._entered():
@@ -140,7 +140,7 @@ class Slam:
             acceleration: (3,) specific force, m/s^2: about +9.8 along the axis that points up at rest.
 
         Raises:
-            InputError: a number is not finite, or the stamp not after the last one. Nothing has changed; go on.
+            InputError: a number is not finite, or the stamp not after the last one. Nothing has changed; continue.
             ConfigError: the configured odometry uses no IMU.
         """
         self._require_open()
@@ -164,7 +164,7 @@ class Slam:
             return trajectory if result is None else Trajectory(trajectory.stamps, result.T_world_lidar)
 
     def map(self) -> PointCloud:
-        """The map of all scans so far, one point in a voxel, with normals; without what moved.
+        """The map of all scans so far, one point in a voxel, with normals; without moving objects.
 
         Raises:
             LidarSlamError: building the map failed, or this object is closed.
@@ -180,7 +180,7 @@ class Slam:
 
         Args:
             directory: made if it is not there.
-            overwrite: whether a run that lies there is replaced.
+            overwrite: whether a run that is there is replaced.
 
         Raises:
             OutputError: the directory holds something else, or cannot be written.
@@ -199,7 +199,7 @@ class Slam:
             draw_report(Path(directory), outcome)
 
     def close(self) -> None:
-        """End the threads, and let go of everything; no other method may be called afterwards."""
+        """End the threads, and release all resources; no other method may be called afterwards."""
         with self._lock:
             if self._closed:
                 return
@@ -240,7 +240,7 @@ class Slam:
         return look_at(scan, self._faults)
 
     def _corrected(self) -> tuple[Tracked, GraphOutcome | None]:
-        """What there is so far, corrected by the loops that are closed, once the background is done."""
+        """The results so far, corrected by the closed loops, once the background is done."""
         log, built = copy.deepcopy(self._log), self._pipeline.map
         closed = loops_so_far(self._graph if self._has_whole_graph() else None, built.global_map, log)
         return Tracked(TrackedScans.of(log, copy.copy(self._faults), built), built.global_map), closed

@@ -63,7 +63,7 @@ class Estimate:
 
 
 def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Estimate:
-    """A run directory, or a trajectory, in memory or in TUM or KITTI text, with the map given beside it.
+    """A run directory, or a trajectory, in memory or in TUM or KITTI text, with a map given separately.
 
     Raises:
         InputError: it is none of these, or damaged.
@@ -122,7 +122,7 @@ def recording_truth(source: Path, config: ReaderConfig) -> Poses:
 
 
 def truth_of_run(run: Path) -> Trajectory | None:
-    """The ground truth that came with the recording of a run; None without, or where it is not at hand.
+    """The ground truth that came with the recording of a run; None without, or where it is not available.
 
     Raises:
         InputError: there is no run, or it is damaged.

@@ -40,7 +40,7 @@ def read_cloud(path: Path) -> FloatArray:
         points = read(path)
     except InputError:
         raise
-    except Exception as error:  # whatever a damaged file makes of laspy, its decompressors and libE57Format
+    except Exception as error:  # damaged files make laspy, its decompressors and libE57Format raise anything
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: not a readable {kind} file ({reason}); copy it again or remove it") from error

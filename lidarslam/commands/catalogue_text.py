@@ -76,7 +76,7 @@ def _recordings(places: Iterable[Path], depth: int) -> Iterator[tuple[Path, str]
 
 
 def list_data_sets(on_disk: OnDisk) -> str:
-    """One line a data set, and how to go on."""
+    """One line per data set, and how to continue."""
     rows = [("name", "sensor", "reader", "truth", "IMU", "on disk")]
     for one in CATALOGUE:
         there = count(len(on_disk[one.name]), "recording") if on_disk.get(one.name) else "-"
@@ -94,7 +94,7 @@ def list_data_sets(on_disk: OnDisk) -> str:
 
 
 def describe_data_set(one: DataSet, on_disk: OnDisk) -> str:
-    """All that is known about one."""
+    """All known facts about one data set."""
     rows = list(_rows(one, on_disk.get(one.name, ())))
     lines = [
         f"{label if index == 0 else '':<11}{line}"

@@ -239,7 +239,7 @@ jobs_options = _together(
 
 
 def take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":
-    """The formats of the map beside .ply; the options they are made of are removed.
+    """The formats of the map besides .ply; the options they are made of are removed.
 
     Raises:
         OutputError: a library for one is not installed.

@@ -38,7 +38,7 @@ def serving() -> "Iterator[WebPage]":
 
 
 def wait_for_interrupt() -> None:
-    """Serve on until Ctrl-C or SIGTERM, which is how it ends well."""
+    """Keep serving until Ctrl-C or SIGTERM, the regular end."""
     with contextlib.suppress(KeyboardInterrupt):
         while True:  # signal.pause would sleep on after a signal that came just before it
             time.sleep(0.5)

@@ -118,13 +118,13 @@ def _show(show: Any, web: bool, file: Path | None) -> None:
 
 
 def _serve(show: "Callable[[WebPage], None]") -> None:
-    with contextlib.suppress(KeyboardInterrupt), serving() as page:  # Ctrl-C is how it ends well
+    with contextlib.suppress(KeyboardInterrupt), serving() as page:  # Ctrl-C is its regular end
         show(page)
         wait_for_interrupt()
 
 
 def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, Any]) -> Any:
-    """What is shown; its type is not named because that would import Rerun."""
+    """The scene that is shown; its type is not named because that would import Rerun."""
     from lidarslam.assessment.inputs import truth_of_run
     from lidarslam.config.settings import load_config
     from lidarslam.datasets.registry import is_recording

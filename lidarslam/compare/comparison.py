@@ -55,7 +55,7 @@ class CompareOutcome:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no method came to any result."""
+        """Whether no method has a result."""
         results = [result for sequence in self.comparison.sequences for result in sequence.methods]
         return all(result.trajectory is None for result in results)
 
@@ -85,7 +85,7 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
 def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = COMMAND) -> CompareOutcome:
     """Run, evaluate, and write comparison.json and the report.
 
-    A method that fails is a row; Ctrl-C ends the method at work, and the results so far are written. The command is the
+    A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. The command is the
     process of each method, see `run_method`.
 
     Raises:
@@ -172,7 +172,7 @@ class _Turns:
             self.narrator.tell(format_result(planned.name, results[-1], reused=earlier is not None))
         try:
             return measure(planned, results, with_maps=not self.interrupted)
-        except KeyboardInterrupt:  # maps take a while
+        except KeyboardInterrupt:  # comparing maps takes time
             self.interrupted = True
             return measure(planned, results, with_maps=False)
 
@@ -196,7 +196,7 @@ class MethodTask:
 
     run: MethodRun
     limits: Limits
-    command: Sequence[str] | None  # the process; None: that of the machine at work
+    command: Sequence[str] | None  # the process; None: that of the machine that runs it
     folder: str  # that relative paths are relative to
     url: str | None  # of the source, where it was fetched
     is_remote: bool  # whether the run directory comes back with the result: the machine may have other disks

@@ -31,12 +31,12 @@ class Demo:
     """A finished demonstration."""
 
     out: Path  # the folder that everything is in
-    outcome: CompareOutcome  # the methods beside the truth
+    outcome: CompareOutcome  # the methods compared with the truth
     pictures: tuple[Path, ...]  # of the true map and of the methods' maps
 
 
 def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], None] = lambda _: None) -> Demo:
-    """Record so many sweeps, run the methods, compare them, draw the maps; an earlier demonstration is replaced.
+    """Record this many sweeps, run the methods, compare them, draw the maps; an earlier demonstration is replaced.
 
     `tell` is called with a line for each finished method.
     """

@@ -26,7 +26,7 @@ from lidarslam.storage.directory import SUMMARY, RunDirectory
 from lidarslam.storage.finished_run import read_summary
 from lidarslam.viewer.run_report import with_run
 
-# Beside a run's own files: how its process went, and its standard error.
+# In addition to a run's own files: how its process ended, and its standard error.
 PROCESS, LOG = "process.json", "process.log"
 COMMAND = (sys.executable, "-m", "lidarslam.compare.method_process")
 # The process starts here, so that no package in the user's folder is found first.
@@ -48,7 +48,7 @@ _SHAPE = TypeAdapter(_Recorded)
 
 
 def obstacle(run: MethodRun, recording: Recording) -> str | None:
-    """Why a method cannot run on a recording; None where nothing is in its way."""
+    """Why a method cannot run on a recording; None where it can."""
     if run.peer is None:
         return None
     try:
@@ -61,10 +61,10 @@ def obstacle(run: MethodRun, recording: Recording) -> str | None:
 def run_method(
     run: MethodRun, limits: Limits, progress: Callable[[int, int], None], command: Sequence[str] = COMMAND
 ) -> tuple[MethodResult, bool]:
-    """Run a method to any end; its result, and whether it was interrupted with Ctrl-C.
+    """Run a method to any end; its result, and whether Ctrl-C interrupted it.
 
     An earlier run of a comparison in its directory is replaced. `progress` is called after every scan with its number
-    from 1 and how many there are; the encoded request is the command's last arguments.
+    from 1 and the total; the encoded request is the command's last arguments.
     """
     folder = run.request.out
     clear(folder)
@@ -85,7 +85,7 @@ def run_method(
 def clear(folder: Path) -> None:
     """Make a method's directory, or remove what a run of an earlier comparison left there."""
     for one in (folder.parent, folder):
-        if one.is_symlink():  # what it leads to is not of this comparison
+        if one.is_symlink():  # its target is not of this comparison
             one.unlink()
     if (folder / LOG).is_file():
         files.remove_files(folder)
@@ -94,10 +94,10 @@ def clear(folder: Path) -> None:
 
 
 def finished_before(run: MethodRun) -> MethodResult | None:
-    """The result of an earlier run of the same request, if it came to its end.
+    """The result of an earlier run of the same request, if it was completed.
 
     The same are the source, its scans, the prior, the program's version and the configuration; the content of the
-    source and the prior is not looked at. Of a peer, its version counts too.
+    source and the prior is not compared. Of a peer, its version counts too.
     """
     try:
         folder = run.request.out

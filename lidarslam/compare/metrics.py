@@ -17,7 +17,7 @@ GROUND_TRUTH = "ground truth"
 
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
-    """The results on one recording, one a method, with the errors of trajectories and, if asked for, of maps."""
+    """The results on one recording, one per method, with the errors of trajectories and, if asked for, of maps."""
     notes = [] if planned.range_m is None else [scene_note(planned.range_m)]
     reference = _find_reference(planned, results, notes)
     measured = [_measure_trajectory(result, reference) for result in results]

@@ -48,7 +48,7 @@ class RecordingEntry:
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    source: Path | None = None  # where it lies; None only where it is simulated
+    source: Path | None = None  # its path; None only where it is simulated
     name: str | None = None  # in tables and of its folder; None: the recording's own
     set: tuple[str, ...] = ()  # settings for this recording alone, `key.path=value`
     # start, stop, step: which scans, as in `range`
@@ -92,7 +92,7 @@ class CompareRequest:
 
 @dataclass(frozen=True, eq=False)
 class PlannedRecording:
-    """One recording under a name of its own, and its runs, one a method, each into a directory with its name."""
+    """One recording under a name of its own, and its runs, one per method, each into a directory with its name."""
 
     name: str
     source: Path

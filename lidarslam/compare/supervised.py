@@ -15,7 +15,7 @@ import psutil
 from lidarslam.core.child_processes import bound
 from lidarslam.core.files import open_own
 
-# Between two looks at the memory; a look costs a millisecond or two of a core.
+# Between two samples of the memory; a sample costs a millisecond or two of a core.
 _PERIOD_S = 0.2
 # For an interrupted command to write its results.
 _GRACE_S = 60.0
@@ -82,7 +82,7 @@ def supervise(
 
 def _pass_on(lines: Iterable[str] | None, on_line: Callable[[str], None]) -> None:
     for line in lines or ():
-        with contextlib.suppress(Exception):  # the pipe has to be emptied, or the process waits for ever
+        with contextlib.suppress(Exception):  # the pipe has to be emptied, or the process waits forever
             on_line(line.rstrip("\n"))
 
 

@@ -1,6 +1,6 @@
 """The whole configuration, composed of the libraries' own; YAML in and out.
 
-Defaults live in the code, beside what consumes them; a file or `--set` holds only what differs.
+Defaults are in the code, next to their use; a file or `--set` holds only the differences.
 """
 
 import difflib
@@ -59,7 +59,7 @@ class CheckpointConfig(BaseModel):
 
 
 class Config(BaseModel):
-    """Everything that decides what a run computes."""
+    """Everything that determines the results of a run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -149,7 +149,7 @@ def setting(key: str, text: str) -> str:
 
 
 def dump_yaml(config: BaseModel, described: dict[str, Any] | None = None, section: str = RUN_SECTION) -> str:
-    """The resolved configuration as commented YAML, after a section that says what was computed."""
+    """The resolved configuration as commented YAML, after a section that describes the run."""
     if described is None:
         return settings_as_yaml(config)
     first = yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)
@@ -172,7 +172,7 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
 
 
 def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> None:
-    """Put a value into the tree, a section beside what is there."""
+    """Put a value into the tree; a section is merged into the existing one."""
     *sections, last = dotted.split(".")
     for key in sections:
         branch = tree.setdefault(key, {})

@@ -1,1 +1,1 @@
-"""The vocabulary every other package speaks: geometry, scans, trajectories, errors."""
+"""The types that all other packages share: geometry, scans, trajectories, errors."""

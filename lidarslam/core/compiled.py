@@ -37,12 +37,12 @@ def compiled(function: Function) -> Function:
     """The function, compiled on its first call for the types of its arguments, and kept on disk for the next process.
 
     It may use NumPy arrays, numbers and tuples of them, constants of its own file, and other compiled functions by
-    their own names: what is kept on disk is outdated when a file of these functions changes. Arithmetic is IEEE's, in
+    their own names: the code on disk is outdated when a file of these functions changes. Arithmetic is IEEE's, in
     the order that is written; divisions by zero give infinity or NaN, as in NumPy. Indices are not checked.
 
-    Kept beside the source, else in the user's cache folder, else in a temporary folder of the user. What was kept
-    beside the source when the program was installed is used wherever the rest is kept. Where nothing can be kept (a
-    full disk, a damaged file), every process compiles the rest anew.
+    Kept next to the source, else in the user's cache folder, else in a temporary folder of the user. Code that was kept
+    next to the source when the program was installed is used wherever the rest is kept. Where nothing can be kept (a
+    full disk, a damaged file), every process compiles the rest again.
     """
     dispatcher = _kept_on_disk(function)
     if hasattr(dispatcher, "_cache"):  # not where numba is switched off
@@ -97,7 +97,7 @@ def is_compiled(module: ModuleType) -> bool:
 def _kept_on_disk(function: Function) -> Any:
     try:
         return _njit(function, cache=True, **_OPTIONS)
-    except RuntimeError as reason:  # neither beside the source nor in a cache folder of the user
+    except RuntimeError as reason:  # neither next to the source nor in a cache folder of the user
         _log.info("%s", reason)
     configured, _config.CACHE_DIR = _config.CACHE_DIR, _temporary_folder()
     try:
@@ -159,7 +159,7 @@ def _stamp(file: str) -> str:
 
 
 def _installed_with(cache: Any) -> Any | None:
-    """The machine code beside a function's source, for a cache that lies elsewhere."""
+    """The machine code next to a function's source, for a cache that is elsewhere."""
     if not hasattr(cache, "_cache_file"):
         return None
     beside = str(Path(cache._py_func.__code__.co_filename).parent / "__pycache__")
@@ -170,7 +170,7 @@ def _installed_with(cache: Any) -> Any | None:
 
 
 class _Installed(InTreeCacheLocator):
-    """The folder beside a function's source, where it cannot be written."""
+    """The folder next to a function's source, where it cannot be written."""
 
     def ensure_cache_path(self) -> None:
         """Nothing is made."""
@@ -181,7 +181,7 @@ class _InstalledImpl(CompileResultCacheImpl):
 
 
 class _InstalledCache(FunctionCache):
-    """The machine code beside a function's source, where there is no folder for the rest."""
+    """The machine code next to a function's source, where there is no folder for the rest."""
 
     _impl_class = _InstalledImpl
 
@@ -190,7 +190,7 @@ class _InstalledCache(FunctionCache):
         _warn_of_compiling_anew()
 
     def flush(self) -> None:
-        """Nothing is made anew."""
+        """Nothing is made again."""
 
 
 class _ForgivingCache:
@@ -215,7 +215,7 @@ class _ForgivingCache:
             return False
 
     def load_overload(self, *arguments: Any) -> Any:
-        """What is kept for these types; None when there is nothing, or nothing that can be read."""
+        """The machine code kept for these types; None when there is none that can be read."""
         loaded = self._load(*arguments)
         if loaded is None and self._installed is not None:
             own, self._cache._cache_file = self._cache._cache_file, self._installed
@@ -235,7 +235,7 @@ class _ForgivingCache:
             return None
 
     def save_overload(self, *arguments: Any) -> None:
-        """Keep what was compiled, if that is possible."""
+        """Keep the compiled code, if that is possible."""
         try:
             self._cache.save_overload(*arguments)
         except Exception as reason:

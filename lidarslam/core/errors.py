@@ -1,12 +1,12 @@
-"""Errors that a user can mend.
+"""Errors that a user can correct.
 
 Everything derived from `LidarSlamError` is caught once, at the command line, and printed as one line without a
-traceback; its message says what was expected, what came, and what to do.
+traceback; its message names the expected input, the actual one, and the remedy.
 """
 
 
 class LidarSlamError(Exception):
-    """Base of every error a user can mend."""
+    """Base of every error a user can correct."""
 
 
 class InputError(LidarSlamError):

@@ -34,7 +34,7 @@ _MARK = b"\xef\xbb\xbf"  # of byte order
 
 @contextlib.contextmanager
 def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
-    """Write a file atomically: a temporary path beside it, renamed to it when the block ends without an error.
+    """Write a file atomically: a temporary path next to it, renamed to it when the block ends without an error.
 
     Args:
         path: the file; an earlier one stays until then.
@@ -64,7 +64,7 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
 
 
 def remove_partial_files(directory: Path) -> None:
-    """Remove what `replacing` left in a directory when the process was killed."""
+    """Remove the files that `replacing` left in a directory when the process was killed."""
     for partial in directory.glob(f"{_PARTIAL}*"):
         if not partial.is_dir():
             partial.unlink(missing_ok=True)
@@ -87,11 +87,11 @@ def make_directory(path: Path) -> None:
 
 
 def open_own(path: Path, anew: bool = False) -> BinaryIO:
-    """Open a file of this program for reading and writing, or make it; what a link leads to is never written.
+    """Open a file of this program for reading and writing, or make it; the target of a link is never written.
 
     Args:
         path: the file, in a folder of this program.
-        anew: whether whatever lies there is replaced by an empty file.
+        anew: whether an existing file is replaced by an empty one.
 
     Raises:
         OutputError: it is a link, has a second name elsewhere (a hard link), or is no ordinary file.
@@ -163,7 +163,7 @@ def only_writer(directory: Path, patience_s: float = 0.0) -> Iterator[None]:
 
 
 def _is_locked(descriptor: int) -> bool:
-    """Lock a directory; whether it is ours, or cannot be locked at all."""
+    """Lock a directory; whether it is ours, or cannot be locked."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

@@ -101,7 +101,7 @@ def log(T: FloatArray) -> FloatArray:
 
 
 def _exp_one(xi: FloatArray) -> FloatArray:
-    """As `exp`, (4, 4) of the only tangent vector; for so little, arrays cost ten times as much as the arithmetic."""
+    """As `exp`, (4, 4) of the only tangent vector; arrays would cost ten times as much as the arithmetic."""
     a, b, c, x, y, z = xi.reshape(6).tolist()
     angle = math.sqrt(a * a + b * b + c * c)
     if not math.isfinite(angle):

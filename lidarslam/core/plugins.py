@@ -1,4 +1,4 @@
-"""Plug points: what other packages add as entry points in the groups `lidarslam.odometry`, `lidarslam.mapping` etc."""
+"""Plug points: entry points of other packages in the groups `lidarslam.odometry`, `lidarslam.mapping` etc."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ Group = Literal["odometry", "mapping", "reader", "peer", "metric"]
 
 @dataclass(frozen=True)
 class PlugPoint:
-    """The names of a group: the built-in ones, and those of other packages, searched only where the former do not do.
+    """The names of a group: the built-in ones and, searched only when needed, those of other packages.
 
     Args:
         group: of entry points, without `lidarslam.`.
@@ -59,7 +59,7 @@ class PlugPoint:
         return self._of_kind(name, loaded, kind)
 
     def make(self, name: str, kind: Any, *arguments: object) -> Any:
-        """What a callable that is loaded likewise returns."""
+        """The result of a callable that is loaded likewise."""
         return self._of_kind(name, self.load(name, Callable)(*arguments), kind)
 
     def _of_kind(self, name: str, given: Any, kind: Any) -> Any:
@@ -74,7 +74,7 @@ class PlugPoint:
 @cache
 def search(point: PlugPoint) -> "Mapping[str, EntryPoint]":
     """The entry points of other packages, by name; a name that is taken is left out with a warning."""
-    from importlib.metadata import entry_points  # takes a while, as the search does
+    from importlib.metadata import entry_points  # slow, as the search is
 
     found: dict[str, EntryPoint] = {}
     for entry in entry_points(group=f"lidarslam.{point.group}"):
@@ -87,7 +87,7 @@ def search(point: PlugPoint) -> "Mapping[str, EntryPoint]":
 
 @cache
 def usable(point: PlugPoint, kind: Any) -> Mapping[str, Any]:
-    """The objects of other packages, by name; what cannot be loaded is left out with a warning."""
+    """The objects of other packages, by name; those that cannot be loaded are left out with a warning."""
     found = {}
     for name in point.added:
         try:

@@ -13,11 +13,11 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape
 from lidarslam.core.trajectory import Trajectory
 
-# No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
+# No LiDAR reaches farther; points beyond are a driver's marker or a damaged file.
 _MAX_RANGE_M = 10_000.0
 # No LiDAR has more lasers; a number beyond is that of something else, or damaged.
 _MOST_RINGS = 4096
-# The fields of a scan with an entry for each point, beside the points.
+# The fields of a scan with an entry for each point, other than the points.
 _COLUMNS = ("time_offsets", "rings", "intensities", "colours")
 
 
@@ -38,7 +38,7 @@ class PointAttributes:
             raise ValueError(f"rgb must be (N, 3), got {self.rgb.shape}")
 
     def present(self) -> Iterator[tuple[str, NDArray[np.generic]]]:
-        """Names and values of those that there are."""
+        """Names and values of the known ones."""
         named = ((field.name, getattr(self, field.name)) for field in fields(self))
         return ((name, values) for name, values in named if values is not None)
 
@@ -111,12 +111,12 @@ class Scan:
         intensities: ArrayLike | None = None,
         colours: ArrayLike | None = None,
     ) -> Self:
-        """Make a scan of a driver's raw points, leaving out invalid ones with all that belongs to them.
+        """Make a scan of a driver's raw points, leaving out invalid ones with their attributes.
 
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
         the origin (a driver's mark for "no return") and points beyond 10 km. A time that is not finite is
         interpolated between the nearest ones in the stored order; where that is more than half of the points, the
-        times are worth nothing and are left out. So are rings when one of them is no number of a laser.
+        times are useless and are left out. So are rings when one of them is no number of a laser.
         """
         with np.errstate(invalid="ignore"):  # damaged bytes may be any number
             raw = np.asarray(points, dtype=np.float64)
@@ -145,7 +145,7 @@ class Scan:
             lasers = None if lasers is None else lasers[kept]
             brightness = None if brightness is None else brightness[kept]
             rgb = None if rgb is None else rgb.take(kept, axis=0)
-        # Invalid points may carry NaN for a ring, which no integer can hold: judge and cast what is left.
+        # Invalid points may carry NaN for a ring, which no integer can hold: judge and cast the others.
         if lasers is not None and not ((lasers >= 0) & (lasers < _MOST_RINGS)).all():
             lasers = None
         lasers = None if lasers is None else lasers.astype(np.int32)
@@ -158,7 +158,7 @@ class Scan:
         return replace(self, time_offsets=scale * self.time_offsets)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":
-        """The scan with only the chosen points (a mask or indices), and what belongs to them."""
+        """The scan with only the chosen points (a mask or indices), and their attributes."""
         chosen = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
         columns = {name: getattr(self, name) for name in _COLUMNS}
         return Scan(

@@ -1,10 +1,10 @@
-"""The state of a computation, saved and restored, for going on where a run stopped.
+"""The state of a computation, saved and restored, to resume a stopped run.
 
 Values become trees of arrays, numbers and texts, driven by type hints; never code. Known are bool, int, float, str,
 enumerations, `T | None`, `NDArray[dtype]` (with `Annotated[..., Shape(None, 3)]` the shape too), `list[T]`,
 `tuple[T, ...]`, `tuple[A, B]`, `dict[K, V]`, dataclasses and `Stateful` classes, nested at will. Lists are stored by
 columns: a list of a thousand (4, 4) arrays is one array (1000, 4, 4), a list of dataclasses a list for each field.
-What is read back has the types and shapes of its hints.
+Values that are read back have the types and shapes of their hints.
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ class Saved:
     Args:
         values: the tree.
         place: the file, and where in it, for errors.
-        remedy: what to do where it is of no use, for errors.
+        remedy: what to do where it cannot be used, for errors.
     """
 
     def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:
@@ -124,7 +124,7 @@ class Stateful:
         self._after_restore()
 
     def _after_restore(self) -> None:
-        """Rebuild what is not saved."""
+        """Rebuild the attributes that are not saved."""
 
 
 def encode(kind: Any, value: Any) -> Any:
@@ -292,7 +292,7 @@ class BlockFile(Stateful):
     """Blocks of bytes in an append-only file, made with the first; a saved state has those written before it.
 
     Args:
-        directory: where a file without a name lies while it is needed; None: the system's temporary directory.
+        directory: where a file without a name is kept while it is needed; None: the system's temporary directory.
         file: a file that outlives the program instead, for `restore`.
     """
 
@@ -316,7 +316,7 @@ class BlockFile(Stateful):
         return super().state()
 
     def restore(self, saved: Saved) -> None:
-        """Go on from a state.
+        """Resume from a state.
 
         Raises:
             InputError: the file is damaged.
@@ -337,7 +337,7 @@ class BlockFile(Stateful):
         return self._ends[-1]
 
     def write(self, block: bytes) -> None:
-        """Keep one more; what lies behind the last was written after the state that was restored.
+        """Append one; any data after the last block was written after the restored state.
 
         Raises:
             OSError: the disk is full.
@@ -356,7 +356,7 @@ class BlockFile(Stateful):
         return self._file.read(self._ends[index + 1] - self._ends[index])
 
     def close(self) -> None:
-        """Give the space back."""
+        """Free the space."""
         self._is_closed = True
         if self._open:
             self._file.close()

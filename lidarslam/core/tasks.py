@@ -21,7 +21,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 # Of a task whose process or machine died.
 _RETRIES = 3
-# Results are small; what does not fit is written to disk.
+# Results are small; larger ones are written to disk.
 _OBJECT_STORE_BYTES = 128 * 2**20
 _ANSWER_S = 5.0
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -45,11 +45,11 @@ class Tasks(Protocol):
         Args:
             function, items: of a module that can be imported, and to be pickled; the same item always has the same
                 result, as a task whose process or machine died is carried out again.
-            on_done: called for each task; after Ctrl-C too, for tasks that come to a result nevertheless.
+            on_done: called for each task; after Ctrl-C too, for tasks that still have a result.
             ahead: number of tasks begun before the result of the first of them is taken; None: all.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C; no task is at work any more.
+            KeyboardInterrupt: Ctrl-C; no task is running any more.
             LidarSlamError: a task raised it, or its process died repeatedly.
         """
 
@@ -91,7 +91,7 @@ class InOrder:
 
 
 def open_tasks(where: Where) -> contextlib.AbstractContextManager[Tasks]:
-    """What carries out tasks there, for the time of the context.
+    """The executor of the tasks, for the duration of the context.
 
     Raises:
         ConfigError: Ray is not installed, or no cluster has that address.
@@ -212,14 +212,14 @@ def _end(running: dict[Any, int], results: dict[int, Any], on_done: OnDone | Non
 
 
 def _of_task(error: Any) -> Exception:
-    """What a task raised."""
+    """The error that a task raised."""
     if isinstance(error.cause, ImportError):
         return ConfigError(f"a node of the cluster lacks a library or has another lidarslam: {error.cause}")
     return error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))
 
 
 def _carry_out(shared: tuple[Callable[[T], R], str], item: T) -> R | LidarSlamError:
-    """One task, in a process of Ray; an error that the user can mend is its result.
+    """One task, in a process of Ray; an error that the user can correct is its result.
 
     Ray would try to pickle the error itself, with the arguments of its class.
     """

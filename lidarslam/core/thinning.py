@@ -11,12 +11,12 @@ from lidarslam.core.geometry import FloatArray
 # Cells share this many slots; where two meet in one slot, one of them is dropped (a few per cent of a large scan).
 _SLOTS = 1 << 20
 _PRIME_X, _PRIME_Y, _PRIME_Z = 73_856_093, 19_349_669, 83_492_791
-# Farther away, in cells, all is one cell: integers go no farther.
+# Points farther away, in cells, share one cell: the range of the integers.
 _FARTHEST = float(1 << 31)
 # How many elements ahead loops prefetch.
 _PREFETCHED = 32
 
-# Slots of this thread; they are never cleared, as allocating them for every scan takes longer than all the rest.
+# Slots of this thread; they are never cleared, as allocating them for every scan takes longer than all other work.
 _room = threading.local()
 
 
@@ -103,7 +103,7 @@ def _most_central(
     Args:
         points, slots: which.
         cells: of all slots, written: the number of the cell in it.
-        sums: (N, 4) room for sums of coordinates and how many they are of, by cell.
+        sums: (N, 4) room for sums of coordinates and the number of points, by cell.
         nearest: (N,) written, by cell.
     """
     count = 0

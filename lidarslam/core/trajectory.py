@@ -1,6 +1,6 @@
 """A sequence of poses in time, and its text files; the only file that knows a quaternion's order.
 
-TUM: `stamp tx ty tz qx qy qz qw`, a pose a line, `#` comments. KITTI: twelve numbers a line, the first three rows
+TUM: `stamp tx ty tz qx qy qz qw`, one pose per line, `#` comments. KITTI: twelve numbers per line, the first three rows
 of the pose matrix, no stamps.
 """
 
@@ -84,7 +84,7 @@ class Trajectory:
     def from_kitti(
         cls, path: str | PathLike[str], stamps: ArrayLike | None = None, T_cam_lidar: FloatArray | None = None
     ) -> "Trajectory":
-        """Read KITTI's text format: the first three rows of a pose matrix a line, without stamps.
+        """Read KITTI's text format: the first three rows of a pose matrix per line, without stamps.
 
         Args:
             path: of the file.

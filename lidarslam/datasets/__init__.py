@@ -1,1 +1,1 @@
-"""One reader a file; the registry names them."""
+"""Readers, one per file; the registry lists them."""

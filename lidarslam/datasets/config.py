@@ -45,6 +45,6 @@ class ReaderConfig(BaseModel):
     )
 
     def raised_deg(self, of_reader: float = 0.0) -> float:
-        """By how much all points are raised, given what their reader does unless the settings have it."""
+        """The angle by which all points are raised: that of the settings, else the one given by their reader."""
         setting = self.elevation_correction_deg
         return setting if isinstance(setting, float) else of_reader

@@ -19,11 +19,11 @@ logger = logging.getLogger(__name__)
 _URL = re.compile(r"([a-z][a-z0-9+.-]*):/+(.+)", re.DOTALL)
 # Kinds of storage. Others of fsspec's lead to further URLs, or render templates from their content.
 _STORAGE = ("file", "http", "https", "s3", "gs")
-# Beside a fetched source; and what has been fetched of one so far, with the version of each file.
+# Next to a fetched source; and the parts fetched so far, with the version of each file.
 _ABOUT, _PARTIAL, _VERSION = "url.txt", ".partial", ".fetched-version"
-# What a storage says of a file that changes with its content, beside its size.
+# Properties of a stored file that change with its content, besides its size.
 _CHANGING = ("ETag", "etag", "Last-Modified", "LastModified", "md5Hash", "generation", "mtime")
-# Bytes of a source at most, and of what is read at once; seconds without a byte after which a server has failed.
+# Bytes of a source at most, and of one read; seconds without a byte after which a server has failed.
 _MOST_BYTES, _BLOCK_BYTES, _SILENCE_S = 2**40, 2**23, 60.0
 
 
@@ -68,9 +68,9 @@ def url_of(path: Path) -> str | None:
 
 
 def fetch(url: str, path: Path) -> None:
-    """Fetch a file or a folder, unless it is there; of several processes that want it, one does so.
+    """Fetch a file or a folder, unless it is there; of several processes that need it, one does so.
 
-    What an interrupted download left is continued, where the storage reads from the middle of a file.
+    An interrupted download is continued, where the storage can read from the middle of a file.
 
     Raises:
         InputError: fsspec or the library for this kind of URL is not installed, or it cannot be fetched.
@@ -122,7 +122,7 @@ def _download(url: str, place: Path) -> None:
 
 
 def _patience(url: str) -> dict[str, Any]:
-    """Options by which a server may take any time, as long as bytes arrive: the default is five minutes in all."""
+    """Options without a limit on the total time, as long as bytes arrive: the default is five minutes in all."""
     if not url.startswith("http"):
         return {}
     from aiohttp import ClientTimeout
@@ -131,7 +131,7 @@ def _patience(url: str) -> dict[str, Any]:
 
 
 def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
-    """Fetch what is missing of a file; return the bytes of the source so far, which were `before` without it."""
+    """Fetch the missing part of a file; return the bytes of the source so far, which were `before` without it."""
     about = storage.info(remote)
     size = about.get("size")
     marks = [str(about[key]) for key in _CHANGING if about.get(key) is not None]

@@ -15,7 +15,7 @@ from lidarslam.datasets.recording import ImuSummary
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
 _IN_G = (0.7, 1.5)  # as `GRAVITY_RANGE`, of accelerations in g
-# Ranges of sensors begin here: rad/s and m/s^2. A sensor out of its range repeats its largest value so often in a row.
+# Ranges of sensors begin here: rad/s and m/s^2. A saturated sensor repeats its largest value this often in a row.
 _LEAST_RANGES, _REPEATED = (1.0, 15.0), 3
 # Share of missing samples that is noted.
 _MISSING = 0.02
@@ -36,14 +36,14 @@ def usable_samples(
     """The samples in the order of time; None where there are none.
 
     Samples with a number that is not finite or the stamp of another one are left out, and those out of the sensor's
-    range; accelerations in g are converted. All is noted, and samples that are missing.
+    range; accelerations in g are converted. All this is noted, and missing samples too.
 
     Args:
         stamps: (N,) seconds, in any order.
         angular_velocities: (N, 3) rad/s.
         accelerations: (N, 3) specific force, m/s^2 or g.
         T_lidar_imu: (4, 4) or None if unknown.
-        notes: what is known about the samples already.
+        notes: known facts about the samples.
     """
     finite = np.isfinite(np.column_stack([stamps, angular_velocities, accelerations])).all(axis=1)
     finite_rows = np.flatnonzero(finite)

@@ -40,7 +40,7 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
 
 
 def describe_as_json(source: Path, config: ReaderConfig) -> str:
-    """The same as JSON with the keys of docs/command_line.md, all of them always; null for what is not known.
+    """The same as JSON with the keys of docs/command_line.md, all of them always; null for unknown values.
 
     Raises:
         InputError: the source cannot be read.
@@ -57,7 +57,7 @@ def describe_as_json(source: Path, config: ReaderConfig) -> str:
 
 
 def _content(source: Path, reader: str) -> dict[str, Any]:
-    """All keys, with what is known before the recording is opened."""
+    """All keys, with the values known before the recording is opened."""
     names = ("topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan", "point_time")
     unknown = dict.fromkeys((*names, "ground_truth", "imu"))
     return {

@@ -1,4 +1,4 @@
-"""Scans of a recording on their way to a run: ordered by stamp, thinned where too large, checked once."""
+"""Scans of a recording as a run takes them: ordered by stamp, thinned where too large, checked once."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,11 +20,11 @@ _MOST_POINTS = 1 << 20
 _CELL_M = 0.02
 # Of ranges: this share is nearer than the near one, and farther than the far one.
 _SHARE = 0.01
-# Something is always nearer to a sensor on the ground; sensors that look all round do not reach so far.
+# Something is always nearer to a sensor on the ground; sensors with a view all round do not reach so far.
 _NEAR_M, _FAR_M = 20.0, 400.0
 # From an aircraft everything lies on one side and is about as far; this far, with such a spread, nothing does.
 _HALF_M, _SPREAD = 3000.0, 5.0
-# Length of the points' mean direction: near 0 all round, 0.75 in a cone of 60 degrees about its axis.
+# Length of the points' mean direction: near 0 for points all round, 0.75 in a cone of 60 degrees about its axis.
 _ALL_ROUND = 0.5
 # No sweep is so short; the times of a flash are, and so are those in another unit.
 _SHORTEST_SWEEP_S = 1e-3
@@ -85,7 +85,7 @@ def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Sca
 
 
 def _without_repeats(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
-    """The scans that have been measured anew: the noise of two measurements is never the same."""
+    """The scans that are new measurements: the noise of two measurements is never the same."""
     last: Scan | None = None
     for scan in scans:
         if last is not None and len(scan) > _FEW_POINTS and _is_repeated(scan.points, last.points):

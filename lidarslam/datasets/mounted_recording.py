@@ -16,7 +16,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting import UPRIGHT, Guess, corrected, guess_mounting, transform_of, written
 from lidarslam.datasets.recording import Recording, RecordingInfo
 
-# Scans from one that a guess looks at to the next.
+# Step between the scans that a guess uses.
 _STEP = 4
 
 
@@ -98,7 +98,7 @@ class MountedRecording:
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
     ) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`, in upright axes."""
-        _ = self.T_upright_recorded  # guessed before the first scan: two passes through one file may not alternate
+        _ = self.T_upright_recorded  # guessed before the first scan: two passes over one file may not alternate
         scans = self.recorded.scans(start, stop, step, faults)
         is_as_recorded = not (self._is_turned or self.raised_deg) and self._time_scale == 1.0
         return scans if is_as_recorded else map(self._upright, scans)

@@ -14,7 +14,7 @@ from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
 
-# Roll, pitch, yaw in degrees of the recorded axes: which way the recorded z axis points, seen by who looks along x.
+# Roll, pitch, yaw in degrees of the recorded axes: the direction of the recorded z axis, as seen along x.
 _ANGLES_DEG: dict[MountingName, RollPitchYaw] = {
     "upright": (0.0, 0.0, 0.0),
     "upside-down": (180.0, 0.0, 0.0),
@@ -45,7 +45,7 @@ _MOST_OPPOSITE = 0.01
 _FAR_TO_ONE_SIDE, _NEAR_TO_OTHER, _STRAY_SHARE = np.sin(np.deg2rad(35.0)), np.sin(np.deg2rad(9.0)), 0.005
 _SCANS = 5
 _ENOUGH_SCANS, _SOME_SCANS = 4, 2
-# Points farther than so many median ranges are left out; cells are this share of the median range.
+# Points farther than this many median ranges are left out; cells are this share of the median range.
 _FAR, _CELL_SHARE, _LEAST_CELL_M = 4.0, 1.0 / 30.0, 0.05
 _MOST_READ, _MOST_POINTS, _MOST_NORMALS, _NEIGHBOURS = 40_000, 8000, 3000, 10
 # Neighbours lie in a plane when the least variance is this share of the next.
@@ -59,7 +59,7 @@ _BENEATH_M, _BENEATH_SHARE = 0.5, 0.05
 
 
 def transform_of(mounting: Mounting) -> FloatArray:
-    """T_upright_recorded (4, 4), a rotation; exact of quarter turns, and the identity where it is `auto`."""
+    """T_upright_recorded (4, 4), a rotation; exact of quarter turns, and the identity for `auto`."""
     if mounting == "auto" or mounting == "upright":  # noqa: PLR1714 - mypy narrows by it
         return np.eye(4)
     from scipy.spatial.transform import Rotation  # takes a while to load
@@ -225,17 +225,17 @@ def _sphere(count: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Guess:
-    """What the first scans show of the mounting."""
+    """The mounting as the first scans show it."""
 
-    mounting: Mounting = "upright"  # that acts
-    warning: str | None = None  # what was guessed, or cannot be decided; with the setting
+    mounting: Mounting = "upright"  # that is applied
+    warning: str | None = None  # the guess, or that it cannot be decided; with the setting
 
 
 UPRIGHT = Guess()
 
 
 def guess_mounting(scans: Iterable[FloatArray]) -> Guess:
-    """The guess from the points (N, 3) of scans, of which no more are taken than needed."""
+    """The guess from the points (N, 3) of scans, of which no more are read than needed."""
     found: list[FloatArray] = []
     unclear: list[FloatArray] = []
     for number, points in enumerate(scans):
@@ -283,7 +283,7 @@ def _upwards(points: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     if _sees_one_side(points, R_image_recorded[2]):
         return None, None
     axis = None if np.array_equal(R_image_recorded, np.eye(3)) else R_image_recorded[2]
-    # Beside the spin axis a wall is like the ground of a sensor on its side.
+    # Next to the spin axis a wall is like the ground of a sensor on its side.
     across = [plane for plane in seen if abs(plane.up @ R_image_recorded[2]) > _UPRIGHT]
     grounds = [plane for plane in across if plane.up[2] < _TURNED and _is_ground(plane, seen, axis)]
     largest = max(grounds, key=lambda plane: plane.share, default=None)
@@ -303,7 +303,7 @@ def _sees_one_side(points: FloatArray, axis: FloatArray) -> bool:
 
 
 def _is_ground(plane: Plane, seen: Sequence[Plane], axis: FloatArray | None) -> bool:
-    """Whether a plane is the ground without doubt; less is asked of one that the sensor spins parallel to."""
+    """Whether a plane is certainly the ground; the criterion is weaker for one that the sensor spins parallel to."""
     if plane.height_m > _MOST_HEIGHT_M:
         return False
     opposite = max((other.share for other in seen if other.up @ plane.up < -_ALIKE), default=0.0)

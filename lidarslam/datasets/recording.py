@@ -79,7 +79,7 @@ class RecordingInfo:
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean scans a second; None where the duration is zero."""
+        """Mean scans per second; None where the duration is zero."""
         return (self.scans - 1) / self.duration_s if self.duration_s > 0.0 else None
 
 
@@ -92,7 +92,7 @@ class Recording(ScanSequence, Protocol):
 
     @property
     def imu(self) -> ImuSamples | None:
-        """The samples of the IMU beside the LiDAR; None without one.
+        """The samples of the IMU; None without one.
 
         Raises:
             InputError: they cannot be read.

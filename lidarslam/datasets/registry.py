@@ -18,7 +18,7 @@ from lidarslam.datasets.unrecognised import absent, result_of_program, unrecogni
 
 logger = logging.getLogger(__name__)
 
-# Of rosbag2; a recorder that was killed leaves such a file without the metadata.yaml beside it.
+# Of rosbag2; a recorder that was killed leaves such a file without its metadata.yaml.
 _BAG_SUFFIXES = (".db3", ".mcap")
 _PACKET_SUFFIXES = (".pcap", ".pcapng", ".osf")
 
@@ -41,7 +41,7 @@ def _is_rosbag(source: Path) -> bool:
 
 
 def _bag_of_folder(folder: Path) -> Path:
-    """The rosbag1 file that bears its folder's name, as simulated recordings have it beside their truth and map."""
+    """The rosbag1 file that bears its folder's name, as simulated recordings have it next to their truth and map."""
     return folder / f"{folder.resolve().name}.bag"
 
 

@@ -27,7 +27,7 @@ _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "grou
 class StoredRecording:
     """A file or folder; implements `Recording`.
 
-    A reader adds `__len__`, `_items`, `_read`, `_fields` and `_last_stamp`, and what there is of truth, IMU and notes.
+    A reader adds `__len__`, `_items`, `_read`, `_fields` and `_last_stamp`, and truth, IMU and notes where they exist.
     """
 
     reader: str
@@ -57,7 +57,7 @@ class StoredRecording:
 
     @property
     def imu(self) -> ImuSamples | None:
-        """The samples of the IMU beside the LiDAR."""
+        """The samples of the IMU."""
         return None
 
     @property
@@ -111,7 +111,7 @@ class StoredRecording:
         )
 
     def _first(self, faults: Faults) -> tuple[Any, Scan]:
-        """The first readable scan, and what it is read from; the error of the first one where none can be read."""
+        """The first readable scan, and its item; the error of the first one where none can be read."""
         first_error = None
         for item in self._items(range(len(self)), faults, False):
             try:
@@ -123,7 +123,7 @@ class StoredRecording:
         raise first_error or InputError(f"{self._source}: holds no scan that could be used; record it again{left_out}")
 
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:
-        """What each of the wanted scans is read from; others are counted, or, where it is strict, an error."""
+        """The items that the wanted scans are read from; others are counted, or, where it is strict, an error."""
         raise NotImplementedError
 
     def _read(self, item: Any, faults: Faults) -> Scan:

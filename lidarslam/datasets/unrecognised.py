@@ -1,4 +1,4 @@
-"""What a path is that no reader recognises, and what to do about it."""
+"""Explanations of paths that no reader recognises, and what to do about them."""
 
 import re
 from collections import Counter
@@ -45,7 +45,7 @@ _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
 
 
 def absent(source: Path) -> str:
-    """Why a path does not exist, with the names that are like it."""
+    """Why a path does not exist, with similar names."""
     if _URL.match(str(source)):
         return f"{source}: is an address; download the recording and name the file"
     if (missing_data_set := evalio.absent(source)) is not None:
@@ -64,7 +64,7 @@ def absent(source: Path) -> str:
 
 
 def result_of_program(source: Path) -> str | None:
-    """What a path is that the program has written itself, from a recording; None where it is nothing of that kind."""
+    """The kind of a path that the program has written itself, from a recording; None of any other."""
     folder = source if source.is_dir() else source.parent
     if source.is_dir() and (folder / "comparison.json").is_file():
         return (
@@ -86,7 +86,7 @@ def result_of_program(source: Path) -> str | None:
 
 
 def unrecognised(source: Path, reader_of: ReaderOf) -> str | None:
-    """What else it is and what to do, as far as names alone show it; None where they do not."""
+    """Another kind of path and what to do, as far as names alone show it; None where they do not."""
     for above in islice(source.resolve().parents, 2):
         reader = _reader(above, reader_of)
         if reader in _LAYOUTS or (reader == "rosbag" and source.name == "metadata.yaml"):

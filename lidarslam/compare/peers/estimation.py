@@ -34,15 +34,15 @@ from lidarslam.storage.directory import RunDirectory
 PEER_KEY = "peer"
 # Fewer points do not fix six degrees of freedom, and some libraries abort on a handful.
 _MIN_POINTS = 10
-# Poses are extrapolated to stamps so far outside their instants: the most of a sweep's duration.
+# Poses are extrapolated to stamps up to this far outside their instants: the longest sweep.
 _EXTRAPOLATION_S = 0.25
-# Poses farther apart than this, and than so many of their usual steps, are not interpolated.
+# Poses farther apart than this, and than this many of their usual steps, are not interpolated.
 _LONGEST_GAP_S, _LONGEST_GAP_STEPS = 1.0, 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a peer makes of a recording."""
+    """The poses and times of a peer on a recording."""
 
     trajectory: Trajectory  # at the stamps of the scans that its poses cover
     register_ms: dict[float, float]  # stamp -> wall time of the registration of that scan
@@ -59,9 +59,9 @@ def execute_peer(
 ) -> RunOutcome:
     """Run a peer, and write the run directory.
 
-    First the peer takes all scans; then they are read again, chained with its poses, checked and drawn into the map as
+    First the peer takes all scans; then they are read again, chained with its poses, checked and added to the map as
     with an odometry of ours. A damaged recording ends both at the same scan. `progress` is called after every scan that
-    the peer has registered, with its number from 1 and how many there are; `range_m` is as of `estimate`.
+    the peer has registered, with its number from 1 and the total; `range_m` is as of `estimate`.
 
     Raises:
         LidarSlamError: the source, the peer or the output directory is not usable.

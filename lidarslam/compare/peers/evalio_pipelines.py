@@ -1,8 +1,8 @@
-"""Peers that evalio runs; beside the pipeline that it runs of ours, the only file that imports evalio.
+"""Peers that evalio runs; apart from our own pipeline for evalio, the only file that imports evalio.
 
-Every pipeline keeps evalio's defaults but for what `PIPELINES` says, and for its voxels where these follow the size of
-the scene. evalio wants a sweep in row-major order with a cell for each shot; pipelines that look for features along the
-rings are given that, with the azimuth as the column.
+Every pipeline keeps evalio's defaults except for the changes in `PIPELINES`, and for its voxels where these follow the
+size of the scene. evalio expects a sweep in row-major order with a cell for each shot; pipelines that look for features
+along the rings are given that, with the azimuth as the column.
 """
 
 import os
@@ -121,7 +121,7 @@ class EvalioEstimator:
             self._saved += [
                 (stamp.to_sec() + self._begin, pose.to_mat()) for stamp, pose in self._native.saved_estimates()
             ]
-            self._native.saved_features()  # they pile up otherwise
+            self._native.saved_features()  # they accumulate otherwise
 
         return register
 
@@ -142,7 +142,7 @@ class EvalioEstimator:
 
 
 def _fresh(poses: FloatArray) -> NDArray[np.intp]:
-    """The poses that are not the one before once more, as with a sweep that was passed over or came too early."""
+    """The poses without repetitions of the one before, as of a sweep that was skipped or came too early."""
     repeated = (np.diff(poses, axis=0) == 0.0).all(axis=(1, 2))
     return np.flatnonzero(np.concatenate([[True], ~repeated]))
 

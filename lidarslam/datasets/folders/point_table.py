@@ -17,7 +17,7 @@ _PACKED_COLOURS = ("rgb", "rgba")
 
 
 def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:
-    """The names of the fields with one number a point."""
+    """The names of the fields with one number per point."""
     plain = (name for name in table.dtype.names or () if not table.dtype[name].shape)
     return tuple(name for name in plain if table.dtype[name].kind in "fiu")
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import read_array
 
-# No sweep is larger; reading on would fill the memory.
+# No sweep is larger; reading more would fill the memory.
 _LARGEST_BYTES = 1 << 31
 # A larger number is no scan's, such as a time.
 _MOST_SCANS = 10**9
@@ -45,7 +45,7 @@ _MOST_OF_A_BYTE = 88
 
 
 def natural_key(name: str) -> list[tuple[bool, int, str]]:
-    """Sort key that counts: scan_2 stands before scan_10."""
+    """Sort key by numbers: scan_2 comes before scan_10."""
     return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"([0-9]+)", name)]
 
 
@@ -135,7 +135,7 @@ def table_reader(files: Sequence[Path]) -> TableReader:
     """The reader for scan files, all with one suffix.
 
     Raises:
-        InputError: the number of values a point of a `.bin` file is ambiguous.
+        InputError: the number of values per point of a `.bin` file is ambiguous.
     """
     suffix = files[0].suffix.lower()
     if suffix == ".bin":
@@ -145,7 +145,7 @@ def table_reader(files: Sequence[Path]) -> TableReader:
 
 
 def _bin_columns(files: Sequence[Path]) -> int:
-    """How many numbers a point has: so that the sizes of most files fit, since the file itself does not say.
+    """The number of values per point, by the sizes of most files, since the file itself does not state it.
 
     Four fit almost always where they are right; five, as nuScenes has them, only count where the fifth number is a
     small integer in every point.

@@ -1,4 +1,4 @@
-"""A folder of scan files: .bin, .pcd, .ply or .npy, one sweep each; their stamps, and what lies beside them."""
+"""A folder of scan files: .bin, .pcd, .ply or .npy, one sweep each; their stamps, and the files next to them."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -60,7 +60,7 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
     """The layout by names and the stamp file; no scan is opened.
 
     Raises:
-        InputError: there is no scan, or the stamp file does not go with the scans.
+        InputError: there is no scan, or the stamp file does not match the scans.
     """
     files, notes, warnings = _find_scans(folder)
     places = (folder, folder.resolve().parent)
@@ -99,7 +99,7 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     if not candidates:
         raise InputError(f"{folder}: expected scan files ({', '.join(SCAN_SUFFIXES)}), found none")
     counts = Counter(path.suffix.lower() for path in candidates)
-    suffix = max(SCAN_SUFFIXES, key=lambda s: counts[s])  # of equals the first, so that a map beside a scan loses
+    suffix = max(SCAN_SUFFIXES, key=lambda s: counts[s])  # of equals the first: a scan wins over a map
     same = [path for path in candidates if path.suffix.lower() == suffix]
     numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
     files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
@@ -121,7 +121,7 @@ def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int
     warnings, left = [], max(0, len(files) - len(stamps))
     if len(stamps) > len(files):
         named = [int(file.stem) for file in files if file.stem.isdecimal()]
-        if len(named) == len(files) and named[-1] < len(lines):  # as in KITTI, where scans may have been left away
+        if len(named) == len(files) and named[-1] < len(lines):  # as in KITTI, where scans may have been omitted
             stamps, numbers, which = lines[named], np.array(named), "each takes the line of its number, from 0 on"
         else:
             stamps, which = stamps[: len(files)], "the first are taken"
@@ -146,7 +146,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     """Open a folder of scans.
 
     Raises:
-        InputError: it holds no scans, or its stamp file does not go with them.
+        InputError: it holds no scans, or its stamp file does not match them.
     """
     if not source.is_dir():
         raise InputError(f"{source}: expected a folder of scans, got a file; give the folder it lies in")
@@ -172,7 +172,7 @@ class ScanFolderRecording(FileRecording):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """An assumed rate, how the stamps were mended, and what is wrong with the times of the points."""
+        """An assumed rate, the repairs of the stamps, and faults of the points' times."""
         assumed = assumed_rate("The scans have no stamps", self._config) if self._rate_is_assumed else None
         assumed_warnings = () if assumed is None else (assumed,)
         return (*self._layout.warnings, *assumed_warnings, *self._point_time.warnings)
@@ -215,7 +215,7 @@ class ScanFolderRecording(FileRecording):
 
     @cached_property
     def _learned(self) -> LearnedTime:
-        """Inferred once, so that all scans are read alike."""
+        """Inferred once, so that all scans are read in the same way."""
         config = self._config
         if config.time_reference == "none":
             return LearnedTime()

@@ -1,1 +1,1 @@
-"""What sensors send over the network, as recorded: packets, decoded by the libraries of the makers and of others."""
+"""Recorded network packets of sensors, decoded by the libraries of the makers and of others."""

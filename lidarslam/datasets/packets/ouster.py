@@ -27,7 +27,7 @@ _VALID = 1  # of a column's status
 
 
 def find_metadata(source: Path) -> Path | None:
-    """The metadata of an Ouster beside a recording: the file whose name begins most like it, or the only one."""
+    """The metadata of an Ouster next to a recording: the file whose name begins most like it, or the only one."""
     folder = source.absolute().parent
     found = {path: _in_common(path.stem, source.stem) for path in folder.glob("*.json") if _is_metadata(path)}
     best = max(sorted(found), key=lambda path: found[path], default=None)
@@ -36,7 +36,7 @@ def find_metadata(source: Path) -> Path | None:
 
 
 def _in_common(name: str, other: str) -> int:
-    """How many characters both begin with."""
+    """The number of leading characters in common."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(name, other, strict=False)))
 
 
@@ -155,7 +155,7 @@ def _packets(kind: Any, size_name: str, sensor: Any, contents: Iterable[bytes]) 
 
 
 class OusterFile(OusterRecording):
-    """An `.osf`, or a `.pcap` with its metadata beside it; of several sensors the first."""
+    """An `.osf`, or a `.pcap` with its metadata next to it; of several sensors the first."""
 
     @cached_property
     def _frame_sets(self) -> Any:

@@ -13,8 +13,8 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.stored_recording import StoredRecording, scan_indices, truth_beside
 from lidarslam.datasets.times.point_time import PointTimeModel
 
-# What to type. ouster-sdk is no extra: it demands a version of rosbags that this program cannot use, and does not
-# need it for what is used here.
+# The commands to install them. ouster-sdk is no extra: it requires a version of rosbags that this program cannot use,
+# and does not need it for the functions used here.
 _INSTALL = {
     "velodyne_decoder": "pip install 'lidarslam[velodyne]'",
     "ouster.sdk": "pip install --no-deps ouster-sdk",
@@ -47,7 +47,7 @@ class PacketRecording(StoredRecording):
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
     ) -> Iterator[Scan]:
-        """See `Recording`; sweeps are not counted beforehand, which would take a pass through all packets."""
+        """See `Recording`; sweeps are not counted beforehand, which would take a pass over all packets."""
         return self._scans(scan_indices(sys.maxsize, start, stop, step), faults)
 
     @cached_property

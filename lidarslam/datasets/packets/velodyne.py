@@ -19,10 +19,10 @@ from lidarslam.datasets.packets.packet_recording import PacketRecording, require
 from lidarslam.datasets.recording import PointField, Recording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
-# Beyond the range of any model; the library's own limit is short of some.
+# Beyond the range of any model; the library's own limit is less than that of some.
 _FARTHEST_M = 1000.0
 _PACKETS_LOOKED_AT = 2000
-# First bytes and lengths of others' packets.
+# First bytes and lengths of other makers' packets.
 _HESAI, _ROBOSENSE = b"\xee\xff", (b"\x55\xaa", b"\xa5\xff")
 
 _StampedCloud = tuple[float, NDArray[np.void]]
@@ -112,11 +112,11 @@ def _reason(path: Path, error: Exception) -> str:
 
 
 def _other_sensor(path: Path) -> str:
-    """What a capture without packets of a Velodyne holds, and what to do."""
+    """The content of a capture without packets of a Velodyne, and what to do."""
     import velodyne_decoder
 
     payloads: list[bytes] = []
-    with suppress(Exception):  # damaged; what was found so far is judged
+    with suppress(Exception):  # damaged; the packets found so far are judged
         for _, payload in islice(velodyne_decoder.util.iter_pcap(path), _PACKETS_LOOKED_AT):
             payloads.append(bytes(payload)) if isinstance(payload, bytes) else None
     maker = None

@@ -1,4 +1,4 @@
-"""Apollo-SouthBay: `pcds/*.pcd` and `poses/gt_poses.txt`, a line of index, stamp, position and quaternion a scan."""
+"""Apollo-SouthBay: `pcds/*.pcd` and `poses/gt_poses.txt`, a line of index, stamp, position and quaternion per scan."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -23,7 +23,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     """Open a folder with pcds and poses, or `config.sequence` of one above several such.
 
     Raises:
-        InputError: no such sequence, or its poses do not go with its scans.
+        InputError: no such sequence, or its poses do not match its scans.
     """
     return ApolloRecording(_find_sequence(source, config.sequence), config)
 

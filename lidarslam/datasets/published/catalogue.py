@@ -17,8 +17,8 @@ class DataSet:
     truth: str  # source of the true poses
     imu: bool  # whether samples of an IMU are read
     url: str
-    layout: str  # what a source is, and the files that are read
-    tried: Tried  # what its reader was run on
+    layout: str  # the path of a source, and the files that are read
+    tried: Tried  # the data its reader was run on
     choose: str = ""  # option that chooses a sequence, where the source does not
 
 

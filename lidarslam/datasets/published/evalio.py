@@ -30,7 +30,7 @@ MISSING_EXTRA = "evalio is not installed, which this data set needs; pip install
 
 # As evalio 0.6.1 has them.
 DATA_SETS = tuple(one.name for one in CATALOGUE if one.reader == "evalio")
-# Published where no program can download.
+# Published where programs cannot download.
 _BY_HAND = ("botanic_garden",)
 _LISTED = 6
 _POINT = attrgetter("x", "y", "z", "intensity", "row")

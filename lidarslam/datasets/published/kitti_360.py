@@ -1,7 +1,7 @@
 """A drive of KITTI-360 (Liao et al., PAMI 2022): `data_3d_raw/..._sync/velodyne_points`, `data_poses`, `calibration`.
 
 The scans are as measured, not motion compensated. As on KITTI's car, the laser turns clockwise from the rear and faces
-forward at the stamp, which is what the data set's own program for compensation assumes.
+forward at the stamp, as the data set's own program for compensation assumes.
 """
 
 from collections.abc import Iterator

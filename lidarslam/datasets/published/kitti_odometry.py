@@ -1,7 +1,7 @@
 """The KITTI odometry benchmark: `sequences/NN/{velodyne/*.bin, times.txt, calib.txt}` and `poses/NN.txt`.
 
-The scans are motion compensated by the publishers. The poses are those of the left camera, `cam`; they come to the
-LiDAR's frame here, once, and nowhere else.
+The scans are motion compensated by the publishers. The poses are those of the left camera, `cam`; they are converted to
+the LiDAR's frame here, and nowhere else.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
 """A sequence of MulRan (Kim et al., ICRA 2020): `Ouster/*.bin`, `global_pose.csv`, `xsens_imu.csv`.
 
-A scan is 64 x 1024 points of x, y, z and intensity, one column of 64 lasers after the other, with zeros where nothing
-came back; the LiDAR turns ten times a second. The poses are those of the car's base in UTM coordinates.
+A scan is 64 x 1024 points of x, y, z and intensity, one column of 64 lasers after the other, with zeros where there
+was no return; the LiDAR turns ten times a second. The poses are those of the car's base in UTM coordinates.
 """
 
 from collections.abc import Iterator

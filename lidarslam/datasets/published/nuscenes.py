@@ -1,6 +1,6 @@
 """nuScenes: the sweeps and samples of LIDAR_TOP of one scene, 20 a second.
 
-The tables are read without nuscenes-devkit, which brings image and plotting libraries along. The frame is the
+The tables are read without nuscenes-devkit, which depends on image and plotting libraries. The frame is the
 sensor's: x to the right, y forward, z up."""
 
 import mmap
@@ -128,7 +128,7 @@ def _table(path: Path, shape: TypeAdapter[list[T]]) -> list[T]:
 def _select(
     path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], shape: TypeAdapter[T]
 ) -> Iterator[T]:
-    """The records of a large table in which a pattern is found, as far as the match is wanted."""
+    """The records of a large table in which a pattern is found, if the match is wanted."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
             if not text[-_TAIL:].rstrip().endswith(b"]"):

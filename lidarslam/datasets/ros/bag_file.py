@@ -132,7 +132,7 @@ class BagFile:
         return counts
 
     def _read_without_index(self, error: InputError) -> Counter[tuple[str, str]]:
-        """Leave a folder's metadata aside, then the file's index too; the error stands if both fail."""
+        """Read without a folder's metadata, then without the file's index too; the error remains if both fail."""
         if self.path.is_dir():
             files = [entry for entry in self.path.iterdir() if entry.suffix in _STORAGE_SUFFIXES and entry.is_file()]
             if len(files) != 1:  # the order of several is in the metadata alone
@@ -145,7 +145,7 @@ class BagFile:
         try:
             messages = recover(self.path, self._suffix(self.path), reports.append)
             counts = Counter((message.topic, message.message_type) for message in messages)
-        except Exception as reason:  # not even the beginning makes sense
+        except Exception as reason:  # not even the beginning can be read
             raise error from reason
         if not counts:
             raise error
@@ -158,7 +158,7 @@ class BagFile:
         return counts
 
     def messages(self, topic: Topic, on_damage: Callable[[str], None] = lambda _: None) -> Iterator[BagMessage]:
-        """All messages of a topic in the order of recording, not decoded, up to damage, which is told."""
+        """All messages of a topic in the order of recording, not decoded, up to damage, which is logged."""
         if not self._has_index:
             yield from self._in_sequence(topic)
             return
@@ -185,7 +185,7 @@ class BagFile:
             yield self._message(found[1], found[2], topic)
 
     def _in_sequence(self, topic: Topic) -> Iterator[BagMessage]:
-        with suppress(Exception):  # not even its beginning makes sense any more
+        with suppress(Exception):  # not even its beginning can be read any more
             for message in recover(self.path, self._suffix(self.path), lambda _: None):
                 if (message.topic, message.message_type) == (topic.name, topic.message_type):
                     yield self._message(message.record_ns, message.raw, topic)
@@ -260,7 +260,7 @@ class BagFile:
     def _remedy(self) -> str:
         if self.path.is_dir():
             whole = min(self.path.glob("*.zstd"), default=None)
-            if whole is not None:  # decompressed, it is a file that is read as far as it goes
+            if whole is not None:  # decompressed, it is a file that is read as far as possible
                 return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
             files = sorted(str(file) for suffix in _STORAGE_SUFFIXES for file in self.path.glob(f"*{suffix}"))
             such_as = f", such as {files[0]}" if files else ""

@@ -42,8 +42,8 @@ def static_transform(bag: BagFile, target: str, source: str) -> FloatArray | Non
 
 
 def add_edges(edges: Edges, raw: bytes, ros2: bool) -> None:
-    """Add the transforms of a serialised message, as far as it is sound."""
-    with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
+    """Add the transforms of a serialised message, as far as it is intact."""
+    with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others remain
         for stamped in deserialize(raw, TRANSFORMS_TYPE, ros2).transforms:
             parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
             T_parent_child = _matrix(stamped.transform)
@@ -76,7 +76,7 @@ def _matrix(transform: Any) -> FloatArray:
 
 
 class CloudTopic(NamedTuple):
-    """What the point clouds of a bag are stamped and located by."""
+    """The clock and the frame of a bag's point clouds."""
 
     topic: Topic
     frame_id: str
@@ -84,7 +84,7 @@ class CloudTopic(NamedTuple):
 
 
 class BagImu:
-    """The IMU beside the point clouds of a bag."""
+    """The IMU recorded with the point clouds of a bag."""
 
     def __init__(self, bag: BagFile, clouds: CloudTopic, wanted: str | None) -> None:
         """Choose the topic.
@@ -101,7 +101,7 @@ class BagImu:
         return None if self._topic is None else self._decoded(self._bag.messages(self._topic))
 
     def summary(self) -> ImuSummary | None:
-        """The description, by the first samples; how many there are stands in the index."""
+        """The description, by the first samples; their number is in the index."""
         if self._topic is None:
             return None
         first = self._decoded(islice(self._bag.messages(self._topic), _SAMPLES_LOOKED_AT))

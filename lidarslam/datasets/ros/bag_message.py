@@ -28,7 +28,7 @@ OUSTER_PACKET_TYPES = tuple(
 _LONGEST_FRAME_ID = 256
 # Up to the end of a header's frame; a shorter message is none.
 _SHORTEST_MESSAGE = 16
-# More equal stamps than this among the first messages of a topic were never measured.
+# If more stamps than this are equal among the first messages of a topic, they are no measurements.
 _MESSAGES_LOOKED_AT, _FEW = 10, 3
 # Stamps beyond this (1973) read a clock, and a zero among them was never set; simulated time starts at zero.
 _CLOCK_NS = 10**17
@@ -112,7 +112,7 @@ class StampSource:
 
 
 def find_stamp_source(messages: Iterable[BagMessage]) -> StampSource:
-    """By the first few messages of a topic: those of the headers, unless the driver never sets them anew."""
+    """By the first few messages of a topic: those of the headers, unless the driver never updates them."""
     stamps_ns = [message.header_ns for message in islice(messages, _MESSAGES_LOOKED_AT)]
     first_ns = next((stamp_ns for stamp_ns in stamps_ns if stamp_ns), None)
     if first_ns is None or (len(stamps_ns) > _FEW and len(set(stamps_ns)) == 1):

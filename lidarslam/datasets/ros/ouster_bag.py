@@ -1,4 +1,4 @@
-"""Packets of an Ouster in a bag, as ouster_ros records them, with the metadata in a topic or beside the bag."""
+"""Packets of an Ouster in a bag, as ouster_ros records them, with the metadata in a topic or next to the bag."""
 
 import struct
 from collections.abc import Iterator
@@ -71,7 +71,7 @@ class OusterBag(OusterRecording):
         return count, last
 
     def _contents(self, name: str, message_type: str) -> Iterator[bytes]:
-        """What the messages of a topic beside that of the packets hold: a single string or array of bytes."""
+        """The content of the messages of a topic other than that of the packets: a single string or array of bytes."""
         beside = f"{self._topic.name.rpartition('/')[0]}/{name}"
         topic = next((t for t in self._bag.topics if (t.name, t.message_type) == (beside, message_type)), None)
         for message in self._bag.messages(topic) if topic is not None else ():

@@ -62,7 +62,7 @@ class DecodedCloud:
 
 
 def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> DecodedCloud:
-    """Copy what is used of the points out of a message, organised or not, of either byte order, with any padding.
+    """Copy the used fields of the points out of a message, organised or not, of either byte order, with any padding.
 
     Args:
         message: of ROS 1 or ROS 2.

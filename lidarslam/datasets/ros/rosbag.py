@@ -34,9 +34,9 @@ from lidarslam.datasets.times.stamps import in_stamp_order
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
-# Of the messages of one topic, what all others together have at most where they are no recordings: a map now and then.
+# As a share of one topic's messages, the most of all others together if these are no recordings: occasional maps.
 _NEGLIGIBLE = 0.05
-# So many pairs of messages, spread over the first so many, are compared at their seams.
+# Number of pairs of messages that are compared at their seams, spread over this many of the first.
 _PAIRS, _LOOKED_AT = 40, 600
 _FRAMES_LOOKED_AT = 10
 
@@ -102,7 +102,7 @@ class BagRecording(StoredRecording):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Other topics, a lost index, headers without stamps, and what is wrong with the times of the points."""
+        """Other topics, a lost index, headers without stamps, and faults of the points' times."""
         others = _others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
         found = (others, self._bag.damage, unset, _one_part(self._source), *self._point_time.warnings)

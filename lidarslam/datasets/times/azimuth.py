@@ -14,17 +14,17 @@ from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, is_
 
 AZIMUTH_TIME = PointTimeModel("azimuth", "s", "relative")
 
-# The mean azimuth of so many blocks of consecutive points is followed round the circle.
+# Number of blocks of consecutive points whose mean azimuth is followed round the circle.
 _BLOCKS, _FEWEST_IN_BLOCK = 180, 8
 # Length of a block's mean direction: 1 where all its points have one azimuth; 0.95 is about +-18 degrees.
 _CONCENTRATED, _SHARE = 0.95, 0.95
 _TURN_DEG = (340.0, 385.0)
 # Ring by ring: how much of a turn may lack returns, the part of the points that lies in whole rings, and that of the
-# points before what is taken for the start.
+# points before the assumed start.
 _MISSING_DEG, _SHARE_IN_RINGS, _FIRST = 60.0, 0.7, 1e-3
 # Lasers of one firing differ in azimuth by at most this.
 _WIDEST_FIRING_DEG = 12.0
-# Of the seam: its width at the end and at the start of a sweep, the largest angle between two points that are
+# The seam: its width at the end and at the start of a sweep, the largest angle between two points that are
 # compared, and the nearest and largest differences of range that count.
 _END_DEG, _START_DEG, _SAME_DIRECTION, _NEAREST_M = 3.0, 8.0, np.radians(0.5), 2.0
 _DIFFERS_M, _LARGEST_M = 0.05, 1.0
@@ -218,11 +218,11 @@ class Sweep(NamedTuple):
 
 @dataclass(frozen=True)
 class AzimuthTiming:
-    """Whether points get their times from the azimuth, and what there is to say of it."""
+    """Whether points get their times from the azimuth, and remarks on it."""
 
     period_s: float | None = None  # the duration of a sweep; None: the points get no times
     note: str | None = None  # a fact for the user
-    warning: str | None = None  # what is missing, and what to set
+    warning: str | None = None  # the missing setting, and its value
 
     def offsets(self, sweep: Sweep) -> FloatArray | None:
         """Seconds (N,) from the sweep's first point; None without times."""
@@ -231,14 +231,14 @@ class AzimuthTiming:
 
 @dataclass(frozen=True)
 class PointTiming:
-    """Where the times of a recording's points come from; inferred once, so that all scans are read alike."""
+    """Where the times of a recording's points come from; inferred once, so that all scans are read in the same way."""
 
     learned: LearnedTime
     azimuth: AzimuthTiming
 
     @property
     def model(self) -> PointTimeModel | None:
-        """What the offsets come from; None where points have no times."""
+        """The source of the offsets; None where points have no times."""
         return self.learned.model if self.azimuth.period_s is None else AZIMUTH_TIME
 
     @property
@@ -248,7 +248,7 @@ class PointTiming:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with the time field and what became of the times; times that the azimuth could give."""
+        """Faults of the time field and their effect on the times; times that the azimuth could give."""
         fault = self.learned.warning
         if fault is not None and self.learned.model is None:
             without = "." if self.azimuth.warning is not None else _NO_TIMES
@@ -257,7 +257,7 @@ class PointTiming:
 
 
 def pair_starts(scans: int) -> list[int]:
-    """Indices, spread over a recording of so many scans, of the first scan of each pair that is compared."""
+    """Indices, spread over a recording of `scans` scans, of the first scan of each pair that is compared."""
     return sorted({int(index) for index in np.linspace(0, max(0, scans - 2), _PAIRS)})
 
 

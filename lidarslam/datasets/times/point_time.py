@@ -28,7 +28,7 @@ TIME_FIELD_NAMES: tuple[str, ...] = (
 RING_FIELD_NAMES: tuple[str, ...] = ("ring", "channel", "line", "laser_id", "laser", "ring_id", "beam_id", "beam")
 
 UNITS_PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-# What times come in that were divided or multiplied once too often; not among the settings.
+# Units of times that were divided or multiplied once too often; not among the settings.
 MISTAKEN_UNITS_PER_SECOND = {"ks": 1e-3, "Ms": 1e-6, "ps": 10**12}
 
 # A sweep and its stamp are closer than this; a time farther away is on another clock, or is no time at all.
@@ -44,7 +44,7 @@ _NO_SWEEP_S = 1e-6
 # The same relative to the time between scans, where that is known and itself plausible.
 _SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
 _PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
-# A span so near to the time between scans, in another unit than expected, leaves no doubt about the unit.
+# A span so near to the time between scans, in another unit than expected, determines the unit.
 _WHOLE_SWEEP = (0.8, 1.1)
 _IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
 # Times coarser than this part of the sweep do not separate its points.
@@ -156,10 +156,10 @@ class TimedCloud(NamedTuple):
 
 
 class LearnedTime(NamedTuple):
-    """What is known of a time field."""
+    """The inferred meaning of a time field."""
 
     model: PointTimeModel | None = None  # None: it gives the points no times
-    # A correction, or another clock; without a model, what is wrong, to be continued with a semicolon.
+    # A correction, or another clock; without a model, its fault, to be continued with a semicolon.
     warning: str | None = None
 
 
@@ -273,7 +273,7 @@ class ValueSpread(NamedTuple):
 
 
 def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
-    """The spread of integer or float values (N,), NaN left out; None when all, or all but a few, are alike."""
+    """The spread of integer or float values (N,), NaN left out; None when all, or all but a few, are equal."""
     whole = values.dtype.kind in "iu"
     with np.errstate(invalid="ignore"):  # damaged bytes may be a NaN of the signalling kind
         numbers = values.reshape(-1).astype(np.int64 if whole else np.float64)

@@ -18,18 +18,18 @@ from lidarslam.datasets.faults import Faults
 
 # Clock readings count from 1970; a number outside these years is none.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
-# Thousands of years are no time in seconds, and nanoseconds would be lost on them.
+# Larger numbers, thousands of years, are not in seconds, and float64 would lose their nanoseconds.
 _LATEST_S = 1e11
 _DATE = re.compile(r"(\d{4}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2}(?:\.\d*)?)Z?", re.ASCII)
 _SECONDS_NAME = re.compile(r"\d+\.\d+")
 _INTEGER_NAME = re.compile(r"\d{12,19}")
 _SECONDS_NANOSECONDS_NAME = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})")
 T = TypeVar("T")
-# A stamp so far ahead of the one before may be a stray one; the next scans decide, this many with it.
+# A stamp this far ahead of the one before may be an outlier; this many scans, with it, decide.
 _DOUBTFUL_STEP_S, _LOOKED_AT = 1.0, 6
-# Of more than so many, one that is so many usual steps away from the middle one is a stray one.
+# Among more stamps than this, one that is this many usual steps away from the middle one is an outlier.
 _FEW, _FAR_STEPS = 2, 60
-# So many scans in a row that are in order among themselves, but before the latest stamp, are no strays.
+# This many scans in a row that are in order among themselves, but before the latest stamp, are no outliers.
 _SET_BACK = 10
 _NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
 _AHEAD = "scans were left out: their stamps are ahead of those of the scans after"
@@ -139,14 +139,14 @@ def mend_stamps(stamps: FloatArray, numbers: FloatArray) -> tuple[FloatArray, in
     if np.count_nonzero(kept) < 2:
         raise ValueError("fewer than two stamps increase")
     known, at = stamps[kept], numbers[kept]
-    # Between two good stamps the line keeps the order; outside them it goes on at the median rate.
+    # Between two good stamps the line keeps the order; outside them it continues at the median rate.
     period = float(np.median(np.diff(known) / np.diff(at)))
     outside = np.minimum(numbers - at[0], 0.0) + np.maximum(numbers - at[-1], 0.0)
     return np.interp(numbers, at, known) + outside * period, int(len(stamps) - np.count_nonzero(kept))
 
 
 def assumed_rate(missing: str, config: ReaderConfig) -> str:
-    """That scans without stamps are taken to come at a rate, and how to give another unless it was given."""
+    """The remark that scans without stamps are assumed to come at a rate, and how to set it unless it was set."""
     said = f"{missing}: {config.rate_hz:g} scans a second are assumed"
     if "rate_hz" in config.model_fields_set:
         return f"{said}, as set."
