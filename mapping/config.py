@@ -13,7 +13,7 @@ MAPPINGS = PlugPoint("mapping", get_args(MappingName))
 MapField = Literal["intensity", "rgb", "ring", "time"]
 """An attribute of the points of a map."""
 MapFormat = Literal["pcd", "laz", "e57"]
-"""What a map can be written as beside .ply."""
+"""Formats of a map besides .ply."""
 BudgetMs = Annotated[float, Field(ge=1.0, le=1e6)] | Literal["auto"] | None
 """Milliseconds that a scan may take; auto: half of the time between scans; None: not bounded."""
 
@@ -152,7 +152,7 @@ class LoopConfig(_Settings):
 
     @property
     def drift_rates(self) -> tuple[float, float]:
-        """Standard deviations of attitude and position for each metre of the way, radians and metres."""
+        """Standard deviations of attitude and position per metre travelled, radians and metres."""
         return math.radians(0.02 * self.drift_percent), 0.01 * self.drift_percent
 
 

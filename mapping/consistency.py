@@ -1,8 +1,8 @@
 """Self-consistency of a run's poses along the direction of travel, from scan pairs.
 
 Registration that slips along the direction of travel leaves every scan well aligned with the ground and the facades
-beside the road; only surfaces that face along the way show the slip. For pairs of scans some metres apart, each facing
-surfel of the later scan votes for the shifts along the direction of travel that lay it on a surfel of the earlier one:
+along the road; only surfaces that face that direction show the slip. For pairs of scans some metres apart, each facing
+surfel of the later scan votes for the shifts along the direction that place it on a surfel of the earlier one:
 a Hough transform of the point-to-plane distance with one parameter. At correct poses the votes peak at zero, after a
 slip at the slip. Votes are counted and limited by blocks on the ground, so that a passing vehicle, with consistent
 votes from one or two blocks, does not outvote static structure.
@@ -42,10 +42,10 @@ _FEWEST_FACING, _MOST_FACING = 10, 800
 _BLOCK_M, _MOST_OF_BLOCK = 2.0, 3.0
 # Width of a vote, distance between shifts, and the largest shift.
 _GATE_M, BIN_M, _FARTHEST_M = 0.15, 0.1, 32.0
-# A scan is kept after so many metres or scans, whichever comes first, and paired with the last two.
+# A scan is kept after this many metres or scans, whichever comes first, and paired with the last two.
 _EVERY_M, _EVERY_SCANS = 7.0, 10
 _PARTNERS = 2
-# After so many scans every second burst is kept, then every fourth, and so on.
+# After this many scans every second burst is kept, then every fourth, and so on.
 _MANY, _BURST = 256, 8
 # A scene is periodic where a shift has this share of its votes with itself; over shorter shifts any surface has.
 _REPEATED_SHARE, _LEAST_PERIOD_M = 0.3, 1.0
@@ -57,7 +57,7 @@ _LEAST_WAY_M = 0.2
 # a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
-# A stretch is contradicted by so many pairs, in runs of at least so many; or by one that another confirms.
+# Least contradicting pairs of a stretch, in runs of at least this many; one elsewhere, or where another confirms it
 _LEAST_PAIRS, _FEW_PAIRS = 2, 4
 
 
@@ -194,7 +194,7 @@ def vote(
     held_normals: FloatArray, held_radii: FloatArray, direction: FloatArray, gate_m: float, bin_m: float,
     votes: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Add up votes for the shifts of a scan along a direction that lay its surfels on those of another.
+    """Add up votes for the shifts of a scan along a direction that place its surfels on those of another.
 
     A surfel p is in the plane of a held surfel a with a similar normal n after the shift n.(a - p) / n.d, and votes for
     it if it is then within a's radius; the vote falls off to zero at a distance of `gate_m` from the plane. A surfel
@@ -297,7 +297,7 @@ class Contradiction:
     # first, last: kept scans at its ends
     first: int
     last: int
-    shift_m: float  # shift of the later scans along the way that the clearest pair votes for
+    shift_m: float  # shift of the later scans along the direction of travel that the clearest pair votes for
     # votes, votes_at_pose: for that shift, and for the poses of the run
     votes: float
     votes_at_pose: float
@@ -389,7 +389,7 @@ def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArra
 
 
 def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) -> tuple[Contradiction, ...]:
-    """The stretches where scans clearly fit better at a shift along the way than at their final poses (N, 4, 4)."""
+    """The stretches where scans clearly fit better shifted along the direction of travel than at poses (N, 4, 4)."""
     known = [test.at(T_world_lidar) for test in tests if max(test.first, test.second) < len(T_world_lidar)]
     bad = [one for one in known if one.votes >= LEAST_VOTES and one.votes_at_pose < LARGEST_SHARE * one.votes]
     stretches: list[list[Contradiction]] = []

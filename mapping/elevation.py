@@ -22,21 +22,21 @@ from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 IntArray = NDArray[np.intp]
 
-# Scans of a stretch, and their distance in median ranges: while what is near comes from far away.
+# Scans of a stretch, and their spacing in median ranges: along a stretch, far surfaces come near.
 _SCANS, _SPACING = 10, 0.2
-# A stretch that ends early needs so many.
+# Least number of scans of a stretch that ends early.
 _FEWEST_OF_STRETCH = 4
 # Stretches in all: each takes some 50 ms, and more of them add little.
 _MOST_STRETCHES = 8
-# Edge of the cubes with a plane, in cells of the map. Of these, so many are left out that a scan has about this many
-# points; the same ones for all scans, as what matters is seen by several.
+# Edge of the cubes with a plane, in cells of the map. Cubes are left out until a scan has about this many points; the
+# same ones for all scans, as only surfaces seen by several matter.
 _EDGE_CELLS = 2.0
 _POINTS = 2000
 # A large odd number spreads the keys of cubes.
 _SPREADING = np.int64(0x9E3779B97F4A7C15 - (1 << 64))
 _ITERATIONS = 6
-# A plane has at least so many points, of so many scans, is not long and narrow, and is thin compared with its width and
-# with range noise: of grass, near and far scans see other parts.
+# A plane has at least this many points, of this many scans, is not long and narrow, and is thin compared with its width
+# and with range noise: of grass, near and far scans see other parts.
 _FEWEST_POINTS, _FEWEST_SCANS = 10, 3
 _MOST_THICKNESS, _LEAST_WIDTH, _MOST_THICKNESS_M = 0.4, 0.15, 0.03
 # Standard deviations of a mean of points across its surface, and along its ray; the second is large because all points
@@ -106,7 +106,7 @@ def estimate_bias(scans: Sequence[PlacedPoints], edge_m: float) -> ElevationBias
     sines = points[:, 2] / np.linalg.norm(points, axis=1)
     usable = np.abs(sines) < _STEEPEST
     points, number, elevations = points[usable], number[usable], np.arcsin(sines[usable])
-    # The motion of a point for a radian of elevation.
+    # The motion of a point per radian of elevation.
     rho = np.hypot(points[:, 0], points[:, 1])
     lift = np.column_stack([-points[:, :2] * (points[:, 2] / rho)[:, None], rho])
     for _ in range(_ITERATIONS):
@@ -172,7 +172,7 @@ class _System:
     def solve(self) -> tuple[FloatArray, float, float]:
         """The step (6 K + 1,) of poses and angle, offsets of the planes eliminated; the angle's standard deviations.
 
-        They are those of a regression whose errors are alike within a group, or come from an offset of all ranges.
+        They are those of a regression whose errors are correlated within a group, or come from an offset of all ranges.
         """
         planes = np.bincount(self.plane, self.weight)
         columns = np.column_stack([6 * self.scan[:, None] + np.arange(6), np.full(len(self.scan), 6 * self.scans)])
@@ -186,7 +186,7 @@ class _System:
         # The first pose is kept; the others may have directions that no plane constrains.
         A[np.diag_indices(6 * self.scans)] += np.repeat([1e9, 1.0], [6, 6 * self.scans - 6])
         both = np.linalg.solve(A[:-1, :-1], np.column_stack([A[:-1, -1], b[:-1]]))
-        # What of the angle's effect no motion explains, and what is left of the residuals.
+        # The part of the angle's effect that no motion explains, and the remaining residuals.
         unexplained = whole[:, -1] - whole[:, :-1] @ both[:, 0]
         information = float(self.weight @ unexplained**2)
         angle = -float(self.weight @ (unexplained * self.residual)) / information

@@ -8,7 +8,7 @@ from lidarslam.mapping.config import MappingConfig
 
 # Fewer points make no pose, and no scale.
 MIN_POINTS = 60
-# Cells per median range, and bounds of their size. Where walls are closer than so many metres, the cells are the
+# Cells per median range, and bounds of their size. Where walls are closer than a few metres, the cells are the
 # smallest: steps and door frames are as large in a wider stairwell.
 _CELLS_PER_RANGE = 30.0
 _CELL_BOUNDS_M = (0.05, 1.0)

@@ -79,9 +79,9 @@ def smoothed_start(
 ) -> dict[float, SmoothedMotion]:
     """Motions of the first scans, by stamp; empty where registration in order suffices.
 
-    The map of a single sweep is thin, and what it lets slide stays in the map. So the first scans are registered in
-    order; from the last of them back, with the motions of the latest known, to a new map; and the motions of the
-    first half are those that this map shows. None is known where that loses track.
+    The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
+    scans are registered in order; from the last of them back, with the motions of the latest known, to a new map; and
+    the motions of the first half are those that this map shows. None is known where that loses track.
 
     Args:
         scans: of which the first are taken.
@@ -120,9 +120,9 @@ def smoothed_start(
 
 
 def _likeliest(scans: list[Scan], config: MappingConfig, inertial: "Inertial") -> _Tracking:
-    """The first scans, tracked from the velocity at which they fit best: far apart, they leave it open.
+    """The first scans, tracked from the velocity at which they fit best: scans far apart leave it open.
 
-    What an IMU measured relates it to the motion between all scans, and so the later ones decide.
+    The IMU's measurements relate it to the motion between all scans, and so the later ones decide.
     """
     interval_s, best, most = scans[1].stamp - scans[0].stamp, None, -np.inf
     for velocity in _VELOCITIES:

@@ -56,9 +56,9 @@ def without_outliers(
 
     Args:
         cloud: the map.
-        sigmas: leave out points whose mean distance to so many neighbours exceeds the mean of all points by more than
-            so many standard deviations.
-        radius: leave out points with fewer than so many neighbours within a radius, metres.
+        sigmas: (k, s), to leave out points whose mean distance to k neighbours exceeds the mean of all points by more
+            than s standard deviations.
+        radius: (k, r), to leave out points with fewer than k neighbours within r metres.
     """
     if sigmas is not None:
         cloud = _chosen(cloud, cloud.to_open3d().remove_statistical_outlier(*sigmas)[1])

@@ -1,4 +1,4 @@
-"""The merged map: one averaged point a voxel, so that memory follows the mapped area, not the number of scans."""
+"""The merged map: one averaged point per voxel, so that memory follows the mapped area, not the number of scans."""
 
 import threading
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
-# Those of more points are estimated tile by tile: they take half a kilobyte of memory a point. Neighbours of a tile's
+# Those of more points are estimated tile by tile: they take half a kilobyte of memory per point. Neighbours of a tile's
 # points are looked for within this distance around it.
 _MANY_POINTS = 2_000_000
 NORMALS_MARGIN_M = 10.0
@@ -57,7 +57,7 @@ class GlobalMap(Stateful):
     """Accumulates scans into voxels.
 
     New points wait in a list and are merged into the sorted main table when there are as many as half of it, so that
-    sorting costs little a scan, and memory stays within a small factor of the number of voxels. When the table has more
+    sorting is cheap per scan, and memory stays within a small factor of the number of voxels. When the table has more
     voxels than it may, those of tiles that were not visited since it was merged before go to disk.
 
     Args:
@@ -85,7 +85,7 @@ class GlobalMap(Stateful):
 
     @property
     def is_whole(self) -> bool:
-        """Whether all of it is in memory; of any other map, only `tiles` and `tile` tell more than a part."""
+        """Whether all of it is in memory; of any other map, only `tiles` and `tile` give more than a part."""
         with self._lock:
             self._merge()
             return self._store is None or not len(self._store)
@@ -97,7 +97,7 @@ class GlobalMap(Stateful):
             return super().state()
 
     def add(self, points: FloatArray, T_world_lidar: FloatArray, attributes: PointAttributes | None = None) -> None:
-        """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp, with what is known of them."""
+        """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp, with their attributes."""
         attributes = attributes or PointAttributes()
         layout = Layout.of(attributes)
         keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)

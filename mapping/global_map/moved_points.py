@@ -1,6 +1,6 @@
 """Dynamic points of a map, by visibility: points that later or earlier range images saw through.
 
-Now and then a scan leaves a small range image. A point of the map is dynamic where at least three images saw farther,
+Every few scans, a small range image is kept. A point of the map is dynamic where at least three images saw farther,
 and no more of them saw a surface there. After Pomerleau et al., "Long-term 3D map maintenance in dynamic environments"
 (ICRA 2014), and Kim and Kim, "Remove, then revert" (IROS 2020).
 
@@ -22,7 +22,7 @@ from lidarslam.core.state import Shape, Stateful
 
 Ranges = NDArray[np.float32]
 TWO_PI = 2.0 * math.pi
-# Of the nine pixels around a point, its own and so many in all must hold a return: glass and the sky prove nothing.
+# Of the nine pixels around a point, its own and this many in all must hold a return: glass and the sky prove nothing.
 _LEAST_RETURNS = 6
 # A return is at a point's range within this margin and a voxel: noise, errors of poses, and a surface seen at a slant.
 _MARGIN_M = 0.1
@@ -32,7 +32,7 @@ _MARGIN_OF_RANGE = 0.01
 _WITH_GAPS = 0.5
 # Half the height of a row: views whose beams pass this far from its centre have no gaps.
 NO_GAPS = 0.5
-# So many votes are enough to classify a point by, where hundreds would be cast.
+# This many votes suffice to classify a point, where hundreds would be cast.
 _ENOUGH = 64
 _UNKNOWN, _SUPPORTS, _THROUGH = 0, 1, 2
 _ROWS, _COLUMNS = 16, 360
@@ -45,9 +45,9 @@ _AT_CENTRE, _EVERYWHERE = 0.3, NO_GAPS
 # Short recordings need an image of every second scan; of longer ones every fourth is enough, and costs half.
 _EVERY, _EVERY_LATER = 2, 4
 _MANY_IMAGES, _MOST_IMAGES = 64, 512
-# Some four a pixel; more take time and show no more.
+# About four per pixel; more take time and show no more.
 _ENOUGH_POINTS = 24_000
-# Farther points are narrower than a pixel of so many voxels; near ones count all the same.
+# Points at which a pixel is wider than this many voxels are left out, except near ones.
 _PIXEL_OF_VOXEL = 3.0
 _LEAST_REACH_M = 5.0
 # Views that see through a dynamic point, at least.
@@ -135,9 +135,9 @@ class Views(Stateful):
 def seen_through(
     points: FloatArray, views: PlacedViews, voxel_size_m: float, least_through: int = _LEAST_THROUGH
 ) -> NDArray[np.bool_]:
-    """(M,) which points (M, 3) of a map, in the world, are dynamic: at least so many images see through them.
+    """(M,) which points (M, 3) of a map, in the world, are dynamic: at least `least_through` images see through them.
 
-    An image with gaps between its beams counts half. Where more than 64 images see a point, as many are asked, from the
+    An image with gaps between its beams counts half. Where more than 64 images see a point, 64 of them vote, from the
     whole time.
     """
     moved = np.zeros(len(points), dtype=np.bool_)

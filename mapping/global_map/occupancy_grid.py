@@ -14,7 +14,7 @@ from lidarslam.core.geometry import FloatArray
 CELL_M = 0.5
 # Least |z| of the normal of a point of the ground.
 _UPRIGHT = float(np.cos(np.deg2rad(35.0)))
-# The ground rises or falls by so much from one cell to the next, at most: a slope, and the noise of the points.
+# Largest change of the ground's height from one cell to the next: a slope, and the noise of the points.
 _STEP_M = CELL_M * float(np.tan(np.deg2rad(15.0))) + 0.05
 _FEWEST_GROUND_POINTS = 3
 # Cells without points of the ground that it is continued over: 3 m.
@@ -36,7 +36,7 @@ _MOST_CELLS = 200_000_000
 
 @dataclass(frozen=True)
 class GridOptions:
-    """What is an obstacle, and how far the grid reaches; metres."""
+    """Heights of obstacles and extent of the grid; metres."""
 
     resolution_m: float = 0.05  # edge of a cell
     # min_height_m, max_height_m: obstacles have points between these heights above the ground

@@ -57,7 +57,7 @@ class Tiling:
 
 @dataclass(frozen=True)
 class _Part:
-    """What a block holds."""
+    """Contents of a block."""
 
     # x, y: the tile
     x: int
@@ -68,8 +68,8 @@ class _Part:
 class TileStore(BlockFile):
     """Voxels on disk, a block for all those of a tile that left memory together.
 
-    A tile that is visited again begins anew in memory; its blocks are added up when it is read. The file grows with
-    what leaves memory, and nothing in it is ever changed: see `BlockFile`.
+    A tile that is visited again starts empty in memory; its blocks are added up when it is read. The file grows with
+    the voxels that leave memory, and nothing in it is ever changed: see `BlockFile`.
     """
 
     _parts: list[_Part]

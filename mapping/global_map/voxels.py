@@ -1,4 +1,4 @@
-"""Rows over the points of voxels, by the voxels' keys: a row each, of what every map has and of scans' attributes.
+"""Rows of sums over the points of voxels, by their keys: the columns of every map, and those of scans' attributes.
 
 Intensity and colour are summed over the points that have one. Ring and time are those of the earliest point.
 """
@@ -21,7 +21,7 @@ from lidarslam.mapping.surfels.voxel_hash import reach_m
 POSITION, VIEW, COUNT = slice(0, 3), slice(3, 6), 6
 _GEOMETRY = 7
 _INTENSITY, _RGB, _FIRST = 2, 4, 3
-# Of a point without a time: later than all others, its low part, and its ring.
+# Of a point without a time: a time later than all others, its low part, and its ring.
 _NO_FIRST = (np.inf, 0.0, -1.0)
 _MASK = (1 << BITS) - 1
 
@@ -33,7 +33,7 @@ _reach_m = compiled_part(reach_m)
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns of rows (N, width) beside position (3), direction to the sensor (3) and number of points."""
+    """The columns of rows (N, width) besides position (3), direction to the sensor (3) and number of points."""
 
     intensity: bool = False  # its sum, and how many points have one
     rgb: bool = False  # the sums of red, green and blue, and how many points have them
@@ -206,7 +206,7 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
 def add_up(order: NDArray[np.intp], keys: Keys, sums: Rows, summed: int, unique: Keys, totals: Rows) -> int:
     """Write the keys (M,) and the totals (M, C) of the rows (N, C) of equal keys (N,), given an order that sorts these.
 
-    The first columns are summed, so many; those behind are those of the earliest row, by the first two of them.
+    The first `summed` columns are summed; the others are those of the earliest row, by the first two of them.
 
     Returns:
         M.

@@ -1,1 +1,1 @@
-"""Inertial measurements beside the LiDAR's: the turn between and during sweeps, and the direction of gravity."""
+"""Inertial measurements: the turn between and during sweeps, and the direction of gravity."""

@@ -1,4 +1,4 @@
-"""What LiDAR and IMU measured of the same motion, compared: axes and units, clocks, signs.
+"""Comparison of the same motion as measured by LiDAR and IMU: axes and units, clocks, signs.
 
 Turns show rotation and clock (Wahba's problem; Gauss-Newton on the rotation vectors), accelerations the accelerometer:
 three positions give the velocity's change without a velocity (as in Qin and Shen's alignment, IROS 2017).
@@ -15,7 +15,7 @@ from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.window import Preintegration
 
-# Turns are compared over this time, and velocities: long beside the errors of registered poses.
+# Turns and velocities are compared over this time: long enough for errors of registered poses to matter little.
 _SPAN_S = 0.5
 _FEWEST, _LONGEST_S = 20, 3.0
 # Errors of a turn at least, radians, and of the change of a velocity, m/s.
@@ -25,15 +25,15 @@ _MOST_SIGMA, _MOST_REMAINING = np.deg2rad(1.0), 0.3
 # Deviations before the comparison: of the clock, seconds, of the rotation, radians, and of the bias, rad/s.
 _CLOCK_S, _ROTATION, _BIAS = 0.1, np.deg2rad(5.0), 0.1
 _SHIFT_S = 1e-3
-# Errors of clock and rotation are corrected from here on, and by so many deviations.
+# Errors of clock and rotation are corrected above these values, and beyond this many standard deviations.
 _LEAST_OFFSET_S, _LEAST_ROTATION, _SIGNIFICANT = 0.003, np.deg2rad(1.0), 4.0
 # Turns and changes of the velocity that are kept; turns that a correction needs, and how often one is made at most.
 _KEPT, FEWEST_COMPARED, MOST_CORRECTIONS = 600, 30, 3
 # The clock is certain to this then, seconds.
 _CLOCK_SIGMA_S = 0.001
-# Turns about an axis are seen where their power is so many times that of errors; axes that agree correlate.
+# Turns about an axis are observed where their power is this many times that of errors; axes that agree correlate.
 _CLEAR, _CORRELATED = 100.0, 0.8
-# Accelerations are reversed where their ratio is below this, and zero by so many deviations.
+# Accelerations are reversed where their ratio is below this, and below zero by this many standard deviations.
 _REVERSED, _DEVIATIONS = 0.3, 4.0
 _REWEIGHTED = 8
 _AXES = np.array(["x", "y", "z"])
@@ -63,7 +63,7 @@ class Mounting:
 class Alignment:
     """Errors of an IMU's clock and rotation."""
 
-    offset_s: float  # its stamps are late by so much
+    offset_s: float  # by which its stamps are late
     offset_sigma_s: float
     rotation: FloatArray  # (3,) rotation vector from its axes, as they were given, to the LiDAR's
     rotation_sigma: float  # of its worst axis, radians
@@ -124,12 +124,12 @@ class Comparison:
         return len(self._turns)
 
     def use(self, samples: ImuSamples) -> None:
-        """Go on with other samples of the same IMU, such as the latest ones."""
+        """Continue with other samples of the same IMU, such as the latest ones."""
         self._gyroscope = Gyroscope(samples, self._T_lidar_imu[:3, :3])
         self._preintegration = Preintegration(samples, self._T_lidar_imu[:3, :3])
 
     def add(self, stamp: float, T_world_lidar: FloatArray, is_connected: bool) -> None:
-        """Take a registered pose (4, 4); one that does not follow from those before begins anew."""
+        """Add a registered pose (4, 4); one that does not follow from those before restarts the comparison."""
         if not is_connected:
             self._recent.clear()
         self._recent.append((stamp, T_world_lidar))
@@ -184,7 +184,7 @@ class Comparison:
         return Alignment(float(x[0]), float(np.sqrt(covariance[0, 0])), x[1:4], worst, agrees)
 
     def contradiction(self) -> str | None:
-        """What is seen of axes, signs or units that cannot be right; None where nothing is."""
+        """Observed errors of axes, signs or units; None where there are none."""
         if len(self) < _FEWEST:
             return None
         return self._contradicting_turns() or self._contradicting_velocities()
@@ -211,7 +211,7 @@ class Comparison:
         )
 
     def _contradicting_velocities(self) -> str | None:
-        """Velocities change by a negative multiple of what the accelerometer measured, beside gravity and a bias."""
+        """Velocities change by a negative multiple of the measured acceleration, apart from gravity and a bias."""
         if len(self._velocities) < _FEWEST:
             return None
         rotations, lidar, imu = (np.stack(column) for column in zip(*self._velocities, strict=True))

@@ -10,7 +10,7 @@ from lidarslam.core.scan import Scan
 
 # Longest step of the integration: within it the axis of rotation is taken as constant.
 _STEP_S = 0.0025
-# A gap between samples is longer than so many usual intervals, and than this.
+# A gap between samples is longer than this many usual intervals, and than this time, seconds.
 _GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.02
 _NO_BIAS = np.zeros(3)
 

@@ -30,7 +30,8 @@ _EVERY_S, _LEVEL_SIGMA = 1.0, np.deg2rad(0.5)
 _BETTER = 0.7
 # The turns of IMU and LiDAR disagree when they differ by more than this share, and by more than registration does.
 _FEWEST_TURNS, _MOST_DIFFERENT, _REGISTRATION_ERROR = 50, 0.2, np.deg2rad(0.15)
-# Biases are reported from here on, and by so many deviations: sensor, part of the bias, m/s^2 and rad/s; as written.
+# Biases are reported beyond this many standard deviations and above a threshold: sensor, part of the bias, threshold in
+# m/s^2 and rad/s, factor and unit of the message.
 _DEVIATIONS = 5.0
 _LARGE_SCALE = 0.05
 _LARGE_BIASES = (
@@ -69,7 +70,7 @@ class Inertial(Stateful):
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
 
     def use(self, samples: ImuSamples) -> None:
-        """Go on with other samples of the same IMU, such as the latest ones."""
+        """Continue with other samples of the same IMU, such as the latest ones."""
         self._integrate(samples)
         self._window.use(self._preintegration)
 
@@ -86,7 +87,7 @@ class Inertial(Stateful):
 
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the IMU, one sentence each."""
+        """Problems of the IMU, one sentence each."""
         warnings, last = [] if self._disagreement is None else [self._disagreement], self._window.last
         if last is not None:
             whole = self._window.covariance()
@@ -117,7 +118,7 @@ class Inertial(Stateful):
 
     @property
     def direction(self) -> GravityDirection | None:
-        """Gravity as measured until the last scan, in its LiDAR frame; None where nothing was."""
+        """Gravity as measured until the last scan, in its LiDAR frame; None where it was not."""
         return self._direction
 
     def prior(self, scan: Scan, prior: Prior) -> Prior:
@@ -131,7 +132,7 @@ class Inertial(Stateful):
         return replace(prior, inertial=self._lidar_state(scan, knot, self._window.covariance(knot)))
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
-        """Take the result of a scan: biases, velocity and gravity follow it."""
+        """Update with the result of a scan: biases, velocity and gravity follow it."""
         knot, self._predicted, self._direction = self._predicted, None, None
         follows = mapped.registered and mapped.is_connected
         if knot is None or (mapped.registered and not mapped.is_connected):

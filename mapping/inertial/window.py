@@ -200,7 +200,7 @@ class InertialWindow(Stateful):
     ) -> None:
         """Begin at a registered pose (4, 4), with the specific force (3,) there; the calibration stays.
 
-        With `is_level`, so does the tilt of the world; after a long loss of tracking, the map may have begun anew.
+        With `is_level`, so does the tilt of the world; after a long loss of tracking, the map may have been restarted.
         """
         last, sigmas = self.last, np.full(_SIZE, np.inf)
         sigmas[_VELOCITY], sigmas[9:12], sigmas[12:15], sigmas[_WORLD] = _SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT
@@ -238,7 +238,7 @@ class InertialWindow(Stateful):
         return replace(knot, T_world_lidar=knot.T_world_estimated)
 
     def add(self, knot: Knot) -> None:
-        """Take the next state, with its registration if there is one: all states follow."""
+        """Add the next state, with its registration if there is one, and update all states."""
         self._knots.append(knot)
         for _ in range(_ITERATIONS):
             step = self._step()
@@ -334,7 +334,7 @@ def _triangle(rows: FloatArray) -> FloatArray:
 
 
 def _remaining(second: Knot, R: FloatArray) -> _Prior:
-    """What the triangle of two knots leaves of the second."""
+    """The information on the second knot in the triangle of two."""
     return _Prior(second, R[_SIZE : 2 * _SIZE, _SIZE:-1].copy(), R[_SIZE : 2 * _SIZE, -1].copy())
 
 

@@ -103,7 +103,7 @@ def _pick_edges(
     points: FloatArray, curvature: FloatArray, edge_above: float, first: int, last: int, free: NDArray[np.bool_],
     kinds: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Mark the points of largest curvature of a sector [first, last) that are still free, and exclude those beside."""
+    """Mark the points of largest curvature of a sector [first, last) that are still free; exclude their neighbours."""
     picked = 0
     sharp = first + np.flatnonzero(curvature[first:last] > edge_above)
     for i in sharp[np.argsort(-curvature[sharp], kind="mergesort")]:

@@ -21,7 +21,7 @@ _CURVATURE_M2 = 0.1
 # An edge needs this many times the median curvature as well. Flat surfaces seen with a range noise of more than one
 # centimetre exceed the published threshold all over, and these edges, on rings that move with the sensor, hold it back.
 _ABOVE_NOISE = 10.0
-# The median is of every so many points.
+# The median is taken over one in this many points.
 _SAMPLED = 4
 
 
@@ -34,7 +34,7 @@ class FeatureSampler(Sampler):
     def _choose(self, scan: Scan, has_rings: bool, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
         if has_rings:
             order, kinds = find_features(scan)
-        else:  # the ends of strokes are no edges, and what is no plane finds none in the map
+        else:  # the ends of strokes are no edges, and points that lie on no plane find none in the map
             order, kinds = np.arange(len(scan)), np.full(len(scan), PLANE, dtype=np.int8)
         chosen = []
         for kind in (EDGE, PLANE):

@@ -26,7 +26,7 @@ _FLAT_RATIO = 3.0
 _PLANE_M, _PLANE_CELLS = 0.2, 0.5
 # Standard deviation of a range, and how many points it counts as in the scatter of few.
 _RANGE_NOISE_M, _COUNTED = 0.02, 2.0
-# A line or plane is as uncertain as if so many of its points counted as one: neighbours share their errors.
+# A line or plane is as uncertain as if this many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
 # Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
 # ring, five points make planes of any direction, and these move with the rings.
@@ -37,7 +37,7 @@ _CERTAIN_TILT = 0.03
 _LEAST_COSINE = 0.1
 # Points whose slots are prefetched.
 _PREFETCHED = 4
-# A voxel of so many points is frozen, so that drift does not smear it.
+# A voxel with this many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
 

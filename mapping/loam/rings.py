@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 
-# A cloud is stored ring after ring when nearly all azimuths go the same way round, at least so many rings.
+# A cloud is stored ring after ring when nearly all azimuths run in one sense, over at least this many rings.
 _SAME_WAY, _FEWEST_RINGS = 0.95, 4
 # Width of the bins of elevation in which rings are peaks, and least height of a peak as a share of the mean.
 _BIN_RAD, _LEAST_PEAK = np.deg2rad(0.05), 0.5

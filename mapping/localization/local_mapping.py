@@ -17,7 +17,7 @@ from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER
 # Scans until the first search of the whole map, growth of the intervals, and the longest; and between nearby searches.
 _FIRST_SEARCH, _GROWTH, _LONGEST = 5, 1.5, 40
 _NEARBY_EVERY = 5
-# A scan is kept after so much way, in median ranges, or such a turn. The latest are kept.
+# A scan is kept after this distance, in median ranges, or this turn. The latest are kept.
 _APART_RANGES, _APART_RAD = 0.25, np.deg2rad(30.0)
 _MOST = 24
 
@@ -53,13 +53,13 @@ class KeptScans:
         self.latest: KeptScan | None = None
 
     def add(self, scan: KeptScan) -> None:
-        """Take the next scan that was registered in the local frame."""
+        """Add the next scan that was registered in the local frame."""
         self.latest = scan
         if not self._apart or scan.is_apart_from(self._apart[-1]):
             self._apart = [*self._apart, scan][-_MOST:]
 
     def chosen(self, count: int) -> Sequence[KeptScan]:
-        """The latest scan, and before it at most so many others, backwards in time, evenly spread."""
+        """The latest scan, and at most `count` others before it, backwards in time, evenly spread."""
         if self.latest is None:
             return []
         others = [scan for scan in reversed(self._apart) if scan is not self.latest]
@@ -111,13 +111,13 @@ class LocalMapping:
             self.kept.add(KeptScan.of(scan, mapped.state.T_world_lidar, mapped.state.velocity))
         elif mapped.fit is not None:
             self._lost += 1
-            if self._lost >= GIVE_UP_AFTER:  # the local map begins anew at a pose that is only predicted
+            if self._lost >= GIVE_UP_AFTER:  # the local map restarts at a pose that is only predicted
                 self.kept, self._followed, self._lost = KeptScans(), [], 0
         self._count += 1
         return mapped
 
     def followed_within(self, ranges: float, before: int) -> list[int]:
-        """Numbers of the scans before one, from which it is tracked without a break over a way in median ranges."""
+        """Numbers of the scans before one, tracked without a break from there, up to a distance in median ranges."""
         latest = self.kept.latest
         numbers = [number for number in self._followed if number < before]
         if latest is None or not numbers:

@@ -29,10 +29,10 @@ logger = logging.getLogger(__name__)
 
 # A scan with less of its points near surfaces of the map is outside of it, or the world has changed.
 _LEAST_OVERLAP = 0.25
-# Radius of the region that scans are registered to, in median ranges, and what it is drawn larger by, as a share.
+# Radius of the region that scans are registered to, in median ranges, and the share by which it is drawn larger.
 _RANGES = 5.0
 _SPARE = 0.5
-# The way, in median ranges, over which the recording's own map places the scans before the first place.
+# The distance, in median ranges, over which the recording's own map places the scans before the first place.
 _BACK_RANGES = 10.0
 
 
@@ -68,11 +68,11 @@ class MapLocaliser(Stateful):
         self._last: MotionState | None = None
         self._pending: tuple[Found, FloatArray] | None = None  # unconfirmed, and its `T_map_local` (4, 4)
         self._count = 0
-        self.found: list[Found] = []  # one a time that it was found
+        self.found: list[Found] = []  # one for each time that it was found
         # Of every search without a place: the number of the scan, from 0, and the reason.
         self.refusals: list[tuple[int, str]] = []
-        # Better poses than those returned, known by now, by the numbers of the scans; and which of these scans lie on
-        # the way to the first place, and which at a place that was not confirmed.
+        # Better poses than those returned, known by now, by the numbers of the scans; and which of these scans came
+        # before the first place, and which lie at a place that was not confirmed.
         self.corrections: dict[int, FloatArray] = {}
         self.placed_afterwards: list[int] = []
         self.revoked: list[int] = []
@@ -80,7 +80,7 @@ class MapLocaliser(Stateful):
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan."""
         sampled = self._sampler.sample(scan)
-        # What an IMU predicts is a pose in the map.
+        # An IMU predicts a pose in the map.
         own = None if self._local is None else self._local.add(sampled, replace(prior, inertial=None))
         if self._tracker is not None and self._last is not None:
             mapped = self._track(sampled, prior, self._tracker, self._last)
@@ -118,7 +118,7 @@ class MapLocaliser(Stateful):
         return replace(mapped, added=False)
 
     def _confirm(self, pending: Found, T_map_local: FloatArray) -> None:
-        """Accept a place; the scans on the way to the first one are placed too, as far as drift is small."""
+        """Accept a place; the scans before the first one are placed too, as far as drift is small."""
         local = self._local
         if local is not None and not self.found:
             self.corrections = {number: T_map_local @ T for number, T in local.poses.items() if number < pending.scan}

@@ -30,15 +30,15 @@ _RANGES, _PLACES, _PEAKS = 3.0, 32, 8
 _FEW_POINTS, _LIKELY = 500, 0.5
 # Of these, that are registered.
 _PROMISING = 16
-# A region of the map serves several places, farther than what the scans reach by so many times that; so many are kept.
+# A region of the map serves several places: it is larger than the scans' reach by this factor. Number of them kept.
 _SPARE, _REGIONS = 1.5, 8
-# Other scans that must fit, and what they may be off from where the recording's own motion puts them.
+# Other scans that must fit, and their largest distance and angle from where the recording's own motion puts them.
 _OTHERS = 5
 _MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
 # Standard deviations of a place that may be anywhere near, and of one that follows from another: radians, metres.
 _ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
 _STILL = 1e-3
-# What scans need, on average: inlier ratio, share of inliers among all points, directional support.
+# Least averages over the scans: inlier ratio, share of inliers among all points, directional support.
 _LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
 # Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it. At
 # 0.8 a wrong place in a row of equal houses was taken.
@@ -132,7 +132,7 @@ class PlaceSearch:
         return self.among(scans, starts)
 
     def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Search:
-        """The one of the places near poses (4, 4) of the latest scan where all scans fit, if no other fits alike."""
+        """The one of the places near poses (4, 4) of the latest scan where all scans fit, if no other fits as well."""
         kept = scans.chosen(_OTHERS)
         if not kept or not starts:
             return Search(None, "there is nothing upright to search with")
@@ -224,7 +224,7 @@ class PlaceSearch:
 
 
 def _decided(places: Sequence[Place]) -> Search:
-    """The first of places by descending quality, unless it does not fit, or a rival fits alike."""
+    """The first of places by descending quality, unless it does not fit, or a rival fits as well."""
     best = places[0]
     if objection := best.objection():
         return Search(None, f"{objection}, at the best place")

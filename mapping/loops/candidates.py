@@ -15,7 +15,7 @@ from lidarslam.mapping.loops.closure import RelativePose, Track
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap, SubmapFile
 from lidarslam.mapping.loops.verification import SubmapCloud
 
-# Shorter ways back are no loops, in median ranges and in metres.
+# Shorter paths back are no loops, in median ranges and in metres.
 _MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0
 # Candidates of either kind that are verified: each costs some 30 ms.
 _NEARBY_CANDIDATES = _APPEARANCE_CANDIDATES = 2
@@ -23,7 +23,7 @@ _NEARBY_CANDIDATES = _APPEARANCE_CANDIDATES = 2
 _MIN_SIMILARITY = 0.35
 # Keyframes on either side whose points help in the registration.
 _NEIGHBOURS = 2
-# Descriptors reach so many median ranges of the first keyframe.
+# Radius of descriptors, in median ranges of the first keyframe.
 _RADIUS_PER_RANGE = 4.0
 # The heading around a nearby keyframe's estimate that is searched, in standard deviations and at least in radians.
 _YAW_SIGMAS = 2.0
@@ -36,7 +36,7 @@ _APART = 3
 # Standard deviation of a guess from two views: radians, and of the median range.
 _ROUGH_RAD = np.deg2rad(10.0)
 _ROUGH_RANGES = 0.3
-# A second place whose score comes so near to the best one's makes both ambiguous.
+# A second place whose score comes this near to the best one's makes both ambiguous.
 _AMBIGUOUS = 0.9
 # Standard deviations of drift that a closure may correct: a candidate by appearance may be anywhere.
 _MAX_SIGMAS, _MAX_SIGMAS_BY_APPEARANCE = 3.0, 2.0
@@ -65,7 +65,7 @@ class KeyframeDatabase(Stateful):
 
     Attributes:
         track: the present estimates.
-        submaps: one a keyframe, in a file.
+        submaps: one for each keyframe, in a file.
     """
 
     track: Track
@@ -85,14 +85,14 @@ class KeyframeDatabase(Stateful):
         return next((_RADIUS_PER_RANGE * submap.range_m for submap in self.submaps if len(submap)), 1.0)
 
     def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> None:
-        """Take the next keyframe: its submap (N, 3), way and segment, and the present estimates (K, 4, 4) of all."""
+        """Add a keyframe: its submap (N, 3), path length and segment, and the present estimates (K, 4, 4) of all."""
         track = self.track
         self._keep(points)
         way_m_all, segments = np.append(track.way_m, way_m), np.append(track.segment, segment)
         self.track = Track(poses, way_m_all, segments, track.drift_rates)
 
     def rebuild(self, submaps: Iterable[FloatArray]) -> None:
-        """Go on, after the estimates were restored, with the points (N, 3) of all submaps."""
+        """Rebuild, after the estimates were restored, from the points (N, 3) of all submaps."""
         for points in submaps:
             self._keep(points)
 
@@ -147,7 +147,7 @@ class KeyframeDatabase(Stateful):
             return
         others, rotation, translation, distance = (v[within] for v in (others, rotation, translation, distance))
         similarity, _ = self._compare(BirdEyeView.of(submap), others)
-        # The nearest as long as drift is little, the most similar when it is much.
+        # The nearest while drift is small, the most similar once it is large.
         cost = distance / (submap.range_m + translation) - similarity
         for k in _spread(others, cost, _NEARBY_CANDIDATES):
             guess = self._near_estimate(int(others[k]), index, float(rotation[k]), float(translation[k]))
@@ -224,7 +224,7 @@ class KeyframeDatabase(Stateful):
 
 
 def _spread(indices: NDArray[np.intp], cost: FloatArray, count: int) -> list[int]:
-    """Which few cost least, no two of them next to one another."""
+    """The few that cost least, no two of them next to one another."""
     chosen: list[int] = []
     for k in np.argsort(cost, kind="stable"):
         if len(chosen) == count:

@@ -12,9 +12,9 @@ from lidarslam.core.state import TRANSFORM, Shape
 
 # Chi-squared with six degrees of freedom: 99 % of consistent measurements are below.
 CHI_SQUARED_99 = 16.8
-# So many scans on either side of a scan are near it; a way on would not be known before they have come.
+# This many scans on either side of a scan are near it; a distance ahead would not be known before they have come.
 NEAR_SCANS = 50
-# However short the way, poses next to each other are no better than this; radians and metres.
+# However short the path, poses next to each other are no better than this; radians and metres.
 _LEAST_ROTATION = np.deg2rad(0.1)
 _LEAST_TRANSLATION_M = 0.02
 
@@ -69,7 +69,7 @@ class GivenLoops:
 class Track:
     """The present estimates of all keyframes, and their drift.
 
-    Two closures between the same two segments make a cycle with the ways between them, that must close (pairwise
+    Two closures between the same two segments make a cycle with the paths between them, that must close (pairwise
     consistency: Mangelson et al., ICRA 2018).
     """
 
@@ -77,7 +77,7 @@ class Track:
     way_m: Annotated[FloatArray, Shape(None)]  # (K,) path length from the recording's start
     # (K,) stretch of continuous tracking; the drift model holds within one
     segment: Annotated[NDArray[np.int64], Shape(None)]
-    # standard deviations of attitude and position for each metre of the way, radians and metres
+    # standard deviations of attitude and position per metre travelled, radians and metres
     drift_rates: tuple[float, float]
 
     @cached_property
@@ -95,7 +95,7 @@ class Track:
     def drift(self, first: NDArray[np.intp], second: int) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (N,) of the second keyframe's attitude and position relative to others (N,).
 
-        A heading error grows along the way; its lever arm is about half the distance from the way between to the
+        A heading error grows along the path; its lever arm is about half the distance from the path between to the
         keyframe.
         """
         way = np.abs(self.way_m[first] - self.way_m[second])
@@ -131,7 +131,7 @@ class Track:
         return max(float(np.sqrt(xi[p] @ np.linalg.solve(covariance[p, p], xi[p]))) for p in parts)
 
     def close_cycle(self, a: RelativePose, b: RelativePose) -> tuple[float, float] | None:
-        """Chi-squared of the cycle of two links and the ways between them, and its largest standard deviation, metres.
+        """Chi-squared of the cycle of two links and the paths between them, and its largest standard deviation, metres.
 
         None when the links do not join the same two segments.
         """

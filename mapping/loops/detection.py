@@ -20,22 +20,22 @@ from lidarslam.mapping.loops.verification import GUESS_SIGMAS, MIN_INLIERS, Veri
 
 logger = logging.getLogger(__name__)
 
-# Way after a closure before the next is sought: another would repeat it. After many on end it is the median range:
-# more of them cost time without improving the trajectory.
+# Distance after a closure before the next is sought: another would repeat it. After many in a row it is the median
+# range: more of them cost time without improving the trajectory.
 _SPACING_M = 2.0
 _MANY = 40
 # A closure near the estimate needs no other while drift is less than this part of the median range.
 _ALONE_RANGES = 0.5
-# Any other needs so many consistent ones, spread over this way, in median ranges.
+# Any other needs this many consistent ones, spread over this distance, in median ranges.
 _CONSISTENT, _SPAN_RANGES = 2, 1.0
-# Way after which a closure that no other is consistent with is rejected.
+# Distance after which a closure that no other is consistent with is rejected.
 _PENDING_M = 100.0
 # A cycle whose standard deviation exceeds this part of the median range closes whatever the links are.
 _SIGNIFICANT_RANGES = 0.25
-# A closure by appearance needs so many times the support of its rivals, of which the last count.
+# A closure by appearance needs this many times the support of its rivals, of which the last count.
 _OUTVOTED = 3
 _RIVALS = 5
-# A closure is compared with at most so many of those before it.
+# A closure is compared with at most this many of those before it.
 _MEMORY = 40
 _ALONE = "no other closure agrees"
 
@@ -60,7 +60,7 @@ class LoopDetector(Stateful):
         poses: FloatArray,
         barred: NDArray[np.bool_] | None = None,
     ) -> list[LoopClosure]:
-        """Take the next keyframe, and return the closures that are accepted or rejected by now.
+        """Add the next keyframe, and return the closures that are accepted or rejected by now.
 
         Args:
             points: (N, 3) its submap, in its LiDAR frame, compensated and thinned.

@@ -1,7 +1,7 @@
 """Fine registration of a loop closure: dense submaps, symmetric point-to-plane ICP.
 
-Planes fitted to the few thousand points of verification are biased by the scan pattern, by centimetres, and alike for
-all closures along a street, so that they do not average out. An accepted closure is registered again on all points of
+Planes fitted to the few thousand points of verification are biased by the scan pattern, by centimetres, and equally for
+all closures along a street, which does not average out. An accepted closure is registered again on all points of
 both submaps and their neighbours. Residuals are taken from planes of either side to points of the other: the bias of
 sampling has opposite signs in the two directions.
 
@@ -29,7 +29,7 @@ from lidarslam.mapping.registration.gauss_newton import (
     point_to_plane_jacobian,
 )
 
-# Planes are fitted to so many nearest points, wherever they lie: to leave out what is not flat biases the result.
+# Planes are fitted to this many nearest points, wherever they lie: leaving out non-planar ones biases the result.
 _NEIGHBOURS = 12
 _MAX_PLANES = 3000
 # Gate of correspondences, in cells, and most Gauss-Newton steps, level after level; scale of the robust kernel.
@@ -116,7 +116,7 @@ def _linearise(
 def _match(
     planes_of: DenseSubmap, points_of: DenseSubmap, T_points_planes: FloatArray, gate_m: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Planes of one side, and of each the nearest point of the other within the gate."""
+    """Planes of one side, and for each the nearest point of the other within the gate."""
     moved = transform_points(T_points_planes, planes_of.centroids)
     distances, found = points_of.tree.query(moved, distance_upper_bound=gate_m, workers=1)
     near = np.flatnonzero(np.isfinite(distances))

@@ -27,7 +27,7 @@ _NARROW = 0.06
 _POLE = 0.7
 # Pixels of the range image: 3 degrees of azimuth and elevation.
 PIXELS = (120, 60)
-# From the sensor's axis, "up" may be so far.
+# Largest angle between "up" and the sensor's axis.
 _LARGEST_TILT = np.cos(np.deg2rad(45.0))
 # Submaps that stay in memory, those used last: about 15 MB.
 _KEPT = 256
@@ -120,7 +120,7 @@ def _shapes(cloud: FloatArray, points: FloatArray) -> tuple[NDArray[np.uint8], F
 def _level_rotation(normals: FloatArray) -> FloatArray:
     """The smallest rotation (3, 3) that takes the mean of the normals (N, 3) near the sensor's z axis to z.
 
-    Floor and ceiling count alike, so z may end up pointing down.
+    Floor and ceiling count equally, so z may end up pointing down.
     """
     axis = np.array([0.0, 0.0, 1.0])
     for least in (_LARGEST_TILT, 0.9, 0.97, 0.99):
@@ -173,7 +173,7 @@ class SubmapFile:
 
 
 def _record(points: int) -> np.dtype[np.void]:
-    """The attributes of a submap of so many points."""
+    """The attributes of a submap with this number of points."""
     return np.dtype([
         ("R_level_lidar", "f8", (3, 3)), ("range_m", "f8"), ("cell_m", "f8"), ("points", "f4", (points, 3)),
         ("axes", "f2", (points, 3)), ("tilt", "f2", (points,)), ("range_image", "f2", PIXELS),

@@ -1,6 +1,6 @@
 """Geometric verification of a loop candidate: registration, then inliers among the points that either side sees.
 
-Sparse submaps are registered point to plane and point to line, coarse to fine. In a row of like rooms, and along any
+Sparse submaps are registered point to plane and point to line, coarse to fine. In a row of similar rooms, and along any
 corridor, most surfaces fit though the pose is wrong. So the inliers must carry most of the information on every
 direction of translation, the weakest too.
 """
@@ -24,14 +24,14 @@ from lidarslam.mapping.registration.gauss_newton import (
     point_to_plane_jacobian,
 )
 
-# Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.
+# Level after level: reach of correspondences and scale of the kernel, in cells; stride of the points; most steps.
 _LEVELS = ((12.0, 4.0, 4, 8), (6.0, 2.0, 2, 6), (4.0, 1.0, 1, 4), (3.0, 0.5, 1, 8))
 _SETTLED = 0.02  # of a cell
 # Cosine between normals of one surface.
 _LEAST_AGREEMENT = 0.6
 _LINE_NOISE_M = 0.08
 _RANGE_NOISE_M = 0.02
-# Residuals of neighbouring points are correlated: so many count as one. Compared with true errors of simulated rounds.
+# Residuals of neighbouring points are correlated: this many count as one. From true errors on simulated rounds.
 CORRELATION = 25.0
 _MIN_POINTS = 12
 # Standard deviations of a candidate's guess, radians and metres.
@@ -43,7 +43,7 @@ _REACH = 4.0
 _REACH_PER_RANGE = 0.06
 # No closure is more precise than this: radians and metres.
 _LEAST_SIGMAS = np.array([np.deg2rad(0.15)] * 3 + [0.015] * 3)
-# Points inform about a direction that their normals face by more than noise would; so many must, for it to count.
+# Points constrain a direction that their normals face by more than noise would; at least this many must.
 _FACING = 0.3
 _LEAST_FACING = 10
 # Where less than this share of a direction's information is in view, too little is known of it.
@@ -66,9 +66,9 @@ class SubmapCloud:
     axes: FloatArray
     tilt: FloatArray  # (N,)
     is_line: NDArray[np.bool_]  # (N,)
-    ahead_m: FloatArray  # (N,) way from the keyframe to that which a point is of, where the drifting estimates place it
-    drift_rates: tuple[float, float]  # standard deviations of that drift for each metre, radians and metres
-    middle_m: float  # way on which a submap is drawn after its keyframe, on average
+    ahead_m: FloatArray  # (N,) path from the keyframe to that of a point, where the drifting estimates place it
+    drift_rates: tuple[float, float]  # standard deviations of that drift per metre, radians and metres
+    middle_m: float  # path over which a submap is drawn after its keyframe, on average
     tree: cKDTree  # of the points
 
     @classmethod
@@ -79,7 +79,7 @@ class SubmapCloud:
         ways_m: Sequence[float] = (),
         drift_rates: tuple[float, float] = (0.0, 0.0),
     ) -> "SubmapCloud":
-        """Unite with neighbours, each with `T_keyframe_neighbour` (4, 4) and the way there; back is negative."""
+        """Unite with neighbours, each with `T_keyframe_neighbour` (4, 4) and the path to it; back is negative."""
         points, axes, tilt, is_line, ahead_m = [], [], [], [], []
         for (T, part), way_m in zip([(np.eye(4), submap), *neighbours], [0.0, *ways_m], strict=True):
             used = part.kinds > 0
@@ -201,7 +201,7 @@ class Verification:
     # (6, 6) of xi in `T_true = T_target_source @ exp(xi)`; that of the guess along degenerate directions
     covariance: FloatArray
     overlap: float  # inliers among the points that either side sees of the other; the worse side
-    information: float  # the same, weighed by information on the direction of translation that fares worst
+    information: float  # the same, weighed by information on the worst constrained direction of translation
     residual_m: float  # root mean square residual of the inliers
     inlier_ratio: float  # inliers among the source's points
     inliers: int  # their number

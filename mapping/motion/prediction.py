@@ -15,9 +15,9 @@ LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 _ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
 UNKNOWN_VELOCITY = np.diag(np.concatenate([LEAST_SIGMA, _ANY_VELOCITY]) ** 2)
 LOST_MOTION = np.diag(np.concatenate([[np.deg2rad(20.0)] * 3 + [1.0] * 3, _ANY_VELOCITY]) ** 2)
-# Standard deviation of what is held at its prediction, m and m/s.
+# Standard deviation along directions held at the prediction, m and m/s.
 _HELD = 0.001
-# The velocity of a lost sensor fades by this factor a scan.
+# The velocity of a lost sensor fades by this factor per scan.
 FADING = 0.7
 # Bounds of the process noise: standard deviations of the acceleration, rotation (rad/s^2) and translation (m/s^2).
 _LEAST_ACCELERATION, _LARGEST_ACCELERATION = (np.deg2rad(150.0), 3.0), (np.deg2rad(4000.0), 60.0)
@@ -60,7 +60,7 @@ class Prior:
     caution: float = 10.0  # factor on the odometry's own standard deviations: its errors are correlated in time
 
     def without_odometry(self) -> "Prior":
-        """What an IMU measured."""
+        """The measurement of an IMU alone."""
         return Prior(inertial=self.inertial)
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:

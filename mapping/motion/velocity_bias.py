@@ -1,6 +1,6 @@
 """The bias that the velocities during successive sweeps have in common, observed by the motion between their poses.
 
-Sweeps that are bent alike fit one another and the map that they make, so that their registration hardly observes a
+Sweeps that are bent equally fit one another and the map that they make, so that their registration hardly observes a
 bias in common. The motion between the poses of successive sweeps does: on average, it is their velocity.
 """
 

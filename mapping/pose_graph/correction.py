@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, interpolate, inverse
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 
-# Over a shorter way the sensor stood still, and scans are counted instead.
+# Over a shorter path the sensor stood still, and scans are counted instead.
 _STILL_M = 0.01
 _UPPER = np.triu_indices(6)
 _TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
@@ -92,7 +92,7 @@ def corrected(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyfr
 def _shares(
     positions: FloatArray, scans: NDArray[np.intp], left: NDArray[np.intp], right: NDArray[np.intp]
 ) -> FloatArray:
-    """(M,) the part of the way between the keyframes on its left and right that each scan has gone."""
+    """(M,) the fraction of the path between the keyframes before and after it that each scan has covered."""
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     still = path[right] - path[left] < _STILL_M
     behind = np.where(still, scans - left, path - path[left])

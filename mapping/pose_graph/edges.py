@@ -1,4 +1,4 @@
-"""Measurements of the graph beside loop closures: motion between keyframes, attitude by gravity, GNSS positions."""
+"""Measurements of the graph besides loop closures: motion between keyframes, attitude by gravity, GNSS positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from lidarslam.mapping.global_map.georeference import GnssTrack, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
 
-# Drift of scan-to-map registration between keyframes, one standard deviation: a floor, and growth with the way.
+# Drift of scan-to-map registration between keyframes, one standard deviation: a floor, and growth per distance.
 # Compared with true errors of simulated recordings.
 _LEAST_RAD, _LEAST_M = np.deg2rad(0.03), 0.005
 _RAD_PER_M, _M_PER_M = np.deg2rad(0.02), 0.003
@@ -41,7 +41,7 @@ class MotionSinceKeyframe:
     T_keyframe_lidar: Annotated[FloatArray, TRANSFORM] | None  # (4, 4); None once a scan had none
     covariance: Annotated[FloatArray, Shape(6, 6)]  # of it, rotation first
     length_m: float = 0.0  # path length
-    lost: bool = False  # whether tracking was lost on the way
+    lost: bool = False  # whether tracking was lost since
 
     @classmethod
     def none(cls) -> "MotionSinceKeyframe":
@@ -88,7 +88,7 @@ def trajectory_edges(
 
 
 def drift_covariance(length_m: float, registered: bool = True, lost: bool = False) -> FloatArray:
-    """(6, 6) of the drift along a way, rotation first."""
+    """(6, 6) of the drift along a path, rotation first."""
     if lost:
         sigma_rad, sigma_m = _LOST_RAD, _LOST_M + _LOST_M_PER_M * length_m
     else:
@@ -104,7 +104,7 @@ def squared_error(edge: RelativePose, poses: Sequence[FloatArray]) -> float:
 
 
 def first_connected(count: int, pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
-    """For each of so many nodes the first one of its connected component, given the pairs that are joined."""
+    """For each of `count` nodes the first one of its connected component, given the pairs that are joined."""
     ends = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, labels = connected_components(adjacency, directed=False)
@@ -125,7 +125,7 @@ class Attitude:
 def measured_attitude(
     scan: GraphScan, keyframes: Sequence[Keyframe], scan_poses: Sequence[FloatArray]
 ) -> list[Attitude]:
-    """Gravity as measured with the latest scan, in the last keyframe; nothing where nothing was measured."""
+    """Gravity as measured with the latest scan, in the last keyframe; empty where it was not measured."""
     if scan.gravity is None or not keyframes:
         return []
     T_lidar_keyframe = inverse(scan.T_world_lidar) @ scan_poses[keyframes[-1].scan]

@@ -55,7 +55,7 @@ class KeyframeGraph(Stateful):
     keyframes: list[Keyframe]
     edges: list[RelativePose]  # along the trajectory
     attitudes: list[Attitude]  # of keyframes
-    redraws: list[int]  # numbers of keyframes when the running local map was drawn anew
+    redraws: list[int]  # numbers of keyframes when the running local map was rebuilt
     store: SubmapStore  # of all keyframes but the last, until `end_recording`
     _selector: KeyframeSelector
     _submap: GlobalMap | None  # of the last keyframe, in its frame
@@ -82,7 +82,7 @@ class KeyframeGraph(Stateful):
         self._submap.add(points, inverse(self.scan_poses[self.keyframes[-1].scan]) @ T_world_lidar, known)
 
     def add(self, scan: GraphScan) -> None:
-        """Take the next scan; the points of the one before have been drawn by now."""
+        """Add the next scan; the points of the one before have been drawn by now."""
         if self.scan_poses:
             step_m = float(np.linalg.norm(scan.T_world_lidar[:3, 3] - self.scan_poses[-1][:3, 3]))
             self._motion = self._motion.then(scan, step_m)
@@ -105,11 +105,11 @@ class KeyframeGraph(Stateful):
         self._close_submap()
 
     def close(self) -> None:
-        """Give up the submaps on disk."""
+        """Release the submaps on disk."""
         self.store.close()
 
     def means(self, key: int) -> VoxelMeans:
-        """The submap of a keyframe, be it the one that still grows."""
+        """The submap of a keyframe, also of the one that still grows."""
         if key < len(self.store):
             return self.store[key]
         return (self._submap or GlobalMap(1.0)).means()

@@ -18,7 +18,7 @@ _RANGES_APART, _LEAST_M, _MOST_M = 4.0, 0.5, 4.0
 _LEAST_OVERLAP = 0.5
 # Cells in which two scans are compared, as a part of the median range; finer ones differ from noise alone.
 _CELL_RANGES = 0.1
-# The overlap's error with so many points is below 2 %.
+# The overlap's error with this many points is below 2 %.
 _COMPARED_POINTS = 1500
 
 

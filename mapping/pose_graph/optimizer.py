@@ -19,7 +19,7 @@ from lidarslam.core.state import Stateful
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.edges import AntennaPosition, Attitude, first_connected, squared_error
 
-# Standard deviations of a pose that is held, radians and metres: firm beside every edge, but no singular system.
+# Standard deviations of a pose that is held, radians and metres: firm compared with every edge, but no singular system.
 _HELD = np.array([np.deg2rad(0.01)] * 3 + [0.001] * 3)
 # Of a pose that positions hold, after their alignment.
 _ALIGNED = np.array([np.deg2rad(5.0)] * 3 + [100.0] * 3)
@@ -33,7 +33,7 @@ _KERNEL_SIGMAS = 4.0
 _INLIER_SIGMAS = 6.0
 # Relative decrease of the cost at which Levenberg-Marquardt ends: while a run lasts, and in the end.
 _NEARLY, _CONVERGED = 1e-4, 1e-9
-# Factors of edges, each made once: to make them anew takes longer than to optimise from poses that are nearly right.
+# Factors of edges, each made once: rebuilding them takes longer than optimising from poses that are nearly right.
 _factors: WeakKeyDictionary[RelativePose, gtsam.BetweenFactorPose3] = WeakKeyDictionary()
 # An optimisation takes time in proportion to the keyframes. The next one waits for the hundredth part of their number,
 # so that its time for each keyframe does not grow: none waits with 100 keyframes, 300 m or so with 10,000.

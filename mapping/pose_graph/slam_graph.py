@@ -3,7 +3,7 @@
 Scans come with the poses that scan-to-map registration gave them. Some become keyframes; the points seen until the next
 one are the submap of each. Consecutive keyframes are joined by edges of the trajectory and of the odometry, and
 submaps that show the same place by loop closures. In the end the whole graph is optimised, the scans between keyframes
-follow, and the map is drawn anew from the submaps.
+follow, and the map is rebuilt from the submaps.
 
 Several recordings of one place are tracked each by itself, and added one after the other. Only loop closures join them;
 those that are connected end up in one frame.
@@ -40,7 +40,7 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-# So many submaps on either side: one alone is as sparse as the sensor, and over a longer way drift bends them.
+# Submaps on either side: one alone is as sparse as the sensor, and over a longer path drift bends them.
 REACH = 1
 
 
@@ -107,7 +107,7 @@ class SlamGraph(KeyframeGraph):
             self.keyframe_ms.append(tracked.keyframe_ms[key] + 1e3 * (time.perf_counter() - started))
 
     def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
-        """The local map drawn anew without the latest scan, in the frame of registration, with cells of that edge.
+        """The local map rebuilt without the latest scan, in the frame of registration, with cells of that edge.
 
         None unless loop closures refined since the last call show that submaps lie elsewhere in the local map, or are
         missing.
@@ -137,7 +137,7 @@ class SlamGraph(KeyframeGraph):
         return self._corrected(self._closures, placed)
 
     def present(self) -> Corrected | None:
-        """Optimise what there is, and stay as it is; None when there is no keyframe.
+        """Optimise the graph so far, and leave it as it is; None when there is no keyframe.
 
         Candidates that wait for others to agree are left out, and so are those of the last keyframe.
         """
@@ -199,7 +199,7 @@ class SlamGraph(KeyframeGraph):
         return [closure for closure in self._closures if closure.accepted]
 
     def _constraints(self, closures: Sequence[LoopClosure]) -> tuple[list[RelativePose], list[LoopClosure]]:
-        """What is no outlier, the edges and closures that are given, and closures that may be one."""
+        """Constraints that are never outliers, the edges and given closures, and closures that may be outliers."""
         accepted = [closure for closure in closures if closure.accepted]
         given = [closure for closure in accepted if closure.given is not None]
         return [*self.edges, *given], [closure for closure in accepted if closure.given is None]
@@ -262,7 +262,7 @@ class SlamGraph(KeyframeGraph):
         first, second = self.keyframes[closure.first], self.keyframes[closure.second]
         if first.segment != second.segment:
             return closure
-        # Of a recording that was added, it is not known what lay where in the maps that were drawn anew.
+        # Of a recording that was added, the places of submaps in its rebuilt local maps are unknown.
         if self._first_scans and any(closure.first < count <= closure.second for count in self.redraws):
             return closure
         place = self._laid.place(closure.first, first.scan, self.scan_poses[first.scan], second.scan)
@@ -284,7 +284,7 @@ class SlamGraph(KeyframeGraph):
         return drift_covariance(max(abs(self.keyframes[k].path_m - path_m) for k in self._around(key))) / 3.0
 
     def _around(self, key: int) -> list[int]:
-        """A keyframe with those beside it in its segment that have submaps by now."""
+        """A keyframe with its neighbours in its segment that have submaps by now."""
         near = range(max(0, key - REACH), min(len(self.store), key + REACH + 1))
         return [k for k in near if self.keyframes[k].segment == self.keyframes[key].segment]
 

@@ -1,7 +1,7 @@
-"""The running local map, drawn anew after a loop closure: submaps at their corrected places around the sensor.
+"""The running local map, rebuilt after a loop closure: submaps at their corrected places around the sensor.
 
 Scans are registered in a frame without jumps, in which the first visit of a place lies where drift has put it, or is
-forgotten. After a closure the submaps around the sensor are laid where the corrected graph has them relative to the
+forgotten. After a closure the submaps around the sensor are placed as in the corrected graph relative to the
 latest keyframe, so that the surfaces of both visits coincide.
 """
 
@@ -21,22 +21,22 @@ from lidarslam.mapping.pose_graph.edges import first_connected
 from lidarslam.mapping.pose_graph.keyframes import Keyframe
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
-# A submap is off when its place in the local map differs from the corrected one by more than so many cells, or by more
-# than this angle: half the width of a surfel, and what displaces a surface by it at the median range of 30 cells.
+# A submap is off when its place in the local map differs from the corrected one by more than this share of a cell or
+# this angle: half the width of a surfel, and the angle that it subtends at the median range of 30 cells.
 _OFF_CELLS, _OFF_RAD = 0.5, np.deg2rad(1.0)
 # Submaps within these parts of the radius of the local map must be in it, and not be off.
 _HELD_WITHIN, _RIGHT_WITHIN = 0.5, 0.25
 # Points of a drawn map, to bound its time; submaps overlap, so that fewer of each are enough.
 _MOST_POINTS = 1_500_000
-# A mean of a submap counts as so many points, so that a cell is full with those of a few submaps that saw it first, as
-# it was when these were mapped; or the scans that follow would shift it to where they are.
+# A mean of a submap counts as this many points, so that a cell is full with those of a few submaps that saw it first,
+# as it was when these were mapped; else the scans that follow would shift it to where they are.
 _WEIGHT = 10.0
-# Scans from the one before which a map is drawn to the first one that is registered to it: the graph is given so much
+# Scans from the one before which a map is drawn to the first one that is registered to it: the graph has this much
 # time before tracking waits for it. More than the scans that may wait for the global map and the graph.
 SCANS_LATER = 12
-# Drawn maps whose submaps are kept: a map is drawn once a scan at most, and closures are refined a few keyframes later.
+# Drawn maps whose submaps are kept: at most one is drawn per scan, and closures are refined a few keyframes later.
 _KEPT = SCANS_LATER + 4
-# Part of the radius of the local map within which the way must have stayed: surfaces around the keyframe are held too.
+# Part of the radius of the local map that the path must not have left: surfaces around the keyframe are held too.
 _PART_OF_RADIUS = 0.6
 # Chi-squared with six degrees of freedom, one time in a thousand: beyond, the two measurements contradict one another,
 # and the surfaces of the first visit had drifted away.
@@ -45,7 +45,7 @@ _CHI_SQUARED_999 = 22.5
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Submaps as they lie in a local map that was drawn anew."""
+    """Submaps as placed in a rebuilt local map."""
 
     since: int  # the first scan that is registered to it
     keys: Annotated[NDArray[np.intp], Shape(None)]  # (H,) the keyframes, ascending
@@ -86,7 +86,7 @@ class SubmapPlacement(Stateful):
         submap: Callable[[int], VoxelMeans],
         scan: int,
     ) -> SurfelMap | None:
-        """The map drawn anew; None unless a submap near the sensor is missing, or lies elsewhere than it should.
+        """The rebuilt map; None unless a submap near the sensor is missing, or lies elsewhere than it should.
 
         Args:
             targets: (K, 4, 4) T_odom_keyframe as corrected; that of the last keyframe is as it was.
@@ -116,7 +116,7 @@ class SubmapPlacement(Stateful):
         return bool((is_far | (rotation_angle(off) > _OFF_RAD)).any())
 
     def is_exchanged(self, first: int, second: int) -> bool:
-        """Whether two scans were registered to different maps, one of them drawn anew."""
+        """Whether two scans were registered to different maps, one of them rebuilt."""
         return any(first < drawn.since <= second for drawn in self._drawn)
 
     def place(self, key: int, scan: int, T_odom_keyframe: FloatArray, at: int) -> tuple[FloatArray, int] | None:
@@ -179,7 +179,7 @@ def as_registered(
     second: FloatArray | None,
     radius_m: float,
 ) -> LoopClosure:
-    """The closure with the motion along the trajectory, where the local map held its place all the way.
+    """The closure with the motion along the trajectory, where the local map held its place along the whole path.
 
     A scan registered to surfaces seen from an earlier keyframe measures its pose relative to that keyframe, with all
     its points and without drift. Registering the two submaps measures the same again from the same points, with more

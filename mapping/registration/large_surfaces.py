@@ -10,11 +10,11 @@ from lidarslam.mapping.registration.surfaces import Surfaces
 # The plane of a point is part of a large one where the coarsest cell has a plane of nearly its normal, no thicker than
 # this share of that cell.
 _SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
-# Large surfaces suffice where they constrain every direction so many times as well as the noise of their normals does.
+# Large surfaces suffice where they constrain every direction this many times as well as the noise of their normals.
 _SUFFICIENT = 15.0
-# They contradict a pose from which they alone would move so many cells away. On recordings without crowds: below 0.1.
+# They contradict a pose from which they alone would move this many cells away. On recordings without crowds: below 0.1.
 _CONTRADICTION_CELLS = 0.2
-# By how much small surfaces are less certain then.
+# Factor by which small surfaces are less certain then.
 INFLATION = 6.0
 _FEWEST = 100
 _RANGE_NOISE_M, _SCALE_PER_MEDIAN = 0.02, 1.5
@@ -30,7 +30,7 @@ def inflation_of_small(
 
     Args:
         points: (N, 3) in the LiDAR frame.
-        T_world_lidar: (4, 4) registered to all surfaces alike.
+        T_world_lidar: (4, 4) registered to all surfaces with equal weight.
         surfaces: of the points.
         local_map: map with these surfaces.
     """

@@ -40,7 +40,7 @@ class LocalMap(Stateful, ABC):
 
     @abstractmethod
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> Matcher:
-        """Finds correspondences of the points of a sweep; until the map changes.
+        """Finds correspondences of the points of a sweep; valid until the map changes.
 
         Args:
             sweep: which.
@@ -85,7 +85,7 @@ class LocalMap(Stateful, ABC):
     def goes_on(
         self, points: FloatArray, normals: FloatArray, sensor: FloatArray, cosine: float, thickness: float
     ) -> NDArray[np.bool_]:
-        """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), go on over the coarsest cell.
+        """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), extend over the coarsest cell.
 
         Args:
             points: in the world.

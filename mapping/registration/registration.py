@@ -1,6 +1,6 @@
 """Scan-to-map registration: pose at the stamp, and velocity during the sweep, by point-to-plane Gauss-Newton.
 
-Correspondences with the map's surfaces are found anew at every iteration, as in LOAM (Zhang and Singh, RSS 2014), with
+Correspondences with the map's surfaces are updated at every iteration, as in LOAM (Zhang and Singh, RSS 2014), with
 robust weights. The sensor moves during a sweep, so that its velocity is estimated together with its pose, as begin and
 end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
 """
@@ -32,9 +32,9 @@ _RANGE_NOISE_M = 0.02
 _SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
 # Residuals beyond this, in cells, are outliers.
 _GATE = 6.0
-# What the prediction leaves open widens the kernel, less at each iteration.
+# The uncertainty of the prediction widens the kernel, less at each iteration.
 _NARROWING = 0.8
-# Errors of neighbouring points are correlated: so many count as one. From true errors on simulated recordings.
+# Errors of neighbouring points are correlated: this many count as one. From true errors on simulated recordings.
 _CORRELATION = 4.0
 # Share of the correspondences' information in the resulting covariance: scans have errors in common, which the balance
 # with the prediction need not allow for. From true errors on real drives.
@@ -193,7 +193,7 @@ class _System:
         """Of points (N, 3) with times (N,), or none to keep the velocity; None where too few have a surface.
 
         The Jacobian with the velocity is `t` times that with the pose, to first order. The kernel is as wide as the
-        covariance (12, 12) of what is still unknown propagates to each residual: the few points that constrain a
+        covariance (12, 12) of the remaining error propagates to each residual: the few points that constrain a
         direction are no outliers while it is unknown, however well all others fit.
         """
         rows = np.empty((3 * len(points), COLUMNS))

@@ -20,7 +20,7 @@ from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
 MIN_CORRESPONDENCES = MIN_POINTS
 # Spacing of the keypoints, in cells.
 _KEYPOINT_SPACING = 2.5
-# Instants that a sweep is divided into, of so many points at least; and the share of the view's height that those of
+# Instants that a sweep is divided into, of this many points at least; and the share of the view's height that those of
 # one instant span if they form a column. It is 0.6 to 0.9 of spinning sensors, 0.07 of a Mid-360.
 _INSTANTS, _LEAST_OF_INSTANT = 1000, 16
 _COLUMN_SHARE = 0.3

@@ -48,7 +48,7 @@ class Correspondences:
 
 
 class Matcher(ABC):
-    """Finds the surfaces that N points correspond to, at one pose after another; until the map changes."""
+    """Finds the surfaces that N points correspond to, at one pose after another; valid until the map changes."""
 
     surfaces: Surfaces
 
@@ -69,7 +69,7 @@ class Matcher(ABC):
         )
 
     def correspondences(self) -> Correspondences:
-        """A residual a row, in the order of the points."""
+        """A residual per row, in the order of the points."""
         found = self.surfaces
         index, _ = chosen = np.nonzero(np.arange(3) < found.counts[:, None])
         return Correspondences(

@@ -33,7 +33,7 @@ Floats = NDArray[np.float32]
 
 # Column of the link to a cell's other side: its row plus one, exact to 16 million cells; zero where there is none.
 OTHER = 15
-# A cell with so many points is frozen, so that drift does not smear it.
+# A cell with this many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
 
@@ -82,7 +82,7 @@ def add_moments(
 ) -> None:  # fmt: skip
     """Add points (N, 3) with elevations (N,) and views (N, 3) to the sums of their cells, unless these are frozen.
 
-    Each counts as so many points as its weight.
+    Each point counts `weight` times.
     """
     scale, w = 1.0 / cell_m, np.float32(weight)
     is_growing = np.empty(len(rows), dtype=np.bool_)

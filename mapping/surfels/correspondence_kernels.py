@@ -18,7 +18,7 @@ from lidarslam.mapping.surfels.surfel_kernels import is_steep
 # only when its points differ so much in height across the rings.
 _LEAST_HEIGHT_M = 0.05
 _FEWEST_POINTS = 6
-# The plane of a surfel is as uncertain as if so many of its points counted as one: neighbours share their errors.
+# The plane of a surfel is as uncertain as if this many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5

@@ -35,7 +35,7 @@ ELEVATION_SPREAD, COUNT, IS_PLANE = 12, 13, 14
 _CACHE_LINE = 64
 # Points that represent a cell in a grid of another size.
 _SAMPLES = 6
-# Stray cells have less than this share of the mean number of points in a cube of so many cells. They are looked for
+# Stray cells have less than this share of the mean number of points in a cube of this many cells. They are looked for
 # whenever the number of cells has grown by this factor.
 _STRAY_SHARE = 0.05
 _AROUND = 12
@@ -140,7 +140,7 @@ class SurfelGrid(Stateful):
     def samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points (S, 3) of the world, their elevations (S,) and views (S, 3), with the moments of the cells.
 
-        Six a cell, two along each principal axis of its own points, or the mean alone of a cell with fewer than six.
+        Six per cell, two along each principal axis of its own points, or the mean alone of a cell with fewer than six.
         """
         count = len(self)
         sums = self._sums[:count].astype(np.float64)
@@ -171,9 +171,9 @@ class SurfelGrid(Stateful):
         self._keep(kept[:count])
 
     def tidy(self) -> None:
-        """Compute all surfels anew, and drop stray cells.
+        """Recompute all surfels, and drop stray cells.
 
-        A surfel is computed again only when its own cell has grown, which a cell beside a wall hardly does while the
+        A surfel is computed again only when its own cell has grown, which a cell next to a wall hardly does while the
         wall grows a hundredfold. Where a sensor circles, noise reaches ever more cells.
         """
         count = len(self)

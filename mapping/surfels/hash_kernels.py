@@ -114,7 +114,7 @@ def insert(
 
 @compiled_part
 def key_at(point: FloatArray, scale: float) -> int:
-    """Key of the cell of a point (3,), of so many cells a metre."""
+    """Key of the cell of a point (3,), with `scale` cells per metre."""
     return key_of(cell_of(point[0] * scale), cell_of(point[1] * scale), cell_of(point[2] * scale))
 
 

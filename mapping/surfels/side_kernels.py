@@ -28,7 +28,7 @@ def belong_to_others(
 ) -> None:  # fmt: skip
     """Write whether points (N,), with views (N, 3), belong to the other sides of their cells, in rows (N,).
 
-    Outdated surfels (M, 15) are computed on the way.
+    Outdated surfels (M, 15) are updated.
     """
     work, asked = scratch(), np.empty(len(rows), dtype=np.int32)
     count = 0

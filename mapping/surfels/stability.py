@@ -1,4 +1,4 @@
-"""Geometrically stable sampling: the points of a scan that constrain what few others do.
+"""Geometrically stable sampling: the points of a scan that constrain directions that few others do.
 
 The few points on the faces of boxes along a corridor determine its length, and an even sample has hardly any of them.
 After Gelfand et al., "Geometrically Stable Sampling for the ICP Algorithm" (3DIM 2003), which sorts points by each

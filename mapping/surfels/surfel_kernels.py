@@ -14,7 +14,7 @@ from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, other_side
 from lidarslam.mapping.surfels.hash_kernels import PREFETCHED, find_one, middle_of, neighbour_key, prefetch_around
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
-# Surfels that are computed together: what one needs is prefetched while another is computed.
+# Surfels that are computed together: the data of one is prefetched while another is computed.
 _TOGETHER = 16
 # A surfel is computed again when its cell has grown by this factor.
 _GROWTH = np.float32(1.5)

@@ -95,7 +95,7 @@ class SurfelMap(LocalMap):
     ) -> None:
         """Insert points (N, 3) of the world, with elevations (N,), seen from along views (N, 3), unit length.
 
-        Each counts as so many points as its weight.
+        Each point counts `weight` times.
         """
         for grid in self._grids:
             grid.insert(points, elevations, views, weight)

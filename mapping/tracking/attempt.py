@@ -15,7 +15,7 @@ from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.fit import Fit
 
-# A correction beyond so many standard deviations of the prediction, and beyond degrees and metres, is a jump.
+# A correction beyond this many standard deviations of the prediction, and beyond degrees and metres, is a jump.
 _MOST_SIGMAS = 5.0
 _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
 # How much faster than predicted a sensor may move and turn, m/s and rad/s, and for how long after it was tracked; then
@@ -26,7 +26,7 @@ _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S = 0.3, np.deg2rad(
 _MEASURED_TURN = np.deg2rad(5.0)
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
-# A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place so many
+# A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place this many
 # cells away. On simulated recordings the inlier ratio was 57 to 74 % at wrong places, at right ones 94 % and more; the
 # share of inliers depends on how much of the view is new.
 _RELIABLE_RATIO, _RELIABLE_SHARE, _RELIABLE_SUPPORT = 0.85, 0.4, 0.6

@@ -41,7 +41,7 @@ _FEW_POINTS, _LIKELY = 800, 0.5
 # cells, within reach of the coarse cells.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
-# Points that constrain what few others do, by which a displacement is chosen, at most.
+# Most points that constrain directions that few others do, by which a displacement is chosen.
 _MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells; a factor by which
 # the quality must be better.
@@ -89,7 +89,7 @@ class ScanMatcher:
         return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
 
     def register(self, prediction: Prediction, coarse_first: bool) -> Attempt:
-        """Register from the prediction; where that does not fit, by way of coarser cells."""
+        """Register from the prediction; where that does not fit, through coarser cells."""
         attempt = self._attempt(prediction, prediction, coarse_first)
         if coarse_first or attempt.status is Status.OK or self._budget.is_spent:
             return attempt
@@ -140,7 +140,7 @@ class ScanMatcher:
     def or_along_weakest(self, near: Attempt) -> Attempt:
         """An attempt; where it fits poorly, a clearly better one a few cells away along its weakest direction, if any.
 
-        Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks alike.
+        Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks the same.
         """
         if near.status is Status.OK or near.fit.weakest is None or not near.fit.is_constrained:
             return near
@@ -161,7 +161,7 @@ class ScanMatcher:
 
         Of several optima along the weakest direction, as on stairs, the prediction's may be the next step's.
         """
-        if prior.T_prev_curr is None or near.prediction.is_inertial:  # an IMU knows better
+        if prior.T_prev_curr is None or near.prediction.is_inertial:  # an IMU's prediction is better
             return near
         if near.fit.weakest is None or not near.fit.is_constrained:
             return near
@@ -188,7 +188,7 @@ class ScanMatcher:
         return best_of(attempt for attempt in attempts if attempt.is_reliable)
 
     def search_map(self, prediction: Prediction) -> Steps[Attempt | None]:
-        """Relocalise anywhere in the map at any yaw; None where no result is reliable, or two places fit alike."""
+        """Relocalise anywhere in the map at any yaw; None where no result is reliable, or two places fit equally."""
         view = BirdsEyeMap.of(self._map.means(), self._map.vertical(), _VIEW_CELLS * self._map.cell_m)
         yield
         points, reach_m = self.scan.sweep.compensated(prediction.velocity), _VIEW_RANGES * self.scan.range_m
@@ -205,7 +205,7 @@ class ScanMatcher:
             begun, prediction: of the earlier scan and of this one.
         """
         assert found.registration is not None
-        # As it was predicted, or where a standstill was for want of an odometry, as the earlier sweep was moving.
+        # By the predicted motion and by the earlier sweep's velocity: without an odometry, a standstill was predicted.
         predicted = inverse(begun.T_world_lidar) @ prediction.T_world_lidar
         moved = exp((prediction.stamp - begun.stamp) * found.registration.velocity)
         starts = found.T_world_lidar @ np.array([predicted, moved])
@@ -248,7 +248,7 @@ class ScanMatcher:
     ) -> Attempt:
         keypoints = keypoints or self.scan.keypoints
         attempt = self._registered(prediction, start, coarse_first, patient, keypoints)
-        # What hardly anything constrains would be estimated from the errors of the normals.
+        # Directions that are hardly constrained would be estimated from the errors of the normals.
         if attempt.registration is None or attempt.fit.weakest is None:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)

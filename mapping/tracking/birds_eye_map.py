@@ -64,7 +64,7 @@ class BirdsEyeMap:
             T_world_lidar: (4, 4), of which only the rotation counts.
             reach_m: radius of the scan's image.
             most: largest K.
-            peaks_per_yaw: correlation peaks that are kept for each yaw; more where places are alike.
+            peaks_per_yaw: correlation peaks that are kept for each yaw; more where places are similar.
         """
         level = points @ (self.R_level_world @ T_world_lidar[:3, :3]).T
         level = level[np.einsum("ij,ij->i", level[:, :2], level[:, :2]) < reach_m**2]

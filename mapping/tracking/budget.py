@@ -12,9 +12,9 @@ Steps: TypeAlias = Generator[None, None, T]
 
 # Share of the time between two scans that `auto` is: the odometry needs the other part.
 _AUTO_SHARE = 0.5
-# A search that goes on has this share of the budget at least.
+# A search that continues has this share of the budget at least.
 _LEAST_SHARE = 0.2
-# The velocity is unknown at first, and nothing waits yet: so many scans are not bounded.
+# The velocity is unknown at first, and nothing waits yet: this many scans are not bounded.
 _FREE_SCANS = 2
 
 
@@ -22,7 +22,7 @@ class Budget:
     """The time of a scan, and whether it is spent.
 
     Args:
-        budget_ms: milliseconds a scan; auto: half of the time between scans; None: not bounded.
+        budget_ms: milliseconds per scan; auto: half of the time between scans; None: not bounded.
         clock: seconds.
     """
 
@@ -32,7 +32,7 @@ class Budget:
         self._length_s = self._until_s = float("inf")
         self._last_interval_s = float("inf")
         self._scans = 0
-        self._was_spent = False  # before a search could go on, at the last scan with one
+        self._was_spent = False  # before a search could continue, at the last scan with one
 
     @property
     def is_spent(self) -> bool:
@@ -40,7 +40,7 @@ class Budget:
         return self._clock() >= self._until_s
 
     def begin(self, interval_s: float) -> None:
-        """Begin with a scan, so long after the one before; a gap between scans makes the budget no larger."""
+        """Begin with a scan, `interval_s` after the one before; a gap between scans makes the budget no larger."""
         self._scans += 1
         if self._budget_ms == "auto":
             self._length_s = _AUTO_SHARE * min(interval_s, self._last_interval_s)
@@ -50,12 +50,12 @@ class Budget:
         self._until_s = self._clock() + self._length_s if self._scans > _FREE_SCANS else float("inf")
 
     def lets_search_on(self) -> bool:
-        """Whether a scan's search may go on; true as well where nothing was left for it at the scan before."""
+        """Whether a scan's search may continue; true as well where nothing was left for it at the scan before."""
         self._was_spent = self.is_spent and not self._was_spent
         return not self._was_spent
 
     def run(self, steps: Steps[T]) -> tuple[T] | None:
-        """Carry on with a computation until it is done or the time is spent; its result, None where it is not done."""
+        """Continue a computation until it is done or the time is spent; its result, None where it is not done."""
         until_s = self._until_s
         if until_s < float("inf"):
             until_s = max(until_s, self._clock() + _LEAST_SHARE * self._length_s)

@@ -107,7 +107,7 @@ class Fit:
     def status(self, config: TrackingConfig, is_young: bool = False, is_held: bool = False) -> Status:
         """Tracking status of the scan.
 
-        In a young map, the support alone cannot say that it is lost; where an IMU holds the pose, it says nothing.
+        In a young map, low support alone does not make it lost; where an IMU holds the pose, support is ignored.
         """
         support = 1.0 if self.support is None or is_held else self.support
         if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP:

@@ -33,7 +33,7 @@ from lidarslam.mapping.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
 
-# Insertions of the first sweep anew, with the motion that the second one showed.
+# Times that the first sweep is inserted again, with the motion that the second one showed.
 _REDRAWS = 2
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 _SEARCHING = "the search for its place goes on with the next scan"
@@ -125,7 +125,7 @@ class Mapper(Stateful):
         prediction = self._tracker.predict(scan, prior, last)
         if scan.is_sparse:
             return self._lose(scan, prediction, local_map, None, _sparse_message(scan))
-        # A velocity that is extrapolated over a gap in the stamps leads anywhere.
+        # A velocity extrapolated over a gap in the stamps may lead anywhere.
         T_world_near = (last if prior.T_prev_curr is None else prediction).T_world_lidar
         beyond = beyond_reach(T_world_near[:3, 3], self._config.max_range_m, local_map.cell_m)
         if beyond is not None:
@@ -147,7 +147,7 @@ class Mapper(Stateful):
         return mapped
 
     def redraw(self, drawn: SurfelMap, scans: int) -> bool:
-        """Replace the local map of surfels by one drawn anew without the latest scans, so many, which are inserted.
+        """Replace the local map of surfels by a rebuilt one without the latest `scans` scans, which are then inserted.
 
         Returns:
             False where another map has begun since, or a search of the map is under way: the map stays.
@@ -176,9 +176,9 @@ class Mapper(Stateful):
     def _track_second(
         self, scan: SampledScan, prior: Prior, last: MotionState, first: SampledScan, local_map: LocalMap
     ) -> MappedScan:
-        """Register the second scan; where the first was moving, insert that anew, and register again.
+        """Register the second scan; where the first was moving, insert that again, and repeat.
 
-        Two sweeps bent alike fit one another and hide a common motion, the motion between their poses does not.
+        Two sweeps that are bent equally fit one another and hide a common motion; that between their poses shows it.
         """
         before = self._tracker.snapshot()
         mapped = self._track(scan, prior, last, local_map)

@@ -1,4 +1,4 @@
-"""A search for the place of a scan that may go on with later scans."""
+"""A search for the place of a scan that may continue with later scans."""
 
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.tracking.attempt import Attempt
@@ -7,7 +7,7 @@ from lidarslam.mapping.tracking.budget import Budget, Steps
 
 
 class SpreadSearch:
-    """A search that is under way, or none; its result is carried on to the present scan by the motion since.
+    """A search in progress, or none; its result is carried on to the present scan by the motion since.
 
     It is no part of a saved state: a new one begins after a resumption.
     """
@@ -19,7 +19,7 @@ class SpreadSearch:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether one was begun, and is not done."""
+        """Whether a search was begun and is not finished."""
         return self._begun is not None
 
     def begin(self, steps: Steps[Attempt | None], prediction: Prediction) -> None:

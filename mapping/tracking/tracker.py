@@ -33,10 +33,10 @@ from lidarslam.mapping.tracking.spread_search import SpreadSearch
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
-# error is forgotten by a factor a scan.
+# error is forgotten by a factor per scan.
 _FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
 # A scan constrains its weakest direction poorly below this support or evidence: a fifth of the scans on stairs, in
-# offices, streets and crowds none. There an odometry counts with at most so many times its own standard deviations,
+# offices, streets and crowds none. There an odometry counts with at most this many times its own standard deviations,
 # after motions of fewer cells than this: after longer ones it may itself be off by a step.
 _WEAK_SUPPORT, _WEAK_EVIDENCE, _WEAK_CAUTION, _WEAK_CELLS = 0.65, 40.0, 2.0, 2.0
 # Where even less constrains it, as in a corridor, nothing but the prediction does: evidence in units of the least.
@@ -77,7 +77,7 @@ class Tracker(Stateful):
 
     @property
     def is_searching(self) -> bool:
-        """Whether a search is under way that goes on with the next scan."""
+        """Whether a search is in progress that continues with the next scan."""
         return self._search.is_under_way
 
     def begin_at(self, stamp: float, quality: float) -> None:
@@ -181,7 +181,7 @@ class Tracker(Stateful):
         return True
 
     def loses(self, has_points: bool) -> bool:
-        """Update with a scan that was not registered; true after so many that the map is to be given up."""
+        """Update with a scan that was not registered; true after enough of them to give the map up."""
         self._prediction_error_m = _UNKNOWN_ERROR_M
         self._is_measured &= has_points
         self._state.lost(has_points)
@@ -280,9 +280,9 @@ class Tracker(Stateful):
     def _found(
         self, matcher: ScanMatcher, prediction: Prediction, prior: Prior, nearby: bool = False
     ) -> Attempt | None:
-        """The scan, relocalised by the search that is under way or a new one; None where that is not done or fails.
+        """The scan, relocalised by the search in progress or a new one; None where that is not finished or fails.
 
-        A place out of reach of the motion since the sensor was tracked looks alike, and is not taken for this one.
+        A place out of reach of the motion since the sensor was tracked is a similar one, and is rejected.
         """
         self._map_is_due |= self._state.searches_map and not nearby
         if not self._search.is_under_way:

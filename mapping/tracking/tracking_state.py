@@ -3,12 +3,12 @@
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 
-# After such a gap between scans the pose is uncertain.
+# After a gap of this length between scans the pose is uncertain.
 _GAP_S = 1.0
-# A relocalisation is confirmed by so many consistent scans over such a time.
+# A relocalisation is confirmed by this many consistent scans over at least this time.
 _CONFIRMED_BY, _CONFIRMED_AFTER_S = 3, 1.0
 _ROUNDING_S = 1e-3
-# A search of the whole map takes a second or two: it is made at these lost scans in a row, and at every so manieth.
+# A search of the whole map takes a second or two: it is made at these lost scans in a row, and then periodically.
 _SEARCHES_AT, _SEARCHES_EVERY = (1, 2, 4, 8, 13), 20
 # A scan fits poorly below this share of the usual quality, which is smoothed over the latest scans.
 _POOR_SHARE, _SMOOTHING = 0.9, 0.2
@@ -58,7 +58,7 @@ class TrackingState(Stateful):
 
     @property
     def gives_up(self) -> bool:
-        """Whether so many scans were lost that a new map is begun."""
+        """Whether enough scans were lost to begin a new map."""
         return self.lost_in_a_row >= GIVE_UP_AFTER
 
     @property
