@@ -32,7 +32,7 @@ from lidarslam.storage.finished_run import load_map
 from lidarslam.viewer.viewer import Viewer
 from lidarslam.viewer.web_page import WebPage
 
-# A map of fewer points is not worth a search.
+# A map of fewer points is too small for a search.
 _FEWEST_POINTS = 1000
 
 
@@ -68,7 +68,7 @@ def read_map(request: LocaliseRequest) -> tuple[PointCloud, FixedMap]:
 
 
 class PlacedViewer(Viewer):
-    """Passes scans on once one has a place in the map: before, poses are in a frame of their own.
+    """Forwards scans once one is localised in the map: before, poses are in a frame of their own.
 
     Args:
         shown: the viewer that shows them.
@@ -79,7 +79,7 @@ class PlacedViewer(Viewer):
         self._is_placed = False
 
     def show_scan(self, index: int, result: ScanEstimate) -> None:
-        """One scan, if the place is known."""
+        """Show a scan, if its pose in the map is known."""
         self._is_placed = self._is_placed or result.status is not Status.LOST
         if self._is_placed:
             self._shown.show_scan(index, result)
@@ -99,11 +99,11 @@ class Localisation:
     inlier_ratio: float | None  # mean of the scans that it was found with
     tracked: int  # scans that were registered to the map
     placed_afterwards: int  # scans before the first place that follow from it
-    times_found: int  # more than once where it was lost on the way
+    times_found: int  # more than once where it was lost in between
     refused: tuple[tuple[int, str], ...]  # scan and reason of every search without a place
 
     def to_json(self) -> dict[str, Any]:
-        """The section of summary.json, but for the map."""
+        """The section of summary.json, without the map."""
         refused = [{"scan": scan, "reason": reason} for scan, reason in self.refused]
         return {
             "found": self.found is not None,
@@ -137,7 +137,7 @@ def execute(
     Args:
         request: what is localised, and where.
         progress: called after every scan.
-        phase: called with a few words on what goes on before the first scan and after the last.
+        phase: called with a short text on the progress before the first scan and after the last.
         page: shows it in browsers, with `rerun="web"`.
 
     Raises:
@@ -167,7 +167,7 @@ def execute(
 
 
 def _write(request: LocaliseRequest, session: RunSession, tracked: Tracked, localiser: MapLocaliser) -> LocaliseOutcome:
-    """Write what is known by now; a recording that was never found has no trajectory in the map."""
+    """Write the results so far; a recording that was never found has no trajectory in the map."""
     log, directory, config, described = session.log, session.directory, request.run.config, request.describe()
     _correct(log, localiser)
     found = _localisation(log, localiser)
@@ -186,7 +186,7 @@ def _write(request: LocaliseRequest, session: RunSession, tracked: Tracked, loca
 
 
 def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
-    """Enter what later scans have shown of earlier ones."""
+    """Update earlier scans by the results of later ones."""
     scans = range(len(log))
     poses = log.trajectory.T_world_lidar.copy()
     for number, T_map_lidar in localiser.corrections.items():

@@ -53,7 +53,7 @@ class WrittenBag:
     """A bag as it was written."""
 
     path: Path
-    messages: dict[str, int]  # topic -> how many
+    messages: dict[str, int]  # topic -> number
 
 
 def export_bag(
@@ -62,7 +62,7 @@ def export_bag(
     """Write odometry, tf, path and map of a run, and its deskewed clouds, for which the recording is read again.
 
     The file has one of `SUFFIXES`, of which none gives a folder; `count` is called with the number of scans done, and
-    of all.
+    the total.
 
     Raises:
         InputError: the map or the recording cannot be read.
@@ -219,7 +219,7 @@ class RosMessages:
         return types["nav_msgs/msg/Path"](self._header(float(stamps[-1]), frame), poses)
 
     def cloud(self, stamp: float, frame: str, points: FloatArray, attributes: PointAttributes) -> Any:
-        """Points (N, 3) with intensity, ring and colour as far as there are any."""
+        """Points (N, 3) with intensity, ring and colour where known."""
         columns: dict[str, Any] = {axis: points[:, n].astype(np.float32) for n, axis in enumerate("xyz")}
         if attributes.intensity is not None:
             columns["intensity"] = attributes.intensity.astype(np.float32)

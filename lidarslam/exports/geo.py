@@ -93,7 +93,7 @@ def utm_around(geodetic: FloatArray) -> Utm:
 
 @dataclass(frozen=True, eq=False)
 class GeoRun:
-    """A run, and where it lies."""
+    """A run, and its place in UTM."""
 
     run: Path
     trajectory: Trajectory
@@ -236,7 +236,7 @@ def _of_bag(bag: BagFile, lidar_frame: str) -> GnssTrack | None:
     for message in bag.messages(max(topics, key=lambda topic: topic.messages)):
         if message.damage is not None:
             continue
-        with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
+        with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others remain
             fix = deserialize(message.raw, _FIX_TYPE, bag.ros2)
             if fix.status.status == _NO_FIX or not np.isfinite([fix.latitude, fix.longitude, fix.altitude]).all():
                 continue

@@ -56,7 +56,7 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, options: dict[
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> list[Path]:
-    """Write `path`, a .yaml file, and the image beside it; the files.
+    """Write `path`, a .yaml file, and the image next to it; the files.
 
     Raises:
         OutputError: they cannot be written.

@@ -31,7 +31,7 @@ _FEWEST_SAMPLES = 10
 
 @dataclass(frozen=True)
 class MapEdits:
-    """What is done, in this order."""
+    """The edits, in this order."""
 
     # moved: range images that see through a moved point, 0: none is removed; None: maps as they are
     moved: int | None = None

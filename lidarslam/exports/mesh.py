@@ -29,7 +29,7 @@ def export_mesh(run: Path, out: Path, cell_m: float | None) -> Iterator[str]:
     Without an edge of the smallest cells, it is twice that of the map's voxels.
 
     Raises:
-        InputError: there is no run or no map, or no surface comes of it.
+        InputError: there is no run or no map, or no surface results from it.
         OutputError: the file cannot be written.
     """
     cloud = load_map(run)

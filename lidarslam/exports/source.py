@@ -26,15 +26,15 @@ from lidarslam.storage.finished_run import read_statuses, read_trajectory
 
 # Stamps of the trajectory and of the recording are equal but for the text's nine decimals.
 _SAME_S = 1e-6
-# A motion over an interval longer than this multiple of the median is not that of the sweep.
+# A motion over an interval longer than this multiple of the median does not describe the sweep.
 _GAP = 2.5
 
 
 def require_new(out: Path, overwrite: bool) -> None:
-    """Check that nothing is in the way of an exported file.
+    """Check that an exported file can be written.
 
     Raises:
-        OutputError: a file is there that is not to be replaced, or a folder.
+        OutputError: there is a file that is not to be replaced, or a folder.
     """
     if out.is_dir():
         raise OutputError(f"{out}: is a folder; name another place, or remove it")

@@ -1,1 +1,1 @@
-"""A robot that is running: its clouds over DDS, poses in return, and the results of a run."""
+"""A robot that is running: its clouds over DDS, published poses, and the results of a run."""

@@ -15,7 +15,7 @@ from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, T
 # Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
 _MOST_LOOKED_AT = 10
 
-# A stamp that is ahead of the time since the scan before by so much is a stray one, unless so many in a row are.
+# A stamp that is ahead of the time since the scan before by this much is an outlier, unless this many in a row are.
 _AHEAD_NS, _CLOCK_WAS_SET = 10**9, 6
 
 _NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
@@ -27,7 +27,7 @@ _TIME_FIELD = "time field of the points has a fault"
 
 @dataclass(frozen=True, eq=False)
 class LiveScan:
-    """A scan with what its message says beside the points."""
+    """A scan with the header of its message."""
 
     scan: Scan  # in upright axes
     stamp_ns: int  # of the header, or of the publication where the header has none
@@ -48,7 +48,7 @@ class CloudDecoder:
         self._frame_id = config.frame_id
         self._last_ns: int | None = None
         self._doubtful: tuple[int, int] | None = None  # stamp and publication of a first message from the future
-        self._last_published_ns = self._ahead = 0  # and how many stamps in a row were ahead of it
+        self._last_published_ns = self._ahead = 0  # and the number of stamps in a row ahead of it
         self._has_header_stamps = True
         self._clouds: list[TimedCloud] = []
         self._point_time: PointTimeModel | None = None

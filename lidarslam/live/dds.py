@@ -2,7 +2,7 @@
 
 ROS 2 maps the topic /points to rt/points, the type sensor_msgs/msg/PointCloud2 to sensor_msgs::msg::dds_::PointCloud2_,
 and serialises messages as XCDR1. Messages stay serialised here: the library would make a list of three million numbers
-of a cloud, which takes ten times as long as all of our own decoding.
+of a cloud, which takes ten times as long as all our own decoding.
 """
 
 import os
@@ -29,7 +29,7 @@ from lidarslam.live.receiving import Received
 # net.core.rmem_max.
 _CONFIG = "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max='32MB'/></Internal></Domain></CycloneDDS>"
 _MOST_ENDPOINTS = 10_000
-_DEPTH = 10  # messages that wait in a reader or for a slow subscriber
+_DEPTH = 10  # messages that are queued in a reader or for a slow subscriber
 _BASE_TYPES = {
     "bool": bool,
     "string": str,
@@ -47,13 +47,13 @@ class PublishedTopic:
 
     name: str  # as in ROS, such as /points
     message_type: str  # as in ROS, such as sensor_msgs/msg/PointCloud2
-    is_reliable: bool  # whether all its publishers send again what was lost
+    is_reliable: bool  # whether all its publishers send lost messages again
 
 
 class DdsNode:
     """A participant in a domain; one at a time in a process.
 
-    The environment variable CYCLONEDDS_URI chooses the network interface and all else, as for ROS nodes.
+    The environment variable CYCLONEDDS_URI chooses the network interface and other settings, as for ROS nodes.
     """
 
     def __init__(self, domain: int) -> None:
@@ -64,7 +64,7 @@ class DdsNode:
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
 
     def published(self) -> tuple[PublishedTopic, ...]:
-        """The topics of ROS that are published now, as far as discovery has come."""
+        """The topics of ROS that are published now, as far as they are discovered."""
         reliable: dict[tuple[str, str], bool] = {}
         for endpoint in self._publications.read(_MOST_ENDPOINTS):
             kind = _ros_type(endpoint.type_name or "")
@@ -76,12 +76,12 @@ class DdsNode:
         return tuple(sorted(PublishedTopic(*key, is_reliable) for key, is_reliable in reliable.items()))
 
     def subscribe(self, topic: PublishedTopic, is_kept: bool = False, depth: int = _DEPTH) -> "Subscription":
-        """Receive a topic, of which so many messages may wait; of a kept one, such as /tf_static, earlier ones too."""
+        """Receive a topic with a queue of this length; of a latched one, such as /tf_static, earlier messages too."""
         qos = _qos(topic.is_reliable, is_kept, depth)
         return Subscription(self._participant, DataReader(self._participant, self._topic(topic), qos), depth)
 
     def publisher(self, name: str, message_type: str, is_kept: bool = False) -> "Publisher":
-        """Publish a topic, reliably, as ROS does odometry and /tf; a kept one to those too who subscribe later."""
+        """Publish a topic, reliably, as ROS does odometry and /tf; a latched one also to later subscribers."""
         topic = self._topic(PublishedTopic(name, message_type, True))
         return Publisher(DataWriter(self._participant, topic, _qos(True, is_kept)))
 
@@ -90,7 +90,7 @@ class DdsNode:
 
 
 class Subscription:
-    """The messages of a topic, in the order in which they came."""
+    """The messages of a topic, in the order of arrival."""
 
     def __init__(self, participant: Any, reader: Any, depth: int) -> None:
         self._reader, self._depth = reader, depth
@@ -99,10 +99,10 @@ class Subscription:
         self._waiting.attach(self._any)
 
     def take(self, timeout_s: float) -> Iterator[Received]:
-        """What has come, waiting for it so long at most."""
+        """The messages that have arrived, after waiting for one at most this long."""
         self._waiting.wait(duration(seconds=timeout_s))
         for message in self._reader.take(self._depth, self._any):
-            if message.sample_info.valid_data:  # else it says that a publisher has gone
+            if message.sample_info.valid_data:  # else a notice that a publisher has gone
                 yield Received(message.raw, message.sample_info.source_timestamp)
 
 
@@ -121,7 +121,7 @@ def open_node(domain: int) -> DdsNode:
     """A participant in the domain.
 
     Raises:
-        InputError: the library cannot join it, as with an interface in CYCLONEDDS_URI that is not there.
+        InputError: the library cannot join it, as with a missing interface in CYCLONEDDS_URI.
     """
     try:
         return DdsNode(domain)

@@ -1,4 +1,4 @@
-"""A robot is followed: each of its clouds becomes a scan, a pose, and a message to the robot."""
+"""Following a robot: each of its clouds becomes a scan, a pose, and a message to the robot."""
 
 import logging
 import time
@@ -30,7 +30,7 @@ Register = Callable[[Scan, float], ScanEstimate]
 
 ODOMETRY_TOPIC, TF_TOPIC, TF_STATIC_TOPIC = "/lidarslam/odometry", "/tf", "/tf_static"
 _POLL_S, _SHOWN_EVERY_S = 0.2, 1.0
-# Reports without a message after which the silence is reported.
+# Number of reports without a message after which the silence is reported.
 _SILENT = 5
 _SILENCE = "no scan came for some seconds; waiting on, Ctrl-C ends the run and writes its results"
 _NOTHING = (
@@ -49,7 +49,7 @@ class Follower:
         node: where topics are subscribed to and published.
         register: registers the scans.
         decoder: makes scans of messages.
-        imu: receives the samples beside them, with the stream that they go to.
+        imu: receives the samples of the IMU, with the stream that they go to.
     """
 
     def __init__(
@@ -69,15 +69,15 @@ class Follower:
             self._static = node.subscribe(PublishedTopic(TF_STATIC_TOPIC, TRANSFORMS_TYPE, True), is_kept=True)
         self._edges: Edges = {}
         self._poses: PosePublisher | None = None
-        self._received = self._silent = 0  # messages until the last report, and reports without any more
+        self._received = self._silent = 0  # messages until the last report, and reports since without any
 
     def follow(self, incoming: IncomingQueue, show: Callable[[str], None]) -> tuple[LiveCounts, bool]:
-        """Register what comes, until the request or Ctrl-C ends it; what waits then is registered too.
+        """Register arriving clouds, until the request or Ctrl-C ends it; queued ones are still registered then.
 
         Registration has a thread of its own, so that Ctrl-C falls between two scans.
 
         Returns:
-            What became of the scans, and whether it was Ctrl-C.
+            The counts of the scans, and whether Ctrl-C ended it.
         """
         is_interrupted = False
         with incoming, ThreadPoolExecutor(1, thread_name_prefix="register") as worker:
@@ -92,7 +92,7 @@ class Follower:
         return self._statistics.counts(incoming.dropped), is_interrupted
 
     def _report(self, counts: LiveCounts, show: Callable[[str], None]) -> None:
-        """Show the counts; that nothing comes, or nothing more, is logged, once each time."""
+        """Show the counts; the absence of messages, or of further ones, is logged, once each time."""
         show(counts.line())
         self._silent = self._silent + 1 if counts.received == self._received else 0
         self._received = counts.received

@@ -41,7 +41,7 @@ class LiveOutcome:
 
     run: RunOutcome  # as of a recording
     topic: str
-    counts: LiveCounts  # what became of the scans
+    counts: LiveCounts  # of the scans: received, lost, delayed
     is_interrupted: bool  # whether Ctrl-C ended it
 
 
@@ -50,12 +50,12 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
 
     Args:
         request: what is followed, and until when; Ctrl-C ends it at any time, with all results.
-        show: called with a few words on what goes on, every second while scans come.
+        show: called with a short text on the progress, every second while scans arrive.
         page: shows the run in browsers, with `rerun="web"`.
 
     Raises:
-        LidarSlamError: the extra `live` is not installed, no scan came, or topic, configuration or output directory are
-            not usable.
+        LidarSlamError: the extra `live` is not installed, no scan arrived, or topic, configuration or output directory
+            are not usable.
     """
     node = _open_node(request.domain)
     request = replace(request, config=bounded(request.config))
@@ -97,7 +97,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
 
 
 def _warm_up(config: Config) -> None:
-    """Register made-up scans: the first calls load compiled loops, for seconds on a busy machine."""
+    """Register made-up scans: the first calls load compiled loops, which takes seconds on a busy machine."""
     with (
         closing(open_odometry(config, None)) as odometry,
         closing(Pipeline(odometry, make_localiser(config), config.global_map)) as pipeline,
@@ -107,10 +107,10 @@ def _warm_up(config: Config) -> None:
 
 
 def bounded(config: Config) -> Config:
-    """The configuration in which scans wait for nothing.
+    """The configuration without waiting for results.
 
     A scan's mapping has a budget, which follows the rate of the sensor unless one is given. The local map is not
-    corrected: tracking would wait for the pose graph to draw it.
+    corrected: tracking would wait for the pose graph to rebuild it.
     """
     mapping = config.mapping.model_copy(update={"budget_ms": config.mapping.budget_ms or "auto"})
     graph = config.pose_graph.model_copy(update={"corrects_local_map": False})
@@ -157,7 +157,7 @@ def _open_node(domain: int) -> "DdsNode":
 
 
 def _require_scans(topic: str, log: ScanLog, faults: Faults) -> None:
-    """Check that there is something to write; InputError: no scan came that could be used."""
+    """Check that there are scans to write; InputError: no usable scan arrived."""
     if not log.points_read:
         why = "; ".join(faults.warnings()) or ("its scans had no valid point" if len(log) else "none came")
         raise InputError(f"{topic}: no scan could be used: {why}")

@@ -59,7 +59,7 @@ Publish = Callable[[bytes], None]
 
 
 class PosePublisher:
-    """Publishes the pose of a body that carries the LiDAR, relative to where the body stood at the first scan.
+    """Publishes the pose of a body that carries the LiDAR, relative to the pose of the body at the first scan.
 
     The pose of a lost scan is a prediction, and is not published.
 

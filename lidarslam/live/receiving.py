@@ -19,13 +19,13 @@ logger = logging.getLogger(__name__)
 
 # Discovery of a running system is done within a second or two; after the second span the topics seen are printed.
 _SETTLED_S, _PATIENCE_S, _POLL_S = 2.0, 5.0, 0.1
-# How long to wait for a message before looking whether anything is wanted still.
+# How long to wait for a message before checking for the end of the run.
 _RECEIVE_S = 0.2
-# Samples of an IMU that may wait in a reader: a second of a fast one.
+# Samples of an IMU that may be queued in a reader: a second of a fast one.
 IMU_DEPTH = 1000
-# A scan waits so long at most for the samples of its sweep, seconds.
+# Longest wait of a scan for the samples of its sweep, seconds.
 _SWEEP_PATIENCE_S, _STEP_S = 0.05, 0.002
-# A stamp so far ahead, seconds, is taken when so many in a row are.
+# A stamp this far ahead, seconds, is accepted when this many in a row are.
 _FAR_S, _STRAYS = 5.0, 10
 
 
@@ -47,10 +47,10 @@ P = TypeVar("P", bound=Published)
 def find_topic(
     published: Callable[[], Iterable[P]], wanted: str | None, domain: int, within_s: float | None = None
 ) -> P:
-    """Wait for the publisher of a topic of clouds, so long at most; without a name, for the only one.
+    """Wait for the publisher of a topic of clouds, for a limited time; without a name, for the only one.
 
     Raises:
-        InputError: there are several and none is named, the named one holds no clouds, or none came in time.
+        InputError: there are several and none is named, the named one holds no clouds, or none appeared in time.
     """
     begin = time.monotonic()
     is_told = False
@@ -96,7 +96,7 @@ def _what_is_seen(wanted: str | None, clouds: Iterable[Published], topics: int, 
 
 @dataclass(frozen=True)
 class Received:
-    """A message as the middleware gives it."""
+    """A message as the middleware delivers it."""
 
     raw: bytes  # CDR, with its four bytes of encapsulation
     published_ns: int  # when it was published, by the publisher's clock
@@ -106,21 +106,22 @@ class Received:
 class Arrived(Received):
     """A message with its time of arrival."""
 
-    arrived_s: float  # when it came, by this machine's clock
+    arrived_s: float  # when it arrived, by this machine's clock
 
 
 class IncomingQueue:
-    """Receives from its beginning to its end; where messages come faster than they are taken, some are dropped.
+    """Receives from its beginning to its end; where messages arrive faster than they are taken, some are dropped.
 
-    Dropped is what leaves the shortest gap: tracking bears half the rate better than a second without scans.
+    The message that leaves the shortest gap is dropped: tracking tolerates half the rate better than a second without
+    scans.
 
     Attributes:
         dropped: number of messages that were dropped.
-        is_ended: whether nothing more is received; messages may wait still.
+        is_ended: whether nothing more is received; messages may still be queued.
 
     Args:
         receive: the next messages, waiting for so many seconds at most.
-        longest: number of messages that may wait.
+        longest: number of messages that may be queued.
         on_arrival: called on the thread that receives, with each message.
     """
 
@@ -150,13 +151,13 @@ class IncomingQueue:
         self._thread.join()
 
     def end(self) -> None:
-        """Receive nothing more; what waits can still be taken."""
+        """Receive nothing more; queued messages can still be taken."""
         with self._changed:
             self.is_ended = True
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> Arrived | None:
-        """The oldest message that waits; None when none came in time.
+        """The oldest message in the queue; None when none arrived in time.
 
         An error of receiving is raised after the messages before it.
         """
@@ -196,7 +197,7 @@ class IncomingQueue:
 
 
 def find_imu(published: Callable[[], Iterable[P]], wanted: str | None) -> P:
-    """Wait a moment for the publisher of an IMU; without a name, for the only one.
+    """Wait briefly for the publisher of an IMU; without a name, for the only one.
 
     Raises:
         InputError: there is none, or there are several and none is named.
@@ -266,6 +267,6 @@ class ImuReceiver:
             self.frame_id = self.frame_id or frame_id
 
     def _is_stray(self, stamp: float) -> bool:
-        """Whether a stamp is an outlier, far ahead of the last one; several in a row are a new time."""
+        """Whether a stamp is an outlier, far ahead of the last one; several in a row mean that the clock was set."""
         self._strays = self._strays + 1 if stamp > self._stream.last_s + _FAR_S else 0
         return np.isfinite(self._stream.last_s) and 0 < self._strays < _STRAYS

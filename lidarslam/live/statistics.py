@@ -12,7 +12,7 @@ from lidarslam.core.text import count
 # A stamp farther from this machine's clock is the reading of another one.
 _SAME_CLOCK_S = 60.0
 _RATE_OVER_S = 5.0
-# An interval that is longer than so many usual ones has room for scans that are missing.
+# An interval longer than this many usual ones contains missing scans.
 _GAP_INTERVALS = 1.5
 
 
@@ -37,19 +37,19 @@ class Latency:
 
 @dataclass(frozen=True)
 class LiveCounts:
-    """What became of the scans that were published."""
+    """Counts of the published scans: received, missing, dropped; their rate and latency."""
 
-    received: int  # messages that came
-    missing: int  # that did not come, by the gaps between the stamps of those that did
-    dropped: int  # that came and waited too long for registration
+    received: int  # messages that arrived
+    missing: int  # that did not arrive, by the gaps between the stamps of those that did
+    dropped: int  # that arrived and waited too long for registration
     registered: int
-    rate_hz: float  # of the messages that came in the last seconds
+    rate_hz: float  # of the messages of the last seconds
     # from_arrival, from_stamp: until the pose was published; from_stamp is None where the stamps are of another clock
     from_arrival: Latency | None
     from_stamp: Latency | None
 
     def line(self) -> str:
-        """A line for the time of the run."""
+        """A line during the run."""
         latency = "" if self.from_arrival is None else f", latency: {self.from_arrival}"
         lost = f"{self.missing} missing, {self.dropped} dropped"
         return f"{count(self.registered, 'scan')}, {self.rate_hz:.1f} Hz{latency}, {lost}"
@@ -94,13 +94,13 @@ class LiveStatistics:
         self._registered = 0
 
     def arrived(self, stamp_s: float, arrived_s: float) -> None:
-        """A message came."""
+        """Count a message that has arrived."""
         with self._lock:
             self._stamps.append(stamp_s)
             self._arrivals.append(arrived_s)
 
     def registered(self, stamp_s: float, arrived_s: float) -> None:
-        """The pose of a scan is out."""
+        """Count a scan whose pose is published."""
         now = time.time()
         with self._lock:
             self._registered += 1
@@ -109,7 +109,7 @@ class LiveStatistics:
                 self._from_stamp.append(now - stamp_s)
 
     def counts(self, dropped: int) -> LiveCounts:
-        """Up to now; the queue dropped so many."""
+        """The counts up to now; the queue dropped `dropped` messages."""
         with self._lock:
             arrivals = np.array(self._arrivals)
             return LiveCounts(
@@ -124,9 +124,9 @@ class LiveStatistics:
 
 
 def count_missing(stamps: FloatArray) -> int:
-    """How many scans have room in the gaps between stamps (N,), seconds, by their median interval.
+    """The number of scans missing in the gaps between stamps (N,), seconds, by their median interval.
 
-    No more than have room in the whole time: a stamp that is late by an interval is followed by a shorter one.
+    No more than fit into the whole time: a stamp that is late by an interval is followed by a shorter one.
     """
     steps = np.diff(np.unique(stamps))
     if not len(steps):

@@ -48,7 +48,7 @@ if TYPE_CHECKING:  # GTSAM takes a while to load
 def merge(request: MergeRequest, show: Show) -> MergeOutcome:
     """Run every recording, find the later ones in the earlier ones, and write the map of all.
 
-    A recording that turns out damaged on the way ends there; an interruption ends everything with what there is. A
+    A damaged recording ends at the damage; an interruption ends the merge with the results so far. A
     recording that no loop joins to the others has a run of its own and is left out of the common map. A merge that was
     killed or interrupted can be resumed.
 
@@ -92,14 +92,14 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
             if about is not None:
                 Unfinished(part.request.out, about).end(interrupted)
             if not part.scans:
-                with suppress(OSError):  # something else lies there
+                with suppress(OSError):  # other files are there
                     part.request.out.rmdir()
         unfinished.end(interrupted)
     return outcome
 
 
 def _replace_earlier(directory: RunDirectory, part: Path) -> None:
-    """Before the results of a recording are replaced: those of the earlier merge are not whole either."""
+    """Before the results of a recording are replaced: mark those of the earlier merge as incomplete too."""
     directory.before_change()
     about = About.read(part)
     if about is not None:
@@ -125,7 +125,7 @@ def _usable(recording: Recording) -> Iterator[Scan]:
 
 
 def _track_all(request: MergeRequest, parts: Sequence[Part], graph: "SlamGraph", show: Show) -> None:
-    """Track the recordings, until all are done or an interruption; the graph takes each as soon as it may."""
+    """Track the recordings, until all are done or an interruption; the graph takes each as early as possible."""
     numbered = [f"{number}/{len(parts)} {part.recording.name}" for number, part in enumerate(parts, start=1)]
     merge = {"merge": "part", "sources": request.describe()["sources"]}
     tasks = [

@@ -34,7 +34,7 @@ from lidarslam.storage.finished_run import read_summary
 from lidarslam.storage.state_file import read_state, write_state
 from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished, remove_unfinished
 
-# The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.
+# The names that `open_parts` gives to directories; other directories in a summary must not be removed.
 _PART = re.compile(r"\d{2,}_[\w.-]+")
 
 
@@ -45,8 +45,8 @@ class MergeRequest:
     # two recordings or more, each once; the first of those that are connected gives the frame
     sources: tuple[Path, ...]
     out: Path  # the directory of the merged map
-    config: Config  # loops are closed whatever it says
-    map_formats: tuple[MapFormat, ...] = ()  # what the maps are written as beside .ply
+    config: Config  # loops are closed regardless of it
+    map_formats: tuple[MapFormat, ...] = ()  # formats of the maps besides .ply
     overwrite: bool = False  # whether an earlier merge, or a run, in `out` is replaced
     resume: bool = False  # whether the merge in `out`, which was killed or stopped, is continued
     where: Where = SERIAL  # where recordings are tracked
@@ -104,8 +104,8 @@ def earlier_parts(out: Path) -> set[str]:
 
 
 def remove_part(path: Path) -> None:
-    """Remove the run of a recording that is no longer merged, however far it came."""
-    if path.is_symlink():  # what it leads to is not of this merge
+    """Remove the run of a recording that is no longer merged, finished or not."""
+    if path.is_symlink():  # its target is not of this merge
         return
     if (path / files.ABOUT).exists():
         remove_unfinished(path)
@@ -129,7 +129,7 @@ def read_graph(saved: Saved, config: Config, submaps: Path) -> KeyframeGraph:
     return graph
 
 
-# A process whose node was lost may be at work for some seconds more.
+# A process whose node was lost may run for some more seconds.
 _PATIENCE_S = 60.0
 
 Show = Callable[[str], AbstractContextManager[Progress]]
@@ -153,7 +153,7 @@ class PartDone:
 
     scans: int  # that were tracked
     missing: str = ""  # why there is none
-    interrupted: bool = False  # whether there would be more
+    interrupted: bool = False  # whether there are more scans
 
 
 @contextlib.contextmanager
@@ -215,7 +215,7 @@ def _track(
         graph.end_recording()
         write_state(files.tracked, {"part": encode(TrackedScans, scans), "graph": graph.state()})
     if not scans.interrupted:
-        for path in (files.state, files.tiles):  # nothing goes on from the state
+        for path in (files.state, files.tiles):  # the state is not resumed any more
             path.unlink(missing_ok=True)
     return PartDone(len(scans.log), interrupted=scans.interrupted)
 

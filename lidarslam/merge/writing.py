@@ -33,7 +33,7 @@ class MergedRecording:
     """One recording of a merge."""
 
     name: str  # of the recording
-    directory: str | None  # of its run, beside the common map; None when no scan could be used
+    directory: str | None  # of its run, next to the common map; None when no scan could be used
     source: str  # its path
     # scans, length_m, lost_scans: of its run
     scans: int
@@ -69,7 +69,7 @@ class MergeSummary:
         }
 
 
-# In the summary of a run; that of the merge says how to mend it.
+# In the summary of a run; that of the merge says how to correct it.
 _OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
 
 
@@ -103,11 +103,11 @@ class Part:
 
     @property
     def checkpoint(self) -> CheckpointFiles:
-        """Where its task left the result."""
+        """The path of its task's result."""
         return CheckpointFiles(self.request.out)
 
     def saved(self) -> Saved:
-        """That result, read anew each time: those of all recordings need not fit into memory.
+        """That result, read again each time: those of all recordings need not fit into memory.
 
         Raises:
             InputError: the file is damaged.
@@ -115,7 +115,7 @@ class Part:
         return read_state(self.checkpoint.tracked)
 
     def tracked(self) -> Tracked:
-        """The recording as it was tracked; its map is drawn anew from the graph."""
+        """The recording as it was tracked; its map is rebuilt from the graph."""
         scans = read_part(self.saved())
         truth = unless_damaged(lambda: self.recording.ground_truth, scans.log, "no metrics")
         return Tracked(scans, recording=self.recording, truth=truth)
@@ -140,7 +140,7 @@ def write_merge(
     joined = [] if finished is None else finished.joined
     runs = tuple(_write_run(part, finished, index, index in joined) for index, part in enumerate(parts))
     common = None if finished is None else finished.common()
-    # First, because it says whose files the others are.
+    # First, because it identifies the other files.
     directory.write_text(files.CONFIG, dump_yaml(request.config, request.describe()))
     written, beyond = WrittenMap(0, voxel_size_m, 0), None
     if common is not None:

@@ -1,6 +1,6 @@
 """On a machine's first run: loops are compiled side by side in other processes, and kept on disk for this one.
 
-A process compiles one function at a time; one for each part of the pipeline, on a made-up room, makes use of the other
+A process compiles one function at a time; one for each part of the pipeline, on a synthetic room, uses the other
 cores. After an installation, `python -m lidarslam.pipeline.compile_ahead` compiles all parts, so that the first run
 need not; with the names of some, these in its own process.
 """
@@ -171,7 +171,7 @@ def parts_of(config: Config) -> list[str]:
 
 
 def uncompiled(names: list[str]) -> list[str]:
-    """Those of the parts with a loop that is not on disk."""
+    """The parts with a loop that is not on disk."""
     modules = {name: [import_module(f"lidarslam.{module}") for module in PARTS[name].modules] for name in names}
     return [name for name in names if not all(is_compiled(module) for module in modules[name])]
 
@@ -179,7 +179,7 @@ def uncompiled(names: list[str]) -> list[str]:
 class CompileAhead:
     """Compiles the loops that are not on disk yet; a context that ends its processes.
 
-    What fails to compile here is compiled in this process, on its first call.
+    Loops that fail to compile here are compiled in this process, on their first call.
 
     Args:
         parts: names of the parts whose loops are compiled.
@@ -205,7 +205,7 @@ class CompileAhead:
         self._pool.shutdown()
 
     def wait_for_first_scan(self, report: Callable[[str], None]) -> None:
-        """Wait for the loops that the first scan needs; `report` is given a line on what is waited for."""
+        """Wait for the loops that the first scan needs; `report` is called with a line about them."""
         self._wait([part for part in self._parts if not PARTS[part].is_late], report)
 
     def wait_for_all(self, report: Callable[[str], None]) -> None:

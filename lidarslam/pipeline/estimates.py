@@ -1,4 +1,4 @@
-"""A scan on its way through the pipeline: with its odometry, with its pose."""
+"""A scan in the stages of the pipeline: with its odometry, then with its pose."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -26,7 +26,7 @@ class ScanOdometry:
     motion: Motion  # the estimated motion since the previous scan
     interval_s: float | None  # time between the two stamps; None when no motion was measured
     stage_ms: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far, see `STAGES`
-    sampled: SampledScan | None = None  # thinned for registration; None where that is left to the localiser
+    sampled: SampledScan | None = None  # thinned for registration; None where the localiser does it
 
     @property
     def velocity(self) -> FloatArray | None:
@@ -57,7 +57,7 @@ class SweepMotion:
         return deskew(scan.points, scan.time_offsets, known[0], known[-1])
 
     def mean(self, scan: Scan) -> FloatArray | None:
-        """One velocity (6,) for the sweep: both, weighted by how much of it lies before and after the stamp."""
+        """One velocity (6,) for the sweep: both, weighted by the shares of the sweep before and after the stamp."""
         if self.before is None or self.after is None or scan.time_offsets is None or not len(scan):
             return self.latest
         begin, end = float(scan.time_offsets.min()), float(scan.time_offsets.max())

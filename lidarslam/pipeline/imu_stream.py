@@ -1,4 +1,4 @@
-"""An IMU whose samples come one after the other, beside the scans."""
+"""An IMU whose samples arrive one by one, along with the scans."""
 
 from collections import deque
 from collections.abc import Callable
@@ -27,25 +27,25 @@ from lidarslam.mapping.tracking.mapped_scan import MappedScan
 # Samples that are kept, seconds; scans between two comparisons.
 _KEPT_S, _EVERY = 6.0, 10
 _FEWEST_SAMPLES = 3
-# Samples that come too late for this share of the sweeps are a fault.
+# Samples that are too late for this share of the sweeps are a fault.
 _LATE_SHARE, _FEWEST_SWEEPS = 0.2, 20
 
 
 class ImuStream(Stateful):
-    """An IMU's part in the prior of each scan; `InertialPrediction` of the samples that have come so far.
+    """An IMU's part in the prior of each scan; `InertialPrediction` of the samples that have arrived so far.
 
     The rotation is found by the turns of the first scans where none is given. Errors of clock and rotation are
     corrected as soon as the scans show them, and an IMU that contradicts them is no longer used.
 
     Args:
         T_lidar_imu: (4, 4) extrinsic calibration; None where it is not known.
-        warn: called with what is corrected, or wrong.
+        warn: called with each correction or fault.
     """
 
     def __init__(self, T_lidar_imu: FloatArray | None, warn: Callable[[str], None]) -> None:
         self._T_lidar_imu, self._warn = T_lidar_imu, warn
         self._lever_sigma_m = KNOWN_LEVER_M
-        self.is_placed = T_lidar_imu is not None  # whether somebody has said where it is, or that it is not known
+        self.is_placed = T_lidar_imu is not None  # whether its extrinsic calibration is given, or given as unknown
         self._rows: deque[FloatArray] = deque()
         self._last_s, self._lock = -np.inf, Lock()
         self._offset_s = 0.0
@@ -67,12 +67,12 @@ class ImuStream(Stateful):
 
     @property
     def direction(self) -> GravityDirection | None:
-        """Gravity as measured until the last scan; None where nothing was."""
+        """Gravity as measured until the last scan; None where it was not."""
         return None if self._inertial is None else self._inertial.direction
 
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the IMU, one sentence each."""
+        """Faults of the IMU, one sentence each."""
         if not self._rows:
             return ["no sample of the IMU came"]
         if self._inertial is None and not self._is_wrong:
@@ -83,7 +83,7 @@ class ImuStream(Stateful):
         return warnings
 
     def place(self, T_lidar_imu: FloatArray | None) -> None:
-        """Take the extrinsic calibration (4, 4) that became known since; None: it will not."""
+        """Take the extrinsic calibration (4, 4) that has become known; None: it remains unknown."""
         self.is_placed = True
         self._begin_anew(T_lidar_imu)
 
@@ -102,7 +102,7 @@ class ImuStream(Stateful):
                 self._rows.popleft()
 
     def take_up(self, scan: Scan) -> Scan:
-        """Use the samples that have come; the sweep as if the sensor had turned evenly. Call it before `prior`."""
+        """Use the samples that have arrived; the sweep as if the sensor had turned evenly. Call it before `prior`."""
         samples = None if self._is_wrong else self._samples()
         if samples is None:
             return scan
@@ -134,7 +134,7 @@ class ImuStream(Stateful):
         self._scans += 1
         if self._comparison is None:
             return
-        # The IMU has no part in what the correspondences measured alone.
+        # The pose by the correspondences alone is independent of the IMU.
         alone = None if self._inertial is None else mapped.measured
         pose = (alone or mapped.state).T_world_lidar
         self._comparison.add(scan.stamp, pose, mapped.registered and mapped.is_connected)
@@ -148,7 +148,7 @@ class ImuStream(Stateful):
             self._align(self._comparison, self._T_lidar_imu)
 
     def _align(self, comparison: Comparison, T_lidar_imu: FloatArray) -> None:
-        """Correct the errors of clock and rotation that are clear; an IMU that contradicts the scans is left alone."""
+        """Correct clear errors of clock and rotation; an IMU that contradicts the scans is not corrected."""
         contradiction, found = comparison.contradiction(), comparison.alignment()
         if contradiction is not None:
             self._give_up(contradiction)

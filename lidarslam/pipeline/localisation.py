@@ -29,10 +29,10 @@ class Restorable(Protocol):
     """Carries a state from scan to scan."""
 
     def state(self) -> State | None:
-        """What it carries; None where it cannot be saved, nor a run resumed."""
+        """The state it carries; None where it cannot be saved, nor a run resumed."""
 
     def restore(self, saved: Saved) -> None:
-        """Go on from a state, before the first scan."""
+        """Resume from a state, before the first scan."""
 
 
 class Localiser(Restorable, Protocol):
@@ -43,7 +43,7 @@ class Localiser(Restorable, Protocol):
         """The scan-to-map registration with a map of its own; None without one."""
 
     def sample(self, scan: Scan) -> SampledScan | None:
-        """What can be computed of the next scan ahead of its pose, on another thread; None where nothing can."""
+        """The computation on the next scan ahead of its pose, on another thread; None where there is none."""
 
     def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """The pose of a scan, given the odometry of the next; None after the last."""
@@ -62,13 +62,13 @@ class InertialPrediction(Restorable, Protocol):
 
     @property
     def direction(self) -> GravityDirection | None:
-        """Gravity as measured until the last scan; None where nothing was."""
+        """Gravity as measured until the last scan; None where it was not."""
 
     def prior(self, scan: Scan, prior: Prior) -> Prior:
         """The odometry's prior, with the state that the IMU predicts."""
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
-        """Follow the result of a scan."""
+        """Update with the result of a scan."""
 
 
 class OdometryAlone(Stateful):
@@ -150,7 +150,7 @@ class ScanToMap(Stateful):
         return self._mapper if isinstance(self._mapper, Mapper) else None
 
     def state(self) -> State:
-        """What it carries from scan to scan; OutputError where the mapper's cannot be saved."""
+        """The state it carries from scan to scan; OutputError where the mapper's cannot be saved."""
         state = super().state()
         if state["_mapper"] is None:
             raise OutputError("the mapping cannot save its state")
@@ -232,7 +232,7 @@ def make_localiser(
 ) -> Localiser:
     """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
 
-    Of surfels, the error of the sensor's elevations is estimated on the way, and the first scans may be smoothed.
+    With surfels, the error of the sensor's elevations is estimated as well, and the first scans may be smoothed.
 
     Raises:
         ConfigError: the mapping is another package's, and cannot be loaded.

@@ -21,7 +21,7 @@ class MapBuilder(Stateful):
 
     Args:
         config: of the map.
-        store: where tiles of the map lie that do not fit into memory; None: in a temporary file.
+        store: where tiles of the map are stored that do not fit into memory; None: in a temporary file.
     """
 
     # of the map; derived from the first scan with points unless it is configured, None until then
@@ -29,7 +29,7 @@ class MapBuilder(Stateful):
     global_map: GlobalMap | None  # None until a scan was added
     views: Views  # range images of some scans, for the removal of moving objects
     slides: ConsistencyCheck  # pairs of scans, for the detection of slips
-    # on its way into the map: its points within the map's range, one a voxel, as read; and its pose
+    # pending: its points within the map's range, one a voxel, as read; and its pose
     _pending: tuple[Scan, ScanEstimate] | None
     _scans: int
 
@@ -44,7 +44,7 @@ class MapBuilder(Stateful):
         self.slides = ConsistencyCheck()
 
     def restore(self, saved: Saved) -> None:
-        """Go on from a state; InputError where it is damaged, or the file of the tiles is."""
+        """Resume from a state; InputError where it is damaged, or the file of the tiles is."""
         self.global_map = self._new_map(1.0) if saved.has("global_map") else None
         super().restore(saved)
 

@@ -1,6 +1,6 @@
-"""Correction of the running local map: drawn anew after a loop closure, and replaced a fixed number of scans later.
+"""Correction of the running local map: rebuilt after a loop closure, and replaced a fixed number of scans later.
 
-The pose graph draws on a thread of its own; which scans are registered to which map does not depend on the threads.
+The pose graph rebuilds it on its own thread; which scans are registered to which map does not depend on the threads.
 """
 
 from collections import deque
@@ -15,14 +15,14 @@ from lidarslam.mapping.tracking.mapper import Mapper
 
 @dataclass(frozen=True, eq=False)
 class DrawnMap:
-    """A local map drawn by the pose graph."""
+    """A local map rebuilt by the pose graph."""
 
-    scan: int  # number of the scan before which it was drawn
+    scan: int  # number of the scan before which it was rebuilt
     surfel_map: SurfelMap
 
 
 class MapCorrection(Stateful):
-    """Hands the maps that the pose graph draws to the mapper, each a fixed number of scans later.
+    """Hands the maps that the pose graph rebuilds to the mapper, each a fixed number of scans later.
 
     Args:
         mapper: whose map is corrected.
@@ -39,12 +39,12 @@ class MapCorrection(Stateful):
         self._drawing: deque[tuple[int, Future[SurfelMap | None]]] = deque()
 
     def state(self) -> State:
-        """With the maps that wait; the graph must be at rest."""
+        """With the pending maps; the graph must be idle."""
         self._collect(self._followed)
         return super().state()
 
     def add(self, drawing: Future[SurfelMap | None]) -> None:
-        """What the graph makes of the next scan: a map without it, or None."""
+        """Take the graph's result for the next scan: a map without it, or None."""
         self._drawing.append((self._followed, drawing))
         self._followed += 1
 
@@ -58,7 +58,7 @@ class MapCorrection(Stateful):
         self._registered += 1
 
     def _collect(self, until: int) -> None:
-        """Wait for the maps that were drawn before the scans up to this one."""
+        """Wait for the maps that were rebuilt before the scans up to this one."""
         while self._drawing and self._drawing[0][0] <= until:
             scan, drawing = self._drawing.popleft()
             drawn = drawing.result()

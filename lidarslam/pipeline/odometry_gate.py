@@ -17,22 +17,22 @@ from lidarslam.core.tracking import Status
 from lidarslam.odometry.interface import Motion, SkippingOdometry
 from lidarslam.pipeline.estimates import ScanEstimate
 
-# Scans in a row that have to be ok before one goes without the odometry.
+# Scans in a row that have to be ok before one does without the odometry.
 _LEAST_OK = 10
-# Largest error of the predictions, as a share of the local map's cells, and what is left of an error after a scan.
+# Largest error of the predictions, as a share of the local map's cells, and its remaining share after a scan.
 _LARGEST_ERROR, _FADING = 0.25, 0.9
 # Range at which an error of the rotation is counted, metres.
 _RANGE_M = 10.0
 # Largest interval over which a velocity is taken as constant, seconds, and its largest ratio to the one before.
 _LONGEST_S, _LARGEST_RATIO = 0.15, 1.5
-# Results that may wait: none is waited for that could not make a difference.
+# Results that may be pending: only those are waited for that could make a difference.
 _MOST_WAITING = 8
 
 
 class OdometryGate(Stateful):
     """Asks the learned odometry where it is needed; implements `Odometry`.
 
-    Each scan is decided by the poses of all scans but the latest that were given to `follow`, however fast they come,
+    Each scan is decided by the poses of all scans but the latest that were given to `follow`, however fast they arrive,
     so that results do not depend on timing.
 
     Args:
@@ -57,7 +57,7 @@ class OdometryGate(Stateful):
         self._last_stamp = 0.0
 
     def estimate(self, scan: Scan) -> Motion:
-        """The motion since the previous scan, where it is needed; else a prediction is left to the mapping."""
+        """The motion since the previous scan, where it is needed; else the mapping predicts it."""
         interval_s = None if self._stamp is None else scan.stamp - self._stamp
         before, self._stamp, self._interval_s = self._interval_s, scan.stamp, interval_s
         is_gap = before is None or interval_s is None or interval_s > min(_LONGEST_S, _LARGEST_RATIO * before)
@@ -67,7 +67,7 @@ class OdometryGate(Stateful):
         return Motion(np.eye(4), 0, "not needed", is_asked=False)
 
     def wait(self) -> None:
-        """Wait for the results that decide about the next scan, so that `estimate` takes no longer than it works."""
+        """Wait for the results that decide about the next scan, so that `estimate` is timed without the wait."""
         while self._may_be_skipped() and self._waiting:
             self._take()
 
@@ -78,7 +78,7 @@ class OdometryGate(Stateful):
             self._take()
 
     def state(self) -> State:
-        """What it carries from scan to scan; all results have come."""
+        """The state it carries from scan to scan; all results have arrived."""
         while self._waiting:
             self._take()
         return super().state()
@@ -92,7 +92,7 @@ class OdometryGate(Stateful):
         return not self._may_be_skipped()
 
     def _may_be_skipped(self) -> bool:
-        """Whether the next scan can do without, if all results that wait are as good as can be."""
+        """Whether the next scan can do without, if all pending results are as good as possible."""
         error_m = self._error_m * _FADING ** len(self._waiting)
         return self._ok + len(self._waiting) >= _LEAST_OK and error_m < _LARGEST_ERROR * self._cell_m
 

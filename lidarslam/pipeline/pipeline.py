@@ -1,4 +1,4 @@
-"""The way of a scan: odometry, scan-to-map registration, global map, pose graph. No files, no printing, no window.
+"""The stages of a scan: odometry, scan-to-map registration, global map, pose graph. No files, no printing, no window.
 
 Four threads: odometry and thinning on the caller's, as one scan's motion is needed for the next; registration on a
 second, one scan behind, because deskewing needs the motion after the stamp as well; the global map on a third, the pose
@@ -33,7 +33,7 @@ from lidarslam.pipeline.map_correction import MapCorrection
 from lidarslam.pipeline.odometry_gate import OdometryGate
 from lidarslam.pipeline.threads import BackgroundWorker
 
-# Scans that may wait for the map, which now and then takes as long as several scans; to bound the memory they hold.
+# Scans that may wait for the map, which at times takes as long as several scans; to bound the memory they hold.
 _SCANS_BEHIND = 8
 # Calls that may wait for the graph, which takes as long for a loop closure as for all scans up to the next keyframe.
 _GRAPH_CALLS_BEHIND = 64
@@ -43,30 +43,30 @@ Take = Callable[[ScanEstimate, float], None]
 
 
 class Checkpointer(Protocol):
-    """Saves the state of a run now and then."""
+    """Saves the state of a run at intervals."""
 
     def is_due(self) -> bool:
         """Whether to save now; asked after every scan."""
 
     def save(self, pipeline: "Pipeline") -> None:
-        """Save the pipeline's state; no thread is at work, and all results up to here are out."""
+        """Save the pipeline's state; no thread is running, and all results up to here are delivered."""
 
 
 class Pipeline(Stateful):
     """Turns a stream of scans into a stream of poses, a global map and a pose graph.
 
-    Recorded scans go through `run`; scans that come one after the other through `register`, which returns the pose at
-    once. The state is without that of odometry and graph.
+    Recorded scans go through `run`; scans that arrive one by one through `register`, which returns the pose at
+    once. The state excludes that of odometry and graph.
 
     Args:
         odometry, localiser: estimate the poses.
         config: of the global map.
-        graph: built along the way; complete when the last result has come.
-        checkpointer: saves the state now and then.
+        graph: built meanwhile; complete when the last result has been delivered.
+        checkpointer: saves the state at intervals.
         store: of the global map, see `MapBuilder`.
     """
 
-    map: MapBuilder  # the global map, and what is kept beside it
+    map: MapBuilder  # the global map, and the data kept with it
     held: ScanOdometry | None  # the last scan that `run` has read: its result waits for the next one
     _localiser: Localiser
     _correction: MapCorrection | None
@@ -93,7 +93,7 @@ class Pipeline(Stateful):
         self._error: LidarSlamError | None = None  # that ended the scans
 
     def run(self, scans: Iterable[Scan]) -> Generator[ScanEstimate, None, None]:
-        """Process the scans in order; each result comes while later scans' odometry is at work.
+        """Process the scans in order; each result is delivered while the odometry of later scans runs.
 
         An error of the reader is raised after the results of the scans before it.
         """
@@ -155,7 +155,7 @@ class Pipeline(Stateful):
         self._graph_worker.wait()
 
     def finish(self) -> None:
-        """As `settle`, and look at the last pair of scans; more may follow."""
+        """As `settle`, and check the last pair of scans; more may follow."""
         self.settle()
         self.map.slides.finish()
 
@@ -175,7 +175,7 @@ class Pipeline(Stateful):
             self._error = error
 
     def _estimate(self, scan: Scan, read_ms: float) -> ScanOdometry:
-        """The odometry of the next scan, which took so long to read; thinned for registration, which is busier."""
+        """The odometry of the next scan, read in `read_ms`; thinned here, as registration is busier."""
         started = time.perf_counter()
         sampled = self._localiser.sample(scan)
         stage_ms = {"read": read_ms, "refine": _ms_since(started)}
@@ -217,7 +217,7 @@ class Pipeline(Stateful):
         return replace(estimate, stage_ms=estimate.stage_ms | {"deskew": deskew_ms, "map": _ms_since(started)})
 
     def _add_pending(self, next_is_lost: bool = False) -> None:
-        """Add the last scan to the map, unless it is in there."""
+        """Add the last scan to the map, unless it is in it already."""
         added = self.map.add_pending(next_is_lost)
         if added is not None and self._graph is not None:
             self._graph_worker.submit(self._graph.draw, *added)

@@ -1,4 +1,4 @@
-"""Threads beside the pipeline: scans are read ahead, calls carried out in order, free memory returned."""
+"""Helper threads of the pipeline: scans are read ahead, calls carried out in order, free memory returned."""
 
 import ctypes
 from collections import deque
@@ -19,7 +19,7 @@ def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
 
 
 def prefetch(items: Iterable[T], ahead: int = 3) -> Iterator[T]:
-    """The same items in the same order, up to `ahead` of them read and decoded while the caller is at work.
+    """The same items in the same order, up to `ahead` of them read and decoded while the caller works.
 
     An exception of the source is raised here, after the items that came before it. Closing the iterator ends the
     thread.

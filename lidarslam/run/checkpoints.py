@@ -1,4 +1,4 @@
-"""Checkpoints of a run: when its state is saved, what it consists of, whether and how a run goes on from it."""
+"""Checkpoints of a run: when its state is saved, its content, whether and how a run resumes from it."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ WITHOUT_EFFECT = {"viewer": True, "checkpoints": True}
 
 
 def describe_computed(request: RunRequest, recording: Recording) -> dict[str, Any]:
-    """Everything that decides what a run computes; weights and prior by a digest of their content.
+    """Everything that determines the results of a run; weights and prior by a digest of their content.
 
     Raises:
         InputError: a file cannot be read.
@@ -69,14 +69,14 @@ def lost_when_finished(request: RunRequest) -> bool | None:
     except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
     if request.config.reader.elevation_correction_deg == "auto":
-        was["reader"]["elevation_correction_deg"] = "auto"  # config.yaml has what was found
+        was["reader"]["elevation_correction_deg"] = "auto"  # config.yaml has the estimated value
     if was_run != describe_run(request) or was != request.config.model_dump(exclude=WITHOUT_EFFECT):
         raise InputError(f"{out}: holds another finished run; name another directory, or replace it with --overwrite")
     return lost
 
 
 def abandoned(out: Path) -> str:
-    """What is left of a run that an interruption ended without results, and what to do."""
+    """The remains of a run that an interruption ended without results, and what to do."""
     if (out / files.STATE).is_file():
         return f"{out}: interrupted, no results were written; continue from the last checkpoint with --resume"
     if (out / files.ABOUT).is_file():
@@ -139,14 +139,14 @@ def _digest(path: Path) -> str:
 
 # Saving takes at most this share of the time.
 _SHARE = 0.02
-# The first is saved soon, so that a run that is interrupted early can go on, too.
+# The first is saved soon, so that a run that is interrupted early can be resumed, too.
 _FIRST_S = 1.0
-# How the sentence in the summary begins.
+# The beginning of the sentence in the summary.
 _RESUMED = "the run was resumed "
 
 
 class Checkpoints:
-    """Saves the state of a run now and then; see `lidarslam.pipeline.pipeline.Checkpointer`.
+    """Saves the state of a run at intervals; see `lidarslam.pipeline.pipeline.Checkpointer`.
 
     Args:
         unfinished: where.
@@ -172,7 +172,7 @@ class Checkpoints:
         self._cost_s: float | None = None  # of the last one
 
     def is_due(self) -> bool:
-        """Whether it is time."""
+        """Whether a checkpoint is due."""
         self._scans += 1
         if self._config.every_scans is not None:
             return self._scans >= self._config.every_scans
@@ -182,7 +182,7 @@ class Checkpoints:
         return self._asked - self._done >= wait_s
 
     def save(self, pipeline: Pipeline) -> None:
-        """Save the state of the pipeline, which is at rest, log and graph; a failure is a warning."""
+        """Save the state of the idle pipeline, log and graph; a failure is a warning."""
         try:
             state = {
                 "pipeline": pipeline.state(),
@@ -196,11 +196,11 @@ class Checkpoints:
             logger.info("%s", error)
             self._log.warn(f"a checkpoint could not be saved, so that --resume would go back further: {error}")
         self._scans, self._done = 0, time.monotonic()
-        # Waiting for the threads to come to rest is part of the cost.
+        # Waiting for the threads to become idle is part of the cost.
         self._cost_s = self._done - self._asked
 
     def begin(self, pipeline: Pipeline, scans: Iterator[Scan], is_recorded: bool) -> Iterator[Scan]:
-        """Restore log, pipeline and odometry, and mark the run as being at work; the scans that are left.
+        """Restore log, pipeline and odometry, and mark the run as running; the remaining scans.
 
         Args:
             pipeline: new.

@@ -1,4 +1,4 @@
-"""The error of a sensor's elevations: what a run finds of it, and its correction beforehand."""
+"""The error of a sensor's elevations: its estimate by a run, and its correction beforehand."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,7 +18,7 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.run.request import RunRequest
 
-# An error is certain beyond so many standard deviations.
+# An error is certain beyond this many standard deviations.
 _CERTAIN_SIGMAS = 4.0
 # The elevations of a sensor whose recorded z axis is farther from up or down than this are about another axis.
 _UPRIGHT = 0.999
@@ -28,7 +28,7 @@ _MOST_SCANS, _ENOUGH_STRETCHES = 300, 3
 
 @dataclass(frozen=True)
 class Elevation:
-    """By how many degrees the points of a recording have to be raised, and were."""
+    """The degrees by which the points of a recording have to be raised, and were."""
 
     elevation_bias_deg: float
     elevation_sigma_deg: float  # standard deviation of the bias
@@ -36,7 +36,7 @@ class Elevation:
 
     @classmethod
     def found(cls, recording: Recording, estimator: ElevationEstimator) -> "Elevation | None":
-        """What an estimator has found in a recording's scans."""
+        """The result of an estimator on a recording's scans."""
         raised_deg, upwards = elevation_of(recording)
         bias = estimator.bias() if abs(upwards) > _UPRIGHT else None
         if bias is None:
@@ -52,7 +52,7 @@ class Elevation:
 
     @property
     def warning(self) -> str | None:
-        """What to do, where the correction is wrong."""
+        """The remedy, where the correction is wrong."""
         if not self.is_certain:
             return None
         return (
@@ -73,8 +73,8 @@ def with_elevations(
 ) -> tuple[RunRequest, Recording]:
     """The request and its recording, with a number for `reader.elevation_correction_deg: auto`.
 
-    It is what the first scans show, registered to each other without an odometry, where it is certain; else the
-    number of degrees by which they are raised already. A run that is resumed finds the same.
+    It is estimated from the first scans, registered to each other without an odometry, where it is certain; else it is
+    the angle by which they are raised already. A resumed run finds the same.
     """
     if request.config.reader.elevation_correction_deg != "auto":
         return request, recording

@@ -29,9 +29,9 @@ logger = logging.getLogger(__name__)
 
 _INSTEAD = "choose --odometry learned, which needs none"
 _ROTATION = "--set odometry.imu_rotation_deg=[R,P,Y]"
-# Scans that a rotation is looked for in at most, and after how many.
+# Largest number of scans to find a rotation in, and the interval of the attempts.
 _MOST_SCANS, _EVERY = 600, 10
-# Scans that clock and rotation are compared in at most.
+# Largest number of scans for the comparison of clock and rotation.
 _COMPARED_SCANS = 60
 
 
@@ -92,11 +92,11 @@ def open_inertial(
 def make_imu_stream(
     config: Config, warn: Callable[[str], None], T_lidar_imu: FloatArray | None = None
 ) -> "ImuStream | None":
-    """The IMU's part in a run whose samples come one after the other; None where the odometry uses no IMU.
+    """The IMU's part in a run whose samples arrive one by one; None where the odometry uses no IMU.
 
     Args:
         config: the configuration; its extrinsic calibration is used before others.
-        warn: called with what is corrected, or wrong.
+        warn: called with each correction or fault.
         T_lidar_imu: (4, 4) extrinsic calibration of another source, in upright axes.
     """
     if not config.odometry.uses_imu:
@@ -117,7 +117,7 @@ class _Poses:
         self._poses: list[tuple[float, FloatArray, bool]] = []
 
     def compared(self, samples: ImuSamples, T_lidar_imu: FloatArray, most: int) -> "Iterator[Comparison]":
-        """The comparison with an IMU after every ten scans, until there are no more, or so many."""
+        """The comparison with an IMU after every ten of at most `most` scans, and after the last."""
         from lidarslam.mapping.inertial.comparison import Comparison
 
         comparison = Comparison(samples, T_lidar_imu)

@@ -14,11 +14,11 @@ from typing import Any
 logger = logging.getLogger(__name__)
 
 _REQUESTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# Requests while results are written: so many, each at least so long after the one before, abandon them. A key that is
+# Requests while results are written: this many, each at least this long after the last, abandon them. A key that is
 # held down or hit repeatedly is one request.
 _INSISTENT = 3
 _APART_S = 0.5
-# A request that comes in a finaliser is taken up after so long.
+# A request that arrives in a finaliser is handled after this time.
 _AFTER_FINALISER_S = 0.05
 
 
@@ -45,7 +45,7 @@ def _is_postponed(number: int, frame: FrameType | None) -> bool:
 
 @contextlib.contextmanager
 def handling(handle: Callable[[int, FrameType | None], Any], replaced: Container[Any] | None = None) -> Iterator[None]:
-    """Handle requests to end for the time of the block, in place of these handlers, or of any.
+    """Handle requests to end during the block, in place of these handlers, or of any.
 
     A signal that is ignored, as with `nohup`, stays ignored.
     """
@@ -68,7 +68,7 @@ def handling(handle: Callable[[int, FrameType | None], Any], replaced: Container
 
 
 def ended_like_interrupted() -> contextlib.AbstractContextManager[None]:
-    """For the time of the block, all requests raise KeyboardInterrupt."""
+    """During the block, all requests raise KeyboardInterrupt."""
     return handling(interrupt, (signal.SIG_DFL, signal.default_int_handler))  # of a program that does not handle them
 
 
@@ -107,7 +107,7 @@ class Interruptions:
         if self._insisted >= _INSISTENT:
             signal.default_int_handler(number, frame)
         left = _INSISTENT - self._insisted
-        with contextlib.suppress(RuntimeError):  # the signal came while a line was written
+        with contextlib.suppress(RuntimeError):  # the signal arrived while a line was written
             logger.warning(
                 "the results so far are being written; %s more Ctrl-C, half a second apart, abandon%s them",
                 left,

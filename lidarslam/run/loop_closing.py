@@ -1,4 +1,4 @@
-"""The pose graph of a run: begun with it, and in the end trajectory and map corrected by it."""
+"""The pose graph of a run: created with it, and at its end trajectory and map corrected by it."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ class LoopReport:
 
     closure: LoopClosure  # between keyframes
     accepted: bool  # whether it is in the graph: an outlier of the optimisation is not
-    scans: tuple[int, int]  # which of their recordings, the second the later one
+    scans: tuple[int, int]  # indices in their recordings, the second the later one
     recordings: tuple[int, int] | None = None  # which, from 1; None where there is one only
 
     def to_json(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class GraphOutcome:
     """A run, or several connected ones, corrected by the graph."""
 
     T_world_lidar: FloatArray  # (M, 4, 4) corrected poses of all scans
-    global_map: GlobalMap  # drawn anew
+    global_map: GlobalMap  # rebuilt
     # keyframe_poses, edges: (K, 4, 4) and the relative poses between them, for pose_graph.g2o
     keyframe_poses: FloatArray
     edges: tuple[RelativePose, ...]
@@ -74,12 +74,12 @@ def begin_graph(
     takes_gnss: bool = False,
     given: GivenLoops | None = None,
 ) -> "SlamGraph | None":
-    """A pose graph, when the configuration asks for one; its submaps lie in the directory, or in the file.
+    """A pose graph, when the configuration asks for one; its submaps are stored in the directory, or in the file.
 
     Loop closures may be given or forbidden.
 
     Raises:
-        ConfigError: it asks for GNSS positions where none are taken.
+        ConfigError: it requires GNSS positions where none are used.
     """
     if config.pose_graph.gnss and not takes_gnss:
         raise ConfigError("pose_graph.gnss is available in lidarslam run only; leave it out here")
@@ -98,9 +98,9 @@ def close_loops(
     viewer: Viewer,
     track: "ProjectedTrack | None" = None,
 ) -> GraphOutcome | None:
-    """Correct the log, and show it, once all scans are there; None where there is nothing to correct.
+    """Correct the log, and show it, once all scans are processed; None where there is nothing to correct.
 
-    A GNSS track, if it is given, holds the graph.
+    A GNSS track, if it is given, constrains the graph.
     """
     if graph is None or global_map is None:
         return None
@@ -156,7 +156,7 @@ def _corrected(
 
 @dataclass(frozen=True, eq=False)
 class FinishedGraph:
-    """An optimised graph of one recording or more; maps are drawn when they are asked for."""
+    """An optimised graph of one recording or more; maps are built on request."""
 
     _graph: "SlamGraph"
     _result: "Corrected"
@@ -169,7 +169,7 @@ class FinishedGraph:
     def of_recordings(
         cls, graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float, most_points: int | None = None
     ) -> "FinishedGraph | None":
-        """Optimise recordings of so many scans each; None where no scan was registered."""
+        """Optimise recordings of these numbers of scans; None where no scan was registered."""
         result = graph.finish()
         return None if result is None else cls(graph, result, tuple(scans), voxel_size_m, most_points)
 
@@ -221,7 +221,7 @@ class FinishedGraph:
         return self._result.T_world_lidar[begin : begin + self._scans[recording]]
 
     def _correction_m(self, recording: int) -> float:
-        """How far a recording's scans moved, its first keyframe held where it is."""
+        """How far a recording's scans moved, its first keyframe held fixed."""
         keys = np.flatnonzero(self._result.keyframe_recordings == recording)
         after = self._scan_poses(recording)
         if not len(keys) or not len(after):

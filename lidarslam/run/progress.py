@@ -12,7 +12,7 @@ from rich.text import Text
 from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
 
-if TYPE_CHECKING:  # what a bar does not need takes a while to load
+if TYPE_CHECKING:  # slow to load, and not needed by a bar
     from lidarslam.pipeline.estimates import ScanEstimate
 
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
@@ -27,7 +27,7 @@ class _RateColumn(ProgressColumn):
 
 
 class _CountColumn(MofNCompleteColumn):
-    """Scans that are done, of how many; nothing before that is known."""
+    """Scans done of the total; nothing before the total is known."""
 
     def render(self, task: Task) -> Text:
         return Text() if task.total is None else super().render(task)
@@ -53,7 +53,7 @@ def _bar(*more: ProgressColumn) -> Progress:
 
 
 class RunProgress:
-    """A bar with scans a second and the state of tracking; before the first scan, what goes on."""
+    """A bar with scans a second and the state of tracking; before the first scan, the current step."""
 
     def __init__(self, bar: Progress, name: str) -> None:
         self._bar = bar
@@ -61,14 +61,14 @@ class RunProgress:
         self._lost = 0
 
     def __call__(self, number: int, total: int, result: "ScanEstimate") -> None:
-        """Show that a scan is done, its number from 1, and how many there are."""
+        """Show that a scan is done, its number from 1, and the total."""
         self._lost += result.status is Status.LOST
         lost = f" [red]{self._lost} lost[/]" if self._lost else ""
         state = f"[{_COLOURS[result.status]}]{result.status.value}[/]{lost}"
         self._bar.update(self._task, completed=number, total=total, state=state)
 
     def phase(self, words: str) -> None:
-        """Show what goes on."""
+        """Show the current step."""
         self._bar.update(self._task, state=words)
 
 

@@ -30,7 +30,7 @@ class RunRequest:
     step: int = 1
     prior: Path | None = None  # TUM file of an external odometry, for `odometry.method: external`
     rerun: RerunMode = "off"  # no Rerun recording, one in the run directory, or that and a browser or a window
-    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
+    map_formats: tuple[MapFormat, ...] = ()  # formats of the map besides .ply
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
     resumable: bool = True  # whether checkpoints are saved
@@ -54,13 +54,13 @@ class LiveRequest:
     base_frame: str | None = None  # the frame that moves, connected to the LiDAR's by /tf_static; None: the LiDAR's own
     publish_tf: bool = True  # whether the pose is published on /tf as well
     rerun: RerunMode = "off"
-    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
+    map_formats: tuple[MapFormat, ...] = ()  # formats of the map besides .ply
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
 def log_choices(request: RunRequest, scans: range, recorded: int) -> None:
-    """Log what a run is about to do."""
+    """Log the source and settings of a run that begins."""
     config = request.config
     logger.info("%s of %s, to %s", count(len(scans), "scan"), f"{recorded:,}", request.out)
     logger.info(

@@ -43,7 +43,7 @@ class TrackedScans:
 
     log: ScanLog
     asked: int  # number of scans that were asked for
-    faults: Faults  # what was left out of them, and what is wrong with them
+    faults: Faults  # scans that were left out, and faults of the others
     views: Views  # range images of some scans, for the removal of moving objects
     slides: list[PairTest]  # pairs of scans, for the detection of slips
     stopped: str | None = None  # why they ended before the last one
@@ -58,7 +58,7 @@ class TrackedScans:
         asked: int | None = None,
         error: InputError | KeyboardInterrupt | None = None,
     ) -> "TrackedScans":
-        """All that came, unless another number was asked for; `error` ended them early."""
+        """All scans that were processed, unless another number was asked for; `error` ended them early."""
         stopped = None if error is None else str(error) or "interrupted"
         asked = len(log) + faults.left_out if asked is None else asked
         return cls(log, asked, faults, built.views, built.slides.tests, stopped, isinstance(error, KeyboardInterrupt))
@@ -66,18 +66,18 @@ class TrackedScans:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What results are written of."""
+    """The data that results are written from."""
 
     scans: TrackedScans
     global_map: GlobalMap | None = None  # of the poses before loop closure; None when no scan was added
-    # recording, truth: of the scans, and its ground truth; scans may come from elsewhere
+    # recording, truth: of the scans, and its ground truth; scans may be from elsewhere
     recording: Recording | None = None
     truth: Trajectory | None = None
-    elevation: Elevation | None = None  # the error of the sensor's elevations; None where nothing shows it
+    elevation: Elevation | None = None  # the error of the sensor's elevations; None where it is unknown
 
 
 def unless_damaged(read: Callable[[], T], log: ScanLog, consequence: str) -> T | None:
-    """Something that came with the recording; None and a warning where it is damaged."""
+    """Data that came with the recording; None and a warning where it is damaged."""
     try:
         return read()
     except InputError as error:
@@ -178,7 +178,7 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFor
     for name in (files.MAP_PLY, *(files.MAPS[one] for one in formats)):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
-    # Of an overview it would tell of the thinning.
+    # For an overview it would measure the thinning.
     entropy = sampled_map_entropy(cloud.points) if drawn.tiled is None else None
     fields = tuple(name for name, _ in cloud.attributes.present())
     mean = None if entropy is None else entropy.mean
@@ -209,7 +209,7 @@ def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> Trajectory
 
 
 class TileWriter:
-    """Writes the tiles of a map, and then the index, without which they are nothing."""
+    """Writes the tiles of a map, and then the index, without which they are useless."""
 
     def __init__(self, directory: RunDirectory) -> None:
         self._directory = directory
@@ -220,7 +220,7 @@ class TileWriter:
         """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
 
         Raises:
-            OutputError: a file is in the way of the folder.
+            OutputError: there is a file in place of the folder.
         """
         if self.failure is None and not self._entries:
             self._begin()
@@ -266,6 +266,6 @@ class TileWriter:
             self.failure = cannot_write(folder, error)
 
     def _remove(self) -> None:
-        """Leave the room of the tiles to the other results."""
+        """Free the space of the tiles for the other results."""
         for entry in self._entries.values():
             (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)

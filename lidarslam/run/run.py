@@ -34,7 +34,7 @@ def execute(
     Args:
         request: what is run.
         progress: called after every scan.
-        phase: called with a few words on what goes on before the first scan and after the last.
+        phase: called with a short text on the progress before the first scan and after the last.
         page: shows the run in browsers, with `rerun="web"`.
 
     Raises:

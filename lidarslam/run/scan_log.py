@@ -67,7 +67,7 @@ class ScanLog(Stateful):
         return len(self._rows) // _ROW.itemsize
 
     def add(self, result: ScanEstimate, total_ms: float = 0.0) -> None:
-        """Log one scan; `total_ms` is the wall time since the scan before was done."""
+        """Log one scan; `total_ms` is the wall time since the previous scan was done."""
         row = (
             result.stamp,
             _STATUSES.index(result.status),
@@ -86,10 +86,10 @@ class ScanLog(Stateful):
         )
         self._degenerate.append(" ".join(result.degenerate))
         self.messages.append(result.message)
-        self._rows += np.array(row, dtype=_ROW).tobytes()  # last, as Ctrl-C may come between: `len` counts rows
+        self._rows += np.array(row, dtype=_ROW).tobytes()  # last, as Ctrl-C may interrupt: `len` counts rows
 
     def warn(self, message: str) -> None:
-        """Keep a sentence for the summary, once."""
+        """Keep a sentence for the summary, without repetition."""
         if message not in self.warnings:
             self.warnings.append(message)
 
@@ -165,7 +165,7 @@ class ScanLog(Stateful):
         return Trajectory(self.stamps, self._table()["T_odom_lidar"])
 
     def format_csv(self) -> str:
-        """The content of scans.csv: a row a scan, empty where there is no number."""
+        """The content of scans.csv: a row per scan, empty where there is no number."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(COLUMNS)
@@ -185,7 +185,7 @@ class ScanLog(Stateful):
         return super().state() | {"rows": self._table()}
 
     def restore(self, saved: Saved) -> None:
-        """Go on from a state, before the first scan."""
+        """Resume from a state, before the first scan."""
         super().restore(saved)
         rows = saved.value("rows")
         if getattr(rows, "dtype", None) != _ROW or not rows.shape == (len(self.messages),) == (len(self._degenerate),):

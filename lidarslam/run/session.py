@@ -44,11 +44,11 @@ UTM_FOLDER = "utm"
 
 @dataclass(eq=False)
 class RunSession:
-    """A run at work; opened with `open_session`, or by itself for scans that are only tracked.
+    """A run in progress; opened with `open_session`, or by itself for scans that are only tracked.
 
     Attributes:
-        request, directory, odometry: what is run, with what, to where.
-        phase: called with a few words on what goes on.
+        request, directory, odometry: the request, its output directory and its odometry.
+        phase: called with a short text on the progress.
         unfinished: where checkpoints are saved; None: nowhere.
         graph: the pose graph; None without one.
         log, viewer: of the scans.
@@ -78,7 +78,7 @@ class RunSession:
         self.unfinished = self._open.enter_context(Unfinished.claim(self.directory, description, resume))
 
     def begin_graph(self, given: "GivenLoops | None" = None, takes_gnss: bool = False) -> None:
-        """Begin the pose graph, where there is one, or go on with that of the checkpoint.
+        """Begin the pose graph, where there is one, or resume that of the checkpoint.
 
         Raises:
             InputError: the checkpoint is damaged.
@@ -112,7 +112,7 @@ class RunSession:
         self._shown.close()
 
     def take(self, estimate: ScanEstimate, total_ms: float, built: MapBuilder) -> None:
-        """Log and show a scan, and now and then the map."""
+        """Log and show a scan, and at intervals the map."""
         self.log.add(estimate, total_ms)
         index = len(self.log) - 1
         self.viewer.show_scan(index, estimate)
@@ -137,7 +137,7 @@ class RunSession:
         Args:
             tracked: the scans.
             described: what was run, for config.yaml.
-            gnss: holds the pose graph.
+            gnss: constrains the pose graph.
 
         Raises:
             OutputError: a file cannot be written.
@@ -178,7 +178,7 @@ def open_session(
 
     Args:
         request: what is run.
-        phase: called with a few words on what goes on.
+        phase: called with a short text on the progress.
         recording: its source, which an external odometry has to overlap with.
         is_placed: whether the results are written in UTM as well.
 
@@ -218,7 +218,7 @@ def draw_report(out: Path, outcome: RunOutcome, phase: Callable[[str], None] = l
 def write_in_utm(run: Path) -> None:
     """Write map and trajectory of a finished run in UTM, in a folder of its own; see `lidarslam.exports.geo`.
 
-    Positions that do not determine the heading are a warning: the run is there.
+    Positions that do not determine the heading are a warning only: the run is written already.
 
     Raises:
         OutputError: a file cannot be written.
@@ -239,7 +239,7 @@ def require_apart(out: Path, source: Path) -> None:
 
 
 def require_no_trajectory(config: Config) -> None:
-    """Refuse an odometry that takes more of a recording than what comes one after the other.
+    """Refuse an odometry that needs more of a recording than its scans one by one.
 
     Raises:
         ConfigError: it needs a trajectory.

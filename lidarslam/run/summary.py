@@ -23,8 +23,7 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import SCANS_CSV
 from lidarslam.storage.finished_run import is_unconstrained
 
-# Turns that are slower, rad/s, and fewer scans decide nothing; of scans farther apart, a shaken sensor turns otherwise
-# in between.
+# Slower turns, rad/s, and fewer scans decide nothing; between scans farther apart, a shaken sensor turns differently.
 _LEAST_RATE, _FEWEST, _MOST_INTERVAL_S = np.deg2rad(5.0), 15, 0.15
 # A share of the intervals by which they may differ.
 _EVEN = 0.5
@@ -61,7 +60,7 @@ def time_scale(
 
 
 def time_scale_warning(found: tuple[float, int] | None) -> str | None:
-    """What a ratio says of the points' times; None where it is near one, or unknown."""
+    """The error of the points' times by a ratio; None where it is near one, or unknown."""
     if found is None or _RIGHT[0] < found[0] < _RIGHT[1]:
         return None
     ratio, scans = found
@@ -147,7 +146,7 @@ class LostStretch:
 class GraphSummary:
     """The pose graph of a run."""
 
-    # keyframes, edges: how many
+    # keyframes, edges: their numbers
     keyframes: int
     edges: int
     loops: tuple[LoopReport, ...]  # accepted loop closures, and rejected candidates
@@ -193,7 +192,7 @@ class RunSummary:
     peak_rss_mb: float
     lost: tuple[LostStretch, ...]
     degraded_scans: int
-    # way along axes of the sensor that the scans did not, or hardly, constrain: it is a prediction
+    # distance travelled along axes of the sensor that the scans did not, or hardly, constrain: it is a prediction
     unconstrained_m: float
     odometry_asked: int  # number of scans
     graph: GraphSummary | None
@@ -210,12 +209,12 @@ class RunSummary:
 
     @property
     def went_astray(self) -> bool:
-        """Whether a scan is lost, the map contradicts itself, or much of the way is a prediction."""
+        """Whether a scan is lost, the map contradicts itself, or much of the path is a prediction."""
         return bool(self.lost_scans or self.contradictions or self.is_unconstrained)
 
     @property
     def is_unconstrained(self) -> bool:
-        """Whether the length is uncertain for want of structure along the way."""
+        """Whether the length is uncertain for lack of structure along the path."""
         return is_unconstrained(self.unconstrained_m, self.length_m)
 
     @property
@@ -310,7 +309,7 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 
 
 def _unconstrained_m(log: ScanLog) -> float:
-    """The way along axes of translation that are named as degenerate directions of the scans that reached them."""
+    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends."""
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)

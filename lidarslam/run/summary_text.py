@@ -10,7 +10,7 @@ from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap
 from lidarslam.storage.directory import MAP_PLY, MAP_TILES, REPORT, SCANS_CSV, SUMMARY
 
-# A speed that differs less is that of the recording.
+# A speed that differs by less is that of the recording.
 _ALIKE = 1.05
 # Stretches of lost scans that are listed; summary.json has them all.
 _LISTED = 3

@@ -73,7 +73,7 @@ def track(
 
     Raises:
         NoScanError: no scan could be used.
-        InputError: the recording is not the one that the run was begun with.
+        InputError: the recording is not the one that the run began with.
     """
     config, faults, log, odometry = request.config, Faults(), session.log, session.odometry
     scans = take_in(recording, chosen, faults)
@@ -135,7 +135,7 @@ def _process(
     truth: Trajectory | None,
     progress: Callable[[int, ScanEstimate], None],
 ) -> InputError | KeyboardInterrupt | None:
-    """Take every scan through the pipeline; what ended it early, None when nothing did."""
+    """Take every scan through the pipeline; the error that ended it early, or None."""
     log, finished = session.log, time.perf_counter()
     try:
         with closing(pipeline.run(prefetch(scans))) as estimates:
