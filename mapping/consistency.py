@@ -389,7 +389,7 @@ def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArra
 
 
 def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) -> tuple[Contradiction, ...]:
-    """The stretches where scans clearly fit better shifted along the direction of travel than at poses (N, 4, 4)."""
+    """The stretches where scans clearly fit better at a shift along their path than at their final poses (N, 4, 4)."""
     known = [test.at(T_world_lidar) for test in tests if max(test.first, test.second) < len(T_world_lidar)]
     bad = [one for one in known if one.votes >= LEAST_VOTES and one.votes_at_pose < LARGEST_SHARE * one.votes]
     stretches: list[list[Contradiction]] = []

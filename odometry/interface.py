@@ -45,13 +45,13 @@ class Odometry(Protocol):
         """The motion since the previous scan given to this method; a scan that cannot be used gives a prediction."""
 
     def state(self) -> State | None:
-        """What is needed to go on; None where the method cannot save it, and has to be given the scans again."""
+        """The state needed to resume; None where the method cannot save it, and has to be given the scans again."""
 
     def restore(self, saved: Saved) -> None:
-        """Go on from a state, before the first scan."""
+        """Resume from a state, before the first scan."""
 
     def close(self) -> None:
-        """Let go of whatever the method holds."""
+        """Release the method's resources."""
 
 
 @runtime_checkable

@@ -18,7 +18,7 @@ MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "time
 no result but the message; `not run`: the comparison was interrupted before, or something is missing that it needs."""
 
 TimesCover = Literal["reading, registration and map", "registration"]
-"""What the times of a scan contain."""
+"""The stages that the times of a scan include."""
 
 WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 """Statuses of a run that came to the recording's end; of any other, the figures are of a part."""
@@ -81,7 +81,7 @@ class MethodResult:
     ms_per_scan_p95: float | None = None
     ms_per_scan_p99: float | None = None
     times_cover: TimesCover = "reading, registration and map"  # all of the above
-    # median wall time of each stage; stages run beside one another
+    # median wall time of each stage; stages run in parallel
     stage_ms: Mapping[str, float] = field(default_factory=dict)
     peak_rss_mb: float | None = None  # of its process and its children
     wall_s: float | None = None  # of the whole process, from start to end
@@ -145,7 +145,7 @@ class MissingRecording:
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A row of somebody's published table, quoted beside ours."""
+    """A row of a published table, quoted next to ours."""
 
     method: str  # as published
     values: Mapping[str, float | str]  # column -> value, for instance {"09 translation_percent": 6.05}
@@ -154,14 +154,14 @@ class PublishedRow:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Everything a report is made of."""
+    """The content of a report."""
 
     title: str  # of the report
     command: str  # that reproduces it
     sequences: Sequence[SequenceComparison]  # one or more recordings
     versions: Mapping[str, str] = field(default_factory=dict)  # program -> version; "commit" when it is known
     machine: Mapping[str, str] = field(default_factory=dict)  # name -> text, such as processor, cores, memory, system
-    published: Sequence[PublishedRow] = ()  # rows quoted beside ours that are in none of the `tables`
+    published: Sequence[PublishedRow] = ()  # rows quoted next to ours that are in none of the `tables`
     tables: Sequence[Table] = ()  # over several recordings, published rows included; a report shows them first
     missing: Sequence[MissingRecording] = ()  # recordings that were asked for and are not there
     notes: Sequence[str] = ()  # remarks on the whole, such as that it was interrupted

@@ -22,7 +22,7 @@ class Quantity:
     lower_is_better: bool | None = True  # None for a quantity that is not ranked
     # path of the value that the number is given in percent of; None: it is given as it is
     percent_of: str | None = None
-    is_time: bool = False  # of a scan, with what `MethodResult.times_cover` says
+    is_time: bool = False  # of a scan, as far as `MethodResult.times_cover` says
 
     def of(self, result: MethodResult) -> float | None:
         """The number; None where there is none."""
@@ -34,7 +34,7 @@ class Quantity:
         return 100.0 * value / whole if whole else None
 
     def is_comparable(self, result: MethodResult) -> bool:
-        """Whether the number is of the whole recording, and a time of all that is done for a scan."""
+        """Whether the number is of the whole recording, and a time of all stages of a scan."""
         return result.status in WHOLE and not (self.is_time and result.times_cover == "registration")
 
     def cell(self, result: MethodResult) -> TableCell:

@@ -33,7 +33,7 @@ class TableCell:
     value: Value  # None where it is not available; text as published, such as "NA"
     # number of recordings that a mean is taken over; of a published figure, as many as the column names
     averaged: int = 1
-    note: str = ""  # beside the value, such as "over 7 of 9"
+    note: str = ""  # next to the value, such as "over 7 of 9"
     ranked: bool = True  # whether the value is comparable with the others of its column
 
 
@@ -42,7 +42,7 @@ class TableRow:
     """A method's row."""
 
     method: str  # ours as the user named it, others' as published
-    cells: Sequence[TableCell]  # one a column
+    cells: Sequence[TableCell]  # one per column
     source: str = ""  # where it was published; empty for ours
 
 
@@ -102,7 +102,7 @@ def printable(text: str) -> str:
 
 
 def number_text(value: Value, digits: int) -> str:
-    """The number with so many decimals; a dash for None and non-finite values, text as it is."""
+    """The number with this many decimals; a dash for None and non-finite values, text as it is."""
     if isinstance(value, str):
         return value
     if value is None or not math.isfinite(value):

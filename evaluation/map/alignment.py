@@ -52,7 +52,7 @@ class MapAlignment:
     fitness: float  # share of inliers, the map's points with a point of the reference within `inlier_m`, 0 to 1
     inlier_rmse_m: float | None  # root mean square distance of the inliers; None without any
     inlier_m: float  # largest distance of an inlier
-    # moved_m, moved_deg: translation of the map's median and rotation by ICP; so much misplacement does not show in the
+    # moved_m, moved_deg: translation of the map's median and rotation by ICP, a misplacement that does not show in the
     # map's errors
     moved_m: float = 0.0
     moved_deg: float = 0.0
@@ -107,7 +107,7 @@ def _search(clouds: "_Clouds") -> MapAlignment:
     """The best pose of a global registration, with the fitness of the next best."""
     judged = [clouds.judge(T, GLOBAL, True, _SEARCH_POINTS) for T in candidate_poses(clouds.mapped, clouds.reference)]
     likeliest = max(judged, key=lambda found: found.fitness).T_reference_map
-    # Buildings look alike when they are turned by right angles about the vertical through their middle.
+    # Buildings look similar when they are turned by right angles about the vertical through their middle.
     middle = make_transform(np.eye(3), 0.5 * (clouds.mapped.min(axis=0) + clouds.mapped.max(axis=0)))
     for quarters in (1, 2, 3):
         turn = middle @ exp([0.0, 0.0, quarters * np.pi / 2.0, 0.0, 0.0, 0.0]) @ inverse(middle)

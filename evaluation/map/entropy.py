@@ -82,7 +82,7 @@ def map_entropy(
 
 
 def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:
-    """`map_entropy` of whole blocks of a map, in a second or two however large it is.
+    """`map_entropy` of whole blocks of a map, in a second or two whatever its size.
 
     Blocks of 10 m on the ground are drawn by a hash of their position: of two maps of one place the same ones.
     """

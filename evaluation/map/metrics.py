@@ -1,6 +1,6 @@
 """Errors of a map relative to a reference map: accuracy, completeness, F-score, coverage, deviation.
 
-Both clouds are first thinned to one point a cell, so that density has no weight. Distances are from point to nearest
+Both clouds are first thinned to one point per cell, so that density has no weight. Distances are from point to nearest
 point; for a flawless map they are therefore about half of the spacing, not 0.
 """
 

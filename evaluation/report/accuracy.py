@@ -36,8 +36,8 @@ _ALIGNED = {
     "none": "without alignment",
 }
 _COMPONENTS = ("x, forward [m]", "y, left [m]", "z, up [m]", "roll [°]", "pitch [°]", "yaw [°]")
-# Largest errors that differ by this factor cannot be read on one linear axis. A method whose errors are so much larger
-# than the others' leaves the picture, which ends at this multiple of the largest that stays.
+# Largest errors that differ by this factor cannot be read on one linear axis. A method whose errors exceed
+# the others' by it leaves the picture, which ends at this multiple of the largest that stays.
 _LOG_RATIO = 10.0
 _BEYOND = 1.5
 _MAP_CELLS = 60_000
@@ -212,7 +212,7 @@ def measured_methods(sequence: SequenceComparison) -> list[tuple[MethodResult, T
 
 
 def aligned_how(measured: Measured) -> str:
-    """How the estimates were brought to the reference's world."""
+    """How the estimates were aligned with the reference's world."""
     return " or ".join(dict.fromkeys(_ALIGNED[metrics.alignment] for _, metrics in measured))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 
 WIDEST = 3.0
-"""A path that reaches farther than so many times the usual leaves the picture."""
+"""A path that reaches farther than this multiple of the usual leaves the picture."""
 # A sensor that hardly moves has no size to compare with.
 _LEAST_REACH_M = 1.0
 
@@ -29,7 +29,7 @@ def paths_in_bulk(paths: Sequence[FloatArray], reference: FloatArray | None = No
 
 
 def beyond_m(points: FloatArray, low: FloatArray, high: FloatArray) -> float:
-    """How far points (N, D) lie outside a box at most, 0 where none does."""
+    """Largest distance of points (N, D) outside a box, 0 where none is outside."""
     return float(np.maximum(np.maximum(low - points, points - high), 0.0).max(initial=0.0))
 
 

@@ -22,7 +22,7 @@ _QUANTITIES = (
 _BANDS = {Status.DEGRADED: "#e69f00", Status.LOST: "#d4003c"}
 _MOST_BANDS = 200
 _HEIGHT = 210
-# The shortest interval is still seen.
+# The shortest interval stays visible.
 _LEAST_SHARE = 0.003
 
 

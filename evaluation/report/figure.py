@@ -89,7 +89,7 @@ class Figure:
     panels: Sequence[Panel]  # of the same methods
     methods: Sequence[str] = ()  # entries of the legend
     reference: str = ""  # name of the reference in the legend; empty where it is not drawn
-    columns: int = 2  # number of panels beside one another on a wide page
+    columns: int = 2  # number of panels side by side on a wide page
 
 
 Styles = Mapping[str, Style]

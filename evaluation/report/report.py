@@ -168,7 +168,7 @@ def _file(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RunPage:
-    """Everything the page of a run is made of."""
+    """The content of the page of a run."""
 
     title: str
     about: Sequence[str]  # lines below the title

@@ -14,11 +14,11 @@ AlignmentMethod = Literal["se3", "first_pose", "none"]
 # street without a bend, is under 4 %; the motorway of 01 has 5 %.
 _LEAST_SPREAD_M = 0.01
 _LEAST_RELATIVE_SPREAD = 0.04
-# Weight of the orientations beside the positions' main direction: it affects only the unobservable rotation.
+# Weight of the orientations relative to the positions' main direction: it affects only the unobservable rotation.
 _TIE_BREAK = 1e-8
 # Where the positions leave a rotation as uncertain as this, orientations determine it too.
 _MOST_UNCERTAIN_RAD = np.deg2rad(5.0)
-# Smaller errors are those of rounding, and say nothing of the weights.
+# Smaller errors are those of rounding, and do not determine the weights.
 _LEAST_DISTANCE_M, _LEAST_ANGLE_RAD = 1e-3, 2e-4
 
 
@@ -69,7 +69,7 @@ def align_poses(
 ) -> FloatArray:
     """`T_reference_estimate` (4, 4) for the orientations: that of the positions, unless they leave a rotation open.
 
-    Positions determine the rotation about an axis as well as their errors are small beside their distances from the
+    Positions determine the rotation about an axis as well as their errors are small against their distances from the
     axis: on a straight stretch, or with a weak reference, hardly. Where they leave one open by more than 5 degrees, the
     alignment is the maximum-likelihood one of both: with isotropic errors, d the positions' RMS distance after their
     own alignment and a the RMS angle after that of the orientations, the rotation minimises

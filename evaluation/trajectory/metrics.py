@@ -126,7 +126,7 @@ def _computed(
     """The numbers of another package's metric, None where they are not finite; None where it fails."""
     try:
         values = {str(key): float(value) for key, value in metric(estimate, reference).items()}
-    except Exception as error:  # another package's code, which costs no other figure
+    except Exception as error:  # another package's code: other figures are kept
         logger.warning("the metric %s could not be computed: %s: %s", name, type(error).__name__, one_line(str(error)))
         return None
     return {key: value if math.isfinite(value) else None for key, value in values.items()}

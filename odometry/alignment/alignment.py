@@ -5,7 +5,7 @@ directions that the images do not constrain it is kept: it enters as a measureme
 
 Sweeps take time, and a gait or the beginning of a turn bends them. Acceleration is taken as constant from the middle of
 one sweep to the middle of the other, and the change of velocity is estimated with the motion: twelve unknowns, of which
-the change is expected to go on as between the motions before.
+the change is expected to continue as between the motions before.
 """
 
 from collections.abc import Sequence
@@ -32,18 +32,18 @@ _RESIDUAL_M, _INDEPENDENT = 0.03, 0.05
 INFORMATION_PER_M2 = _INDEPENDENT / _RESIDUAL_M**2
 # Standard deviations of the change of velocity within a pair of sweeps about the expected one, rad/s and m/s.
 INNOVATION_RAD_S, INNOVATION_M_S = 0.3, 0.5
-# Part of the largest information that counts as none.
+# Share of the largest information that counts as none.
 _NEGLIGIBLE = 0.02
-# Part of a prior's information that stands for none, along directions that it leaves open.
+# Share of a prior's information that stands for none, along directions that it leaves open.
 _NEGLIGIBLE_PRIOR = 1e-9
-# Part of a scan that another must have in view for what is not in view to be left out.
+# Share of a scan that another must have in view for points out of view to be left out.
 _MOSTLY_IN_VIEW = 0.5
 # Initial estimates that differ by less than this converge to the same motion.
 _ALIKE_RAD, _ALIKE_M = 0.05, 0.5
-# An alignment that explains less is doubtful, and steps along its weakest direction are tried, to either side.
+# An alignment that explains less is unreliable, and steps along its weakest direction are tried, to either side.
 DOUBTFUL = 0.45
 STEPS_M: tuple[float, ...] = (0.8, 1.6, 2.4, 3.2)
-# By how much more another alignment must explain, for each standard deviation that it is less likely.
+# Least gain in `explained` of another alignment, and for each standard deviation that it is less likely.
 _CLEARLY_BETTER = 0.05
 # Mean squared Jacobian of the points along a direction, from 0 to about 1. Where the end of a tunnel is in view it is
 # 0.002 and more, in an even one 0.0006 and less.
@@ -51,34 +51,34 @@ _LEAST_SHARE = 0.001
 # Standard deviation of a normal at one metre, radians, by a centimetre of range noise over a patch; it falls with the
 # range. Along a direction with no more than this share of it, the constraint is that noise.
 _TILT_AT_1_M, _NOISE_FACTOR = 0.09, 1.25
-# Among leaves and wires most points have no normal, and a network that sees these as well knows more than alignment:
-# unless so many have one, nothing is taken for degenerate.
+# Among leaves and wires most points have no normal, and a network, which uses these as well, is better constrained than
+# alignment: unless this many have one, no direction is taken for degenerate.
 _MOST = 0.7
 
 
 class Effort(NamedTuple):
-    """How many Gauss-Newton steps at most, and every how-manieth column's points."""
+    """Largest number of Gauss-Newton steps, and stride of the columns whose points are used."""
 
     iterations: int = 8
     column_step: int = 3
 
 
 NORMAL = Effort()
-# Several initial estimates are aligned roughly first; the best is aligned anew.
+# Several initial estimates are aligned roughly first; the best is aligned again.
 _ROUGH = Effort(iterations=6, column_step=6)
 
 
 @dataclass(frozen=True, eq=False)
 class InitialEstimate:
-    """Where alignment begins."""
+    """Initial estimate of an alignment."""
 
     T_prev_curr: FloatArray  # (4, 4) between the middles of the sweeps
-    # (6, 6) inverse covariance, for a change from the left; None: it is only where to start from. It counts along the
+    # (6, 6) inverse covariance, for a change from the left; None: it is only a start. It counts along the
     # directions of which the images have less.
     information: FloatArray | None = None
-    # (6, 6) that holds the change of velocity at the expected one; None: no more than usual
+    # (6, 6) that holds the change of velocity at the expected one; None: the usual one
     change_information: FloatArray | None = None
-    sigmas: float = 0.0  # how much less likely it is than the first initial estimate, in standard deviations
+    sigmas: float = 0.0  # by which it is less likely than the first initial estimate, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
     information, expected = np.zeros((6, 6)) if prior is None else prior, _innovation_information()
     if start.change_information is not None:
         expected = expected + start.change_information
-    # Arrays of another layout would be compiled for anew.
+    # Arrays of another layout would be compiled for again.
     information, expected = np.ascontiguousarray(information), np.ascontiguousarray(expected)
     for done in np.linspace(0.0, 1.0, iterations).tolist():
         scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
@@ -136,7 +136,7 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
 
 
 def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> PairMotion:
-    """The motion, whose change of velocity goes on as before but for the innovation."""
+    """The motion, whose change of velocity continues as before but for the innovation."""
     early, late, last, share = np.empty(6), np.empty(6), innovation, 0.0
     if sweeps.last is not None:
         last, share = sweeps.last.velocity, sweeps.interval_s / (sweeps.interval_s + sweeps.last.interval_s)
@@ -200,7 +200,7 @@ def _marginal(H: FloatArray, per_m2: float) -> FloatArray:
 def _explained(in_view: FloatArray, inlier: FloatArray) -> tuple[float, FloatArray]:
     """The least ratio, over directions (3,), of the information of inliers to that of all in view.
 
-    The smallest generalised eigenvalue of the two sums (3, 3) of squared normals. To both a little is added, so that
+    The smallest generalised eigenvalue of the two sums (3, 3) of squared normals. A little is added to both, so that
     directions that hardly any point constrains do not count as missed.
     """
     little = _NEGLIGIBLE * max(float(in_view.diagonal().max()), 1.0) * np.eye(3)
@@ -213,7 +213,7 @@ def align_best(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Eff
     """The alignment that explains most, from initial estimates, the most likely first.
 
     Estimates that differ are aligned roughly, and the best of them well; the less likely one is, the more it must
-    explain. If that is doubtful, so are steps along the weakest direction.
+    explain. If that is unreliable, steps along the weakest direction are aligned, too.
     """
     best = align(_choose(starts, sweeps), sweeps, effort)
     if best.explained >= DOUBTFUL or not STEPS_M:
@@ -244,7 +244,7 @@ def _sigmas_away(alignment: Alignment, starts: Sequence[InitialEstimate]) -> flo
 
 
 def _choose(starts: Sequence[InitialEstimate], sweeps: SweepPair) -> InitialEstimate:
-    """The first, unless another is not like it and explains more than its likelihood asks for."""
+    """The first, unless another differs from it and explains more than its likelihood requires."""
     first = inverse(starts[0].T_prev_curr)
     away = np.array([log(start.T_prev_curr @ first) for start in starts])
     if (np.linalg.norm(away.reshape(-1, 2, 3), axis=2) < (_ALIKE_RAD, _ALIKE_M)).all():
@@ -255,7 +255,7 @@ def _choose(starts: Sequence[InitialEstimate], sweeps: SweepPair) -> InitialEsti
 
 
 def _along_weakest(alignment: Alignment) -> list[FloatArray]:
-    """The motion (4, 4), moved to and fro along its weakest direction."""
+    """The motion (4, 4), moved to either side along its weakest direction."""
     moved = np.repeat(alignment.T_prev_curr[None], 2 * len(STEPS_M), axis=0)
     moved[:, :3, 3] += np.outer(np.outer(STEPS_M, [1.0, -1.0]), alignment.weakest)
     return list(moved)

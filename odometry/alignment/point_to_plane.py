@@ -44,8 +44,8 @@ _ZERO, _HALF, _ONE, _TWO, _TINY = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 1
 _TURN = np.float32(2.0 * math.pi)
 # Twice as many rows add hardly any information if half as many points are taken of each.
 _FULL_ROWS = 32
-# How far along its row a pixel without a normal looks for one. A point is held against a plane, which goes on beyond
-# its pixel; the gate sees to it that it does not go too far.
+# Reach along its row within which a pixel without a normal takes one. A point is compared with a plane, which extends
+# beyond its pixel; the gate limits the distance.
 _FILL_COLUMNS = 4
 # Scale of the residuals of inliers.
 FINE_M = 0.05
@@ -249,14 +249,14 @@ def _sum_up(
 
 @compiled_part
 def _weigh(size: int, scale_m: np.float32, is_robust: bool, work: Floats) -> None:
-    """Write Jacobians and residuals times the roots of their weights, zero of outliers; and normals of what is seen."""
+    """Write Jacobians and residuals times the roots of their weights, zero for outliers; and normals of points seen."""
     each = _ONE / scale_m if is_robust else _ZERO
     for k in range(size):
         x, y, z, u, v, w = work[X + k], work[Y + k], work[Z + k], work[U + k], work[V + k], work[W + k]
         residual, keep = work[_RESIDUAL + k], work[_INLIER + k] > _ZERO
         share = residual * each
         root = _ONE / (_ONE + share * share)
-        # Not times zero: what is no number would stay none.
+        # Not times zero: NaN would stay NaN.
         work[_ROW + k] = root * (y * w - z * v) if keep else _ZERO
         work[_ROW + _STRIDE + k] = root * (z * u - x * w) if keep else _ZERO
         work[_ROW + 2 * _STRIDE + k] = root * (x * v - y * u) if keep else _ZERO
@@ -321,7 +321,7 @@ class PointToPlane:
 
     Args:
         sweeps: the pair.
-        column_step: every so-manieth column's points are used.
+        column_step: stride of the columns whose points are used.
     """
 
     def __init__(self, sweeps: SweepPair, column_step: int) -> None:
@@ -364,7 +364,7 @@ def _planes(images: SweepImages) -> Planes:
 def _sample(points: Floats, normals: Floats, offsets: Floats, step: int, fewer: int, chosen: Floats) -> int:
     """Write (7, N) point, normal and seconds of one of `step * fewer` pixels of each row, if it has a normal; N.
 
-    So many rows in turn begin a step later.
+    Row i begins at column `i % fewer * step`.
     """
     height, width = offsets.shape
     count = 0
@@ -383,7 +383,7 @@ def _sample(points: Floats, normals: Floats, offsets: Floats, step: int, fewer: 
 def _fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels: Floats) -> None:
     """Write the pixels (H * W, 7) of images (3, H, W), (3, H, W), (H, W).
 
-    Those without a normal get the nearest one in their row, up to so many columns away.
+    Those without a normal get the nearest one in their row, up to `columns` columns away.
     """
     height, width = offsets.shape
     there = np.empty(width, dtype=np.bool_)

@@ -25,7 +25,7 @@ class SweepMotion:
             raise ValueError(f"a motion takes {self.interval_s:g} s")
 
     def pose_after(self, seconds: float) -> FloatArray:
-        """(4, 4) in the frame of the earlier middle, so long after it."""
+        """(4, 4) in the frame of the earlier middle, `seconds` after it."""
         return exp(self.velocity * seconds + self.velocity_change * (seconds * (seconds / self.interval_s - 1.0)))
 
 
@@ -54,7 +54,7 @@ class StampInterpolator(Stateful):
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: the next motion does not follow on the last."""
+        """Restart: the next motion does not follow on the last."""
         self.last, self._T_middle_stamp = None, np.eye(4)
 
     def between_stamps(

@@ -23,9 +23,9 @@ MOST_CELLS = 18
 SHIFTS = 2 * MOST_CELLS + 1
 """Shifts along x and along y, in cells, that are scored."""
 
-# Points farther away are left out: shifted by as much as is looked for they would come round the border.
+# Points farther away are left out: the largest shifts would wrap them around the border.
 _REACH_M = 20.0
-# Range at which a point counts once for the density; what is twice as far away returns a quarter as many.
+# Range at which a point counts once for the density; a surface twice as far away returns a quarter as many.
 _DENSITY_M = 10.0
 
 
@@ -44,7 +44,7 @@ def bird_eye(points: Floats, normals: Floats, heading: float) -> Floats:
 
 @compiled
 def _accumulate(points: Floats, normals: Floats, c: float, s: float, grid: Floats) -> None:
-    """Write the grid (CELLS, CELLS, CHANNELS), zero before: sums first, then what the network is given."""
+    """Write the grid (CELLS, CELLS, CHANNELS), zero before: sums first, then the network's input."""
     for i in range(points.shape[1]):
         px, py, z = points[0, i], points[1, i], points[2, i]
         squared = px * px + py * py

@@ -60,7 +60,7 @@ FINE_PATCHES = (
 def surface_normals(image: Floats, patches: Sequence[Patch] = PATCHES) -> Floats:
     """Unit normals (3, H, W) float32 that face the sensor, zero where no patch is a plane.
 
-    Patches go on across the seam of azimuth; above and below the image they are empty.
+    Patches wrap around the seam of azimuth; above and below the image they are empty.
 
     Args:
         image: (4, H, W) float32 of x, y, z and range in metres in the sensor's frame, zero where empty; wider than the
@@ -140,7 +140,7 @@ def _scatter(padded: Floats, i: int, begin: int, size: int, patch: Patch, work: 
         for k in range(size):
             work[channel * _STRIDE + k] = row[begin + k]
     for down in range(i - patch.rows, i + patch.rows + 1):
-        # One by one: what is indexed by a slice in the middle is taken as not contiguous, and is not done at once.
+        # One by one: a slice in the middle of an index is taken as not contiguous, and would not be vectorised.
         x, y, z, ranges = padded[0, down], padded[1, down], padded[2, down], padded[3, down]
         end = begin + patch.columns + 1
         for first in range(begin - patch.columns, end, _AT_ONCE):

@@ -25,7 +25,7 @@ _ZERO, _HALF, _ONE, _HALF_PI, _PI, _QUARTER = (
     np.float32(x) for x in (0.0, 0.5, 1.0, 0.5 * math.pi, math.pi, 0.25 * math.pi)
 )  # fmt: skip
 _WHOLE, _FAR = np.float32(_TURN), np.float32(np.inf)
-# What stands for the pixel of a point in none, and of one too near to a border; and the same as numbers of pixels,
+# Codes for the pixel of a point in none, and of one too near to a border; and the same as numbers of pixels,
 # which are floats until they are stored.
 _OUTSIDE, _UNSURE = -1, -2
 _ABOVE_OR_BELOW, _NOT_SURE = np.float32(_OUTSIDE), np.float32(_UNSURE)
@@ -127,7 +127,7 @@ def _keep_nearest(
 ) -> None:  # fmt: skip
     """Write the nearest point (H * W,) of each pixel: the bits of its range, which ascend with it, and its index.
 
-    Angles of single precision decide the pixel of all points but those next to its border, whose angles are taken anew.
+    Angles of single precision decide the pixel of all points but those next to its border, whose angles are recomputed.
     """
     pixels, bits = np.empty(_BLOCK, dtype=np.int32), ranges.view(np.int32)
     for begin in range(0, len(ranges), _BLOCK):

@@ -93,7 +93,7 @@ class Imager(Stateful):
     """Makes images of one sensor's scans, about the axis and on the grid of the first scan with points enough.
 
     The network's images are always of the same size. Alignment sees as many rows as the sensor has rings, from those of
-    the network to 64, because an image that shows the nearest point of several rings biases it along the way.
+    the network to 64, because an image that shows the nearest point of several rings biases it along the path.
     """
 
     _grid: ImageGrid | None
@@ -173,6 +173,6 @@ def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageG
 
 
 def _shown(points: Points, grid: ImageGrid, rows: int) -> NDArray[np.bool_]:
-    """(rows, W) which pixels have a point, in an image of so many rows."""
+    """(rows, W) which pixels have a point, in an image with this many rows."""
     fine = ImageGrid(rows, grid.columns, grid.elevation_low, grid.elevation_high)
     return project(points, [fine])[0].index >= 0

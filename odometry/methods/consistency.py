@@ -1,7 +1,7 @@
 """Consistency of consecutive scans under a motion, by point-to-plane distances; independent of every odometry.
 
 Points of the new scan are taken to the previous scan's frame and compared with planes through its points. A wrong
-motion lays walls where there are none, and the inlier ratio falls.
+motion places walls where there are none, and the inlier ratio falls.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Consistency:
 
     residual_m: float | None  # median point-to-plane distance; None with too few planes
     inlier_ratio: float | None  # of the points that have a plane, 0 to 1; None likewise
-    status: Status  # what the ratio means
+    status: Status  # by the ratio
 
 
 class ConsistencyCheck(Stateful):
@@ -112,7 +112,7 @@ def _least_ratio(inlier: NDArray[np.bool_], facing: NDArray[np.intp]) -> float:
 
 
 def _thinned(points: FloatArray) -> FloatArray:
-    """One point a cell, the cells sized by the scene."""
+    """One point per cell, the cells sized by the scene."""
     if len(points) < _MIN_PLANES:
         return points
     return points[one_per_cell(points, _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1))))]

@@ -11,7 +11,7 @@ from lidarslam.core.state import TRANSFORM, Stateful
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.interface import Motion
 
-# A gap is never shorter than this, nor than so many of the trajectory's usual steps.
+# A gap is never shorter than this, nor than this many of the trajectory's usual steps.
 _LEAST_GAP_S = 1.0
 _LEAST_GAP_STEPS = 5.0
 # A scan this close to a given pose is covered by it, whatever lies on the other side.

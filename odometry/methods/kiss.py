@@ -45,7 +45,7 @@ class _Worker:
             [sys.executable, "-m", "lidarslam.odometry.methods.kiss_worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            cwd=Path(__file__).resolve().parents[2],  # a folder called odometry where the user stands must not win
+            cwd=Path(__file__).resolve().parents[2],  # a folder called odometry in the working directory must not win
         )
         self._requests, self._replies = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
         try:
@@ -62,7 +62,7 @@ class _Worker:
     def close(self) -> int:
         """End the child; its exit status, negative for the signal that ended it."""
         for stream in (self._requests, self._replies):
-            with contextlib.suppress(OSError):  # what was not written yet finds no reader
+            with contextlib.suppress(OSError):  # unwritten data has no reader
                 stream.close()
         try:
             return self._process.wait(timeout=5.0)
@@ -109,11 +109,11 @@ class KissOdometry:
         return Motion(self._motion(last, self._last, scan.stamp), points_used)
 
     def state(self) -> State | None:
-        """None: the library does not give its state away."""
+        """None: the library does not expose its state."""
         return None
 
     def restore(self, saved: Saved) -> None:
-        """There is no state to go on from; always an InputError."""
+        """There is no state to resume from; always an InputError."""
         raise saved.refuse("KISS-ICP has no state")
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """The learned odometry: the network's candidates, the best of them refined by alignment, with a covariance.
 
 Each scan becomes an image and is encoded once. The network compares it with the one before; alignment chooses among its
-candidates and refines one. Along degenerate directions the motion goes on as before, with a growing covariance; the
+candidates and refines one. Along degenerate directions the motion continues as before, with a growing covariance; the
 candidate counts there only as long as no motion before is known. A pair of scans that fits too badly is a failure.
 """
 
@@ -38,9 +38,9 @@ _LEAST_INFORMATION = 1e-6
 # KITTI odometry's 04: 74, 96 and 98 % of its errors lie within one, two and three standard deviations.
 _LEAST_SIGMA = np.array([np.deg2rad(0.02)] * 3 + [0.002] * 3)
 _HELD_BACK = 0.004
-# Part of the change of velocity within a pair of sweeps that may not be even.
+# Part of the change of velocity within a pair of sweeps that may not be uniform.
 _UNEVEN_SHARE = 0.05
-# How much less likely than the network's best candidate it is that the motion goes on, in standard deviations.
+# By how many standard deviations a continued motion is less likely than the network's best candidate.
 _SIGMAS_OF_GOING_ON = 1.0
 # Acceleration along degenerate directions, standard deviation: rad/s^2 and m/s^2.
 _ACCELERATION = np.array([2.0] * 3 + [2.0] * 3)
@@ -50,7 +50,7 @@ _HELD = 1e8
 
 @dataclass(frozen=True, eq=False)
 class _Sweep:
-    """A scan as the network and alignment know it; `middle` is the instant of the sweep's middle, seconds."""
+    """A scan as input of the network and of alignment; `middle` is the instant of the sweep's middle, seconds."""
 
     images: ScanImages
     heading: float
@@ -104,7 +104,7 @@ class LearnedOdometry(Stateful):
         self._skipped = scan
 
     def _take_skipped(self, scan: Scan) -> None:
-        """Begin anew with a scan that was skipped."""
+        """Restart with a scan that was skipped."""
         self._forget()
         images = self._imager.images(scan)
         shown = images.network
@@ -197,8 +197,8 @@ def _initial_estimate(candidate: Candidate, best: Candidate) -> InitialEstimate:
 def _right_covariance(T_prev_curr: FloatArray, left: FloatArray, change: FloatArray) -> FloatArray:
     """(6, 6) of the error `xi` in T_true = T_prev_curr @ exp(xi), rotation first.
 
-    `left` is that of a change from the left. To it comes a part of the change of motion (6,) within a pair of sweeps,
-    which is taken as even.
+    `left` is that of a change from the left. A part of the change of motion (6,) within a pair of sweeps, which is
+    taken as uniform, is added to it.
     """
     A = adjoint(inverse(T_prev_curr))
     covariance = A @ left @ A.T + np.diag(_LEAST_SIGMA**2)

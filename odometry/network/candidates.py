@@ -17,7 +17,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.odometry.images.bird_eye import MOST_CELLS, bird_eye
 from lidarslam.odometry.images.projection import Floats
 
-# Turns and shifts that are followed, and the least probability beside the best one's.
+# Turns and shifts that are followed, and their least probability relative to the best one's.
 _TURNS, _SHIFT_PEAKS = 2, 3
 _LEAST_PROBABILITY = 0.02
 # Scores this near a peak belong to it: feature columns, cells.

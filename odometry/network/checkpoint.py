@@ -98,7 +98,7 @@ class Checkpoint:
     network: NetworkConfig  # which one
     images: ImageConfig  # size of its images
     weights: dict[str, Tensor]  # its parameters and buffers by name, finite
-    # what it was trained on and the like; values that JSON can hold
+    # such as its training data; values that JSON can hold
     about: dict[str, Any] = field(default_factory=dict)
 
 
@@ -154,7 +154,7 @@ def network_of(checkpoint: Checkpoint) -> nn.Module:
 def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads: int = 1) -> Search:
     """The search for candidates with a network in evaluation mode, which is moved to the device.
 
-    torch would use all threads and slow down what works beside it.
+    torch would use all threads and slow down the mapping that runs in parallel.
     """
     network = network.to(device)
 

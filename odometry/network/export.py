@@ -1,6 +1,6 @@
 """A trained network as ONNX: for inference without torch, and for other programs.
 
-The default network becomes one graph for each of its parts; between them only the fast Fourier transform is left to do,
+The default network becomes one graph for each of its parts; between them only the fast Fourier transform remains,
 see `odometry.network.candidates`. Other networks are one graph of pairs.
 """
 

@@ -37,7 +37,7 @@ class Exported:
 
 
 def describe(network: NetworkConfig, images: ImageConfig) -> dict[str, Any]:
-    """The description beside weights or graphs; values that JSON can hold."""
+    """The description stored with weights or graphs; values that JSON can hold."""
     return _HEADER | {"network": network.model_dump(mode="json"), "images": images.model_dump(mode="json")}
 
 
@@ -76,7 +76,7 @@ def read_exported(folder: Path) -> Exported:
 
 
 def onnx_search(exported: Exported, threads: int) -> Search:
-    """The search for candidates with an exported network, with so many threads for each graph.
+    """The search for candidates with an exported network, with `threads` threads for each graph.
 
     Raises:
         InputError: a graph is missing or cannot be used.
@@ -96,7 +96,7 @@ class _Graph:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = _FATAL_ERRORS_ONLY
-        # Threads that wait in a loop for more work would take it from mapping, which works beside.
+        # Threads that wait in a loop for more work would take it from mapping, which runs in parallel.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.add_session_config_entry("session.use_env_allocators", "1")
         self._path, self._run, self.deadline_s = path, onnxruntime.RunOptions(), float("inf")
@@ -118,7 +118,7 @@ class _Graph:
             self.deadline_s = float("inf")
 
     def end(self) -> None:
-        """End the computation that is under way."""
+        """End the computation in progress."""
         self._run.terminate = True
 
     def _unusable(self, error: Exception) -> InputError:

@@ -84,7 +84,7 @@ _BIRD_WIDTH, _BIRD_FEATURES = 16, 8
 # Bounds of the standard deviations. Peaks of columns of 2 degrees and of cells of half a metre are known to a part of
 # them at best: while a sensor turns, both sweeps are bent, and the peak with them.
 _LEAST_TURN, _LEAST_SHIFT_M, _LARGEST_SIGMA = 0.01, 0.1, 20.0
-# A peak is the mean over so many turns or shifts to either side of the highest.
+# A peak is the mean over this many turns or shifts to either side of the highest.
 _PEAK = 2
 # Standard deviations of the directions that are not estimated: roll and pitch, radians, and z, metres.
 _TILT, _CLIMB_M = 0.05, 0.2
@@ -303,7 +303,7 @@ _STAGES = ((64, (1, 1)), (128, (1, 2)), (256, (1, 2)), (512, (2, 2)))
 _STEM_CHANNELS = 64
 _FEATURES = 1000
 _HEAD_FEATURES = 100
-# How much smaller than torch's default the weights of the two last layers begin.
+# Initial weights of the two last layers, relative to torch's default.
 _LAST_LAYER_GAIN = 0.1
 # It has no standard deviations; these are written for it, radians and metres.
 _UNKNOWN_SIGMA = 0.1

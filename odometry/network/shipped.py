@@ -1,4 +1,4 @@
-"""The network that comes with the program, and the libraries that its training needs; without torch."""
+"""The network bundled with the program, and the libraries that its training needs; without torch."""
 
 from importlib import import_module
 from importlib.resources import files

@@ -240,7 +240,7 @@ def _mean_of_valid(values: Tensor, valid: Tensor) -> Tensor:
 
 
 def _surfaces(images: Tensor, most: int | None = None, generator: Generator | None = None) -> Surfaces:
-    """The pixels of images (B, 6, H, W), or at most so many of them with a normal, drawn at random."""
+    """The pixels of images (B, 6, H, W), or at most `most` of them with a normal, drawn at random."""
     values = images.flatten(2).mT  # (B, N, 6)
     if most is not None and most < values.shape[1]:
         order = torch.rand(values.shape[:2], generator=generator).to(values.device) + has_normal(values[..., 3:], -1)

@@ -24,7 +24,7 @@ _PANES = 6
 
 
 class Augmentation(NamedTuple):
-    """How pairs are changed; probabilities unless said otherwise."""
+    """Random changes of pairs; probabilities unless said otherwise."""
 
     max_gap: int = 10  # steps from one scan of a pair to the other, 1 to this many, small ones more often
     reverse: float = 0.5  # the later scan comes first
@@ -35,7 +35,7 @@ class Augmentation(NamedTuple):
     mirror: float = 0.5  # y is negated
     scale: float = 0.3  # both scans grow or shrink by up to this part
     drop_beams: float = 0.3  # up to half of the rows are emptied
-    drop_points: float = 0.2  # up to this part of the points, of each scan anew
+    drop_points: float = 0.2  # up to this part of the points, of each scan separately
     hide_sector: float = 0.2  # up to a quarter of the turn is emptied in one scan
     range_noise_m: float = 0.02  # greatest standard deviation of noise on the ranges
     wet_ground: float = 0.15  # level ground beyond 5 to 30 m does not return
@@ -77,7 +77,7 @@ class PairBatch(PairImages):
 
 
 def augmented(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
-    """Pairs changed at random, each anew."""
+    """Pairs changed at random, each separately."""
     batch = _scaled(_mirrored(_turned(batch, config, generator), config, generator), config, generator)
     previous, current = (_worn(images, config, generator) for images in (batch.previous, batch.current))
     return replace(batch, previous=previous, current=current)

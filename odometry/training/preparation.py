@@ -44,7 +44,7 @@ class PreparedRecording:
         return len(self.points)
 
     def require(self, scans: int, images: ImageConfig) -> None:
-        """Refuse what `prepare` does not make of so many scans, with a ValueError; some may be left out."""
+        """Raise ValueError for a recording that `prepare` cannot have made of `scans` scans; some may be left out."""
         count, size = len(self.points), (images.rows, images.columns)
         shapes = {
             "points": (count, 3, *size), "normals": (count, 3, *size), "offsets": (count, *size),
