@@ -39,8 +39,8 @@ class DriverCloud:
     topic: str  # the driver's defaults
     frame_id: str
     record: np.dtype[np.void]  # type of a point, padding included
-    columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # beside x, y, z, by the sweep and its stamp_ns
-    imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one beside it
+    columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # besides x, y, z, by the sweep and its stamp_ns
+    imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one next to it
     imu_frame_id: str = "imu_link"
     message_type: str = POINT_CLOUD2_TYPE
 
@@ -169,7 +169,7 @@ def _clouds(
 
 
 def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", rig: Rig) -> Messages:
-    """Where the IMU is on the LiDAR, then a message a sample."""
+    """The extrinsic calibration of the IMU, then a message per sample."""
     driver, imu, store = DRIVERS[rig.driver], rig.imu, serializer.store
     if imu is None:
         return
@@ -180,7 +180,7 @@ def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", ri
         yield placed, CLOCK_START_NS, serializer.serialized(message, TRANSFORMS_TYPE)
     connection = bag.add_connection(driver.imu_topic, _IMU_TYPE, typestore=store)
     orientation, unknown = store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
-    no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition has it
+    no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition requires
     for number, stamp in enumerate(imu.stamps):
         stamp_ns = clock_ns(stamp)
         sample = store.types[_IMU_TYPE](

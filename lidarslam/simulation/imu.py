@@ -1,4 +1,4 @@
-"""A MEMS inertial measurement unit beside the LiDAR: samples of the exact motion, with noise and walking biases."""
+"""A MEMS inertial measurement unit on the LiDAR: samples of the exact motion, with noise and random-walk biases."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _STEP_S = 2e-4
 # Its stream of random numbers; those of the scans are numbered from 0.
 _STREAM = 2**32 - 1
 
-# Lower than the LiDAR's centre and behind it, turned by about 180 degrees, as where the cable leaves the other way.
+# Below and behind the LiDAR's centre, turned by about 180 degrees, as where the cable leaves in the other direction.
 _T_LIDAR_IMU = make_transform(exp([0.02, -0.015, 3.11, 0.0, 0.0, 0.0])[:3, :3], [-0.05, 0.03, -0.08])
 
 
@@ -50,10 +50,10 @@ def sample_imu(
 ) -> ImuSamples:
     """Samples of a motion on the grid of the IMU's rate that begins at zero, from `first_s` to `last_s`, inclusive.
 
-    The motion has to be twice differentiable between the two; outside, it is not looked at.
+    The motion has to be twice differentiable between the two; outside, it is not evaluated.
     """
     stamps = np.arange(np.ceil(first_s * model.rate_hz), np.floor(last_s * model.rate_hz + 1e-6) + 1) / model.rate_hz
-    # A motion may begin and end at speed: there the differences of the nearest instant inside stand in.
+    # A motion may begin and end at speed: there the differences of the nearest instant inside are used.
     instants = np.clip(stamps, first_s + _STEP_S, last_s - _STEP_S)
     exact = np.hstack(_angular_velocity_and_force(model.T_lidar_imu, T_world_lidar_at, instants))
     rng = np.random.default_rng([seed, _STREAM])

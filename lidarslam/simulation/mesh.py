@@ -52,7 +52,7 @@ def box_mesh(boxes: Boxes) -> Mesh:
 def cylinder_mesh(cylinders: Cylinders) -> Mesh:
     """A capped prism of `CYLINDER_SIDES` sides for each cylinder, in their order, of the same volume as the cylinder.
 
-    The corners stand 0.6 % of the radius proud and the sides lie 0.3 % inside.
+    The corners are 0.6 % of the radius outside the cylinder and the sides 0.3 % inside.
     """
     n = CYLINDER_SIDES
     axis = cylinders.ends - cylinders.starts
@@ -90,7 +90,7 @@ def height_field_mesh(field: HeightField) -> Mesh:
 
 
 def world_mesh(world: World) -> Mesh:
-    """All that stands still: boxes, cylinders, height fields, in this order."""
+    """All static surfaces: boxes, cylinders, height fields, in this order."""
     grounds = [height_field_mesh(field) for field in world.height_fields]
     return merge([box_mesh(world.boxes), cylinder_mesh(world.cylinders), *grounds])
 
@@ -101,7 +101,7 @@ def first_ground_triangle(world: World) -> int:
 
 
 def _repeated(vertices: FloatArray, triangles: IntArray) -> Mesh:
-    """One mesh of N alike solids from their vertices (N, K, 3) and the triangles (M, 3) of one."""
+    """One mesh of N solids of the same shape from their vertices (N, K, 3) and the triangles (M, 3) of one."""
     count, per_solid = vertices.shape[:2]
     first = per_solid * np.arange(count, dtype=np.int32)
     return Mesh(vertices.reshape(-1, 3), (first[:, None, None] + triangles).reshape(-1, 3))
@@ -119,7 +119,7 @@ class Pieces:
     """Triangles cut out of a mesh.
 
     `starts` and `ends` are the area of the mesh before the piece, and with it, in the order of the mesh's triangles
-    and of cutting: they number a piece's samples alike, whichever pieces were dropped.
+    and of cutting: they number a piece's samples in the same way, whichever pieces were dropped.
     """
 
     corners: FloatArray  # (P, 3, 3)
@@ -265,7 +265,7 @@ def _near_mover(
     middle = mover.pose_at(np.array([0.5 * (start + end)]))[0, :3, 3]
     radius = sizes.max() + 0.5 * abs(mover.speed_mps) * (end - start)
     away = middle - origins
-    # A long street has many movers: most are too far away for a look at each ray.
+    # A long street has many movers: most are too far away to test each ray.
     if np.linalg.norm(away[0]) > max_range_m + radius + 2.0 * np.linalg.norm(origins[-1] - origins[0]):
         return np.empty(0, dtype=np.intp)
     along = np.maximum(np.einsum("ij,ij->i", away, directions), 0.0)

@@ -1,7 +1,7 @@
 """Recordings in variety, for training: worlds, sensors, carriers and mountings, drawn by a seed.
 
-The ingredients are listed here and not taken from the registries: what is added there leaves the recordings of a
-seed, the prepared training data and the figures measured on them as they are, and is new to the shipped network.
+The ingredients are listed here and not taken from the registries: additions there leave the recordings of a
+seed, the prepared training data and the figures measured on them unchanged, and are new to the shipped network.
 """
 
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ _ROADS = frozenset({"street", "park", "fields", "terrace"})
 _FAST_WEIGHT = 3.0
 _FAST_MPS = (5.0, 30.0)
 _MOUNT_WEIGHTS = {"upright": 0.7, "upside-down": 0.15, "tilted": 0.15}
-# A mixture's worlds are numbered from here, far from the small seeds that people try things out with.
+# A mixture's worlds are numbered from here, far from the small seeds of manual trials.
 _FIRST_SEED = 1_000_000
 
 
@@ -46,7 +46,7 @@ class Excerpt:
 
     @property
     def name(self) -> str:
-        """The recording's, and where in it."""
+        """The recording's, and the place of the excerpt in it."""
         return f"{self.whole.name}@{self.first}"
 
     @property
@@ -75,7 +75,7 @@ class Ingredients:
 
 
 def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Excerpt]:
-    """Recordings of so many scans each; number i of a seed is the same for any `first`."""
+    """Recordings of `scans` scans each; number i of a seed is the same for any `first`."""
     for number in range(first, first + recordings):
         rng = np.random.default_rng([seed, number])
         chosen = _draw(rng, number)

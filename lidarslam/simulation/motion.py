@@ -1,4 +1,4 @@
-"""Motions of a body through a world: carriers, how they lean on the ground, and trajectories that are given."""
+"""Motions of a body through a world: carriers, their attitude on the ground, and given trajectories."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,7 +112,7 @@ class Carrier:
     """A kind of motion, by its name on the command line."""
 
     name: str
-    speed_mps: float  # where nothing slows it down
+    speed_mps: float  # unless limits or bends slow it down
     acceleration: float  # limits along and across, m/s^2
     side_acceleration: float
     turn_rate_deg: float  # about z, degrees a second (squared)
@@ -124,9 +124,9 @@ class Carrier:
     smoothing_s: float  # half the time over which accelerations set in
     swings_deg: tuple[float, ...] = ()  # turns there and back before it takes a corner's new direction
     leans_with_ground: bool = True  # takes the ground's pitch and roll
-    banks: bool = False  # leans into its accelerations, as what flies must
+    banks: bool = False  # leans into its accelerations, as aircraft must
     keeps_going: bool = False  # is at speed when a lap begins and ends; else laps begin and end at rest
-    flight_height_m: float = 0.0  # above the ground, where the route is high enough; 0 for what does not fly
+    flight_height_m: float = 0.0  # above the ground, where the route is high enough; 0 for ground carriers
     sway: tuple[Swing, ...] = ()  # while it moves
 
 
@@ -181,7 +181,7 @@ _TABLE = (
 )  # fmt: skip
 CARRIERS: dict[str, Carrier] = {carrier.name: carrier for carrier in _TABLE}
 
-# Rotations of the LiDAR on the body: rotation vectors, degrees. Tilted: looking down to the front and a little aside.
+# Rotations of the LiDAR on the body: rotation vectors, degrees. Tilted: facing down to the front and a little sideways.
 MOUNTS: dict[str, tuple[float, float, float]] = {
     "upright": (0.0, 0.0, 0.0),
     "upside-down": (180.0, 0.0, 0.0),
@@ -256,10 +256,10 @@ def motion_along(
         trajectory: poses of a frame with x forwards and z up.
         world: gives the ground, if the motion is on it.
         on_ground: take position and heading from the trajectory, height, roll and pitch from the ground under the
-            carrier; else take the poses as they are, for what flies or is carried.
+            carrier; else take the poses as they are, for aircraft and hand-held sensors.
         carrier: whose footprint and sensor height are meant when on the ground.
         smoothing_s: time within which the trajectory's noise is evened out: centimetres of a GPS receiver at 10 Hz
-            are accelerations that no car survives, which 0.25 s removes. 0 goes through every pose.
+            are accelerations far beyond a car's, which 0.25 s removes. 0 goes through every pose.
 
     Raises:
         InputError: the trajectory has fewer than two poses, points straight up or down, or on the ground moves along
@@ -288,7 +288,7 @@ def motion_along(
 
 
 def _smoothed(times: FloatArray, values: FloatArray, smoothing_s: float) -> FloatArray:
-    """Values (N, D) of the smoothing spline that follows what lasts longer."""
+    """Values (N, D) of the smoothing spline that keeps slower changes."""
     if smoothing_s <= 0.0 or len(times) < _FEWEST_TO_SMOOTH:
         return values
     # Of the smoothing spline's balance, lam * integral(f''^2), the response to a frequency w is 1 / (1 + lam dt w^4).

@@ -1,7 +1,7 @@
 """Measurement noise: pure functions of the true ranges, the sensor's figures and random numbers.
 
-All take and give whole sweeps (N,), in the order of the pattern's rays, so that what happens to one ray does not
-depend on how many others returned; inf stands for no return.
+All take and give whole sweeps (N,), in the order of the pattern's rays, so that the effects on one ray do not
+depend on the number of other returns; inf stands for no return.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ _SHORTEST_BLADE = 0.5
 
 
 def reflectivity(surfaces: NDArray[np.int64]) -> FloatArray:
-    """Reflectivity (N,) in [0.1, 0.8] of the surfaces (N,) met; alike for a solid's neighbouring triangles.
+    """Reflectivity (N,) in [0.1, 0.8] of the surfaces (N,) met; equal for a solid's neighbouring triangles.
 
     Numbers are scattered by Knuth's multiplicative hashing, four successive triangles together.
     """
@@ -48,8 +48,8 @@ def return_probability(
 ) -> FloatArray:
     """Probability (N,) that a ray comes back.
 
-    The echo's power falls with reflectivity * cosine / range^2; detection turns over from certain to none around the
-    power of a surface of 80 % reflectivity met head-on at the maximum range. The fourth power makes the turnover as
+    The echo's power falls with reflectivity * cosine / range^2; detection falls from certain to none around the
+    power of a surface of 80 % reflectivity met head-on at the maximum range. The fourth power makes the transition as
     wide as the published 10 % and 90 % ranges are apart.
     """
     power = reflectivities / _REFERENCE_REFLECTIVITY * np.maximum(cosines, _LEAST_COSINE)

@@ -41,14 +41,14 @@ class RecordRequest:
     seed: int  # of the world, the motion and the noise
     format: str
     trajectory: Path | None = None  # TUM or KITTI file that `motion` moves along instead of the world's route
-    speed_mps: float | None = None  # where no bend slows it down, instead of the carrier's own and the route's limit
+    speed_mps: float | None = None  # unless a bend slows it down, instead of the carrier's own and the route's limit
     imu: bool = False  # whether an IMU is recorded too
     overwrite: bool = False  # whether an earlier recording in `out` is replaced
     where: Where = SERIAL  # whether scans are made one after another or side by side
 
     @property
     def moved(self) -> str:
-        """The carrier, and its way or speed where it is not the usual one."""
+        """The carrier, and its path or speed where it is not the default."""
         if self.trajectory is not None:
             return f"{self.motion} along {self.trajectory.name}"
         return self.motion + (f" at {self.speed_mps:g} m/s" if self.speed_mps is not None else "")
@@ -79,19 +79,19 @@ _FILES = (README, GROUND_TRUTH, REFERENCE_MAP, *{name for row in FORMATS.values(
 
 @contextlib.contextmanager
 def new_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
-    """A path to make a folder at; it becomes `out` when the block ends without an error, else nothing is left of it.
+    """A path to make a folder at; it becomes `out` when the block ends without an error, else it is removed.
 
     Its last part is that of `out`, as formats name files after their folder. With `overwrite` an earlier simulated
-    recording is replaced, but nothing that holds other files too.
+    recording is replaced, but no folder with other files.
 
     Raises:
-        OutputError: there is something already, or it cannot be written.
+        OutputError: the path exists already, or cannot be written.
     """
     out = out.resolve()
     try:
         _refuse_to_replace(out, overwrite)
         out.parent.mkdir(parents=True, exist_ok=True)
-        # Beside its final place, so that renaming is enough; hidden, so that a killed process leaves nothing to find.
+        # Next to its final place, so that renaming is enough; hidden, so that a killed process leaves nothing to find.
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as workplace:
             folder = Path(workplace) / out.name
             yield folder
@@ -218,7 +218,7 @@ def _run_command(summary: RecordingSummary, program: str = "lidarslam") -> str:
 
 
 _TIME_STEP_S = 0.02
-_LOWEST_M = 0.3  # kerbs and bumps under a carrier are not in its way
+_LOWEST_M = 0.3  # kerbs and bumps under a carrier are no obstacles
 
 
 def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None:
@@ -232,7 +232,7 @@ def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None
         name: of the trajectory, for the message.
 
     Raises:
-        InputError: the way leads through something solid or off the world's ground; says where and when.
+        InputError: the path leads through something solid or off the world's ground; the message has place and time.
     """
     world = simulation.world
     times = np.arange(0.0, simulation.scan_count / simulation.sensor.rate_hz + _TIME_STEP_S, _TIME_STEP_S)
@@ -294,7 +294,7 @@ def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[M
     Carriers that lean with the ground follow a trajectory on the ground, the others take its poses as they are.
 
     Raises:
-        InputError: there is no such carrier, it cannot go along the route, or the trajectory cannot be followed, is too
+        InputError: there is no such carrier, it cannot follow the route, or the trajectory cannot be followed, is too
             short, or comes with a speed.
     """
     if request.trajectory is None:
@@ -319,7 +319,7 @@ def _along(path: Path, trajectory: Trajectory, world: World | None, carrier: Car
 
 
 def given_path(path: Path, motion: str) -> FloatArray:
-    """Way of a carrier along a trajectory: (N, 2), or for carriers that do not follow the ground (N, 3).
+    """Path of a carrier along a trajectory: (N, 2), or for carriers that do not follow the ground (N, 3).
 
     The third column is the height of the ground that fits the trajectory: as far below it as the carrier holds or
     flies the sensor. Raises InputError as `plan_motion` does.
@@ -395,7 +395,7 @@ def _sweep(simulation: Simulation, index: int, seen: SeenSurfaces) -> SimulatedS
 
 
 def _chunk(task: tuple[RecordRequest, range]) -> tuple[list[SimulatedScan], KeyArray]:
-    """Some scans, as far as they are written, and the keys of what they saw."""
+    """Some scans, as far as they are written, and the keys of the surfaces they saw."""
     request, indices = task
     simulation, seen = _simulation_of_process(request), SeenSurfaces()
     made = [replace(_sweep(simulation, index, seen), true_ranges=None, moving=None) for index in indices]

@@ -18,7 +18,7 @@ from lidarslam.simulation.noise import bloom, intensities, measure, ranges_in_gr
 from lidarslam.simulation.sensors import Rays, Sensor
 from lidarslam.simulation.world import World
 
-# Blades stand every way; half of a beam's power is what they reflect on average.
+# Blades have all orientations; on average they reflect half of a beam's power.
 _BLADE_COSINE = 0.5
 
 

@@ -53,12 +53,12 @@ class SeenSurfaces:
         self.add_keys(_unique(_voxels(points, self.voxel_m) | _sectors(normals) | from_behind))
 
     def keys(self) -> KeyArray:
-        """Sorted keys of what was seen."""
+        """Sorted keys of the seen surfaces."""
         self._merge()
         return self._keys
 
     def add_keys(self, keys: KeyArray) -> None:
-        """Add what was seen elsewhere, by its keys."""
+        """Add surfaces that were seen elsewhere, by their keys."""
         self._pending.append(keys)
         if sum(map(len, self._pending)) > max(_BLOCK, len(self._keys)):
             self._merge()
@@ -75,7 +75,7 @@ class SeenSurfaces:
 def reference_map(simulation: Simulation, spacing_m: float | None = None, step: int = 1) -> ReferenceMap:
     """The map of the static world that every `step`-th scan of a simulation saw.
 
-    Its points are `spacing_m` apart, by default as the world says.
+    Its points are `spacing_m` apart, by default the spacing of the world.
     """
     seen = SeenSurfaces()
     for index in range(0, len(simulation), step):
@@ -86,7 +86,7 @@ def reference_map(simulation: Simulation, spacing_m: float | None = None, step: 
 def sample_seen(mesh: Mesh, seen: SeenSurfaces, spacing_m: float = 0.05) -> ReferenceMap:
     """Samples of the mesh, one to each `spacing_m` squared, in or next to voxels that were seen.
 
-    Time and memory are those of the seen surfaces, not of the mesh, which is gone through once.
+    Time and memory are those of the seen surfaces, not of the mesh, which is traversed once.
     """
     around = seen.around()
     pieces = pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m)
@@ -121,7 +121,7 @@ def _samples(pieces: Pieces, spacing_m: float) -> Iterator[tuple[FloatArray, NDA
 def _even_in_triangle(numbers: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
     """u and v (N,) with u + v <= 1, evenly spread over the triangle for any run of numbers (N,).
 
-    The square's points are pressed into the triangle without folding it, which would lay points on one another
+    The square's points are pressed into the triangle without folding it, which would place points on one another
     (Heitz, A Low-Distortion Map Between Triangle and Square, 2019).
     """
     u, v = np.mod(np.multiply.outer(_R2, numbers + 1.0), 1.0)

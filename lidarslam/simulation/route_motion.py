@@ -1,4 +1,4 @@
-"""A carrier going round a world's route.
+"""Motion of a carrier along a world's route.
 
 A lap is a chain of stretches: arrays (N, 5) of x, y, lift, rise and yaw at steps of `TIME_STEP_S`. The lift is the
 height of the route above the ground of the world (mezzanines and ramps are no height fields), the rise its gain for
@@ -110,11 +110,11 @@ TIME_STEP_S = 0.01
 def rest_to_rest(
     positions: FloatArray, speed_limits: FloatArray, acceleration: float, smoothing_s: float
 ) -> FloatArray:
-    """Positions (N,) at steps of `TIME_STEP_S` on the quickest way that keeps the limits.
+    """Positions (N,) at steps of `TIME_STEP_S` on the fastest motion that keeps the limits.
 
-    The quickest way has constant acceleration between the limits; averaged in time over a window of `smoothing_s` to
-    either side it keeps both limits on speed and acceleration (the average of what keeps a limit keeps it too), and
-    its acceleration is continuous.
+    The fastest motion has constant acceleration between the limits; averaged in time over a window of `smoothing_s`
+    to either side it keeps both limits on speed and acceleration (an average of values within a limit is within it
+    too), and its acceleration is continuous.
 
     Args:
         positions: (M,) increasing from 0.
@@ -133,7 +133,7 @@ def rest_to_rest(
 def round_and_round(
     positions: FloatArray, speed_limits: FloatArray, acceleration: float, smoothing_s: float
 ) -> FloatArray:
-    """As `rest_to_rest` for one lap of a closed way, whose last position is the first: at speed where it closes.
+    """As `rest_to_rest` for one lap of a closed path, whose last position is the first: at speed where it closes.
 
     The lap's time is rounded up to whole steps, all speeds that much lower.
     """
@@ -246,7 +246,7 @@ def _circuit(carrier: Carrier, world: World) -> FloatArray:
     if np.abs(turning_angles(corners)).max() > np.deg2rad(carrier.stop_angle_deg):
         raise InputError(f"{carrier.name} does not stop, and the route of {world.name} has a corner to turn round at")
     way = _drive(carrier, world, corners, is_closed=True)
-    # Rates and averages over time need the ways before the lap and after it.
+    # Rates and averages over time need the paths before the lap and after it.
     count = round(_REST_S / TIME_STEP_S)
     gain = np.append(np.zeros(4), way[-1, 4] - way[0, 4])
     wider = np.concatenate([way[-count - 1 : -1] - gain, way, way[1 : count + 1] + gain])
@@ -254,7 +254,7 @@ def _circuit(carrier: Carrier, world: World) -> FloatArray:
 
 
 def _from_rest(carrier: Carrier, world: World) -> FloatArray:
-    """The base (N, 7) of a lap: rest, then by turns driving and turning on the spot, and rest."""
+    """The base (N, 7) of a lap: rest, then driving and turning on the spot alternately, and rest."""
     lap = _lap(carrier, world)
     angles = turning_angles(lap[:-1])
     stops = np.flatnonzero(np.abs(angles) > np.deg2rad(carrier.stop_angle_deg))
@@ -329,7 +329,7 @@ def _turn(carrier: Carrier, before: FloatArray, after: FloatArray, angle: float)
 
 
 def _on_the_ground(carrier: Carrier, world: World, way: FloatArray) -> FloatArray:
-    """The base (N, 7) of the motion: the way put on the ground, with the attitude that the carrier takes from it."""
+    """The base (N, 7) of the motion: the path on the ground, with the attitude that the carrier takes from it."""
     xy, (lift, rise, yaw) = way[:, :2], way[:, 2:].T
     ground = ground_under(world, xy, carrier.footprint_m)
     flight = min(carrier.flight_height_m, 0.5 * world.route.free_height_m)

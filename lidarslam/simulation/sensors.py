@@ -1,8 +1,8 @@
-"""LiDARs: their scan patterns and range errors, and the table of those there are, after manuals and data sheets.
+"""LiDARs: their scan patterns and range errors, and the table of all sensors, after manuals and data sheets.
 
-Ring 0 is where the driver has it. Rates are 10 Hz throughout. Noise close by is the precision (one sigma) where it is
-published and half the stated accuracy where it is not; its growth with range is what the published figures for near and
-far suggest. Ouster's rays start at the sensor's origin, as everybody's here, not on the real circle of 16 to 28 mm
+Rings are numbered as by the driver. Rates are 10 Hz throughout. Noise close by is the precision (one sigma) where it is
+published and half the stated accuracy where it is not; its growth with range is inferred from the published figures for
+near and far. Ouster's rays start at the sensor's origin, like all others here, not on the real circle of 16 to 28 mm
 around it.
 """
 
@@ -38,7 +38,7 @@ class Spinning:
 
     @property
     def lasers(self) -> int:
-        """Rays a column."""
+        """Rays per column."""
         return len(self.elevations_deg)
 
     @property
@@ -63,7 +63,7 @@ class Spinning:
 
 @dataclass(frozen=True, eq=False)
 class Rosette:
-    """Lasers that draw a pattern which goes on from sweep to sweep and does not close within any recording.
+    """Lasers that draw a pattern which continues from sweep to sweep and does not close within any recording.
 
     The line of sight turns about z while it nods up and down; the two frequencies and the sweep rate have irrational
     ratios. The lasers nod with phases spread over a period, or together and a constant angle above one another.
@@ -147,7 +147,7 @@ Driver = Literal["velodyne", "ouster", "hesai", "livox"]
 class RangeModel:
     """Errors of measured ranges; lengths in metres.
 
-    At `max_range_m` half the rays that meet a surface of 80 % reflectivity head-on come back. The beam's footprint on a
+    At `max_range_m` half the rays that meet a surface of 80 % reflectivity head-on return. The beam's footprint on a
     slanted surface spreads the range, and at the edge of a near object it returns the edge.
     """
 
@@ -166,7 +166,7 @@ class Sensor:
 
     name: str
     driver: Driver  # whose point fields its recordings have
-    rate_hz: float  # sweeps a second
+    rate_hz: float  # sweeps per second
     pattern: ScanPattern
     ranging: RangeModel
     has_rings: bool = True  # whether points carry the number of their laser

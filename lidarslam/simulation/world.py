@@ -73,7 +73,7 @@ class Grass:
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """Moving boxes that follow a closed polyline at constant speed, again and again."""
+    """Moving boxes that follow a closed polyline at constant speed, repeatedly."""
 
     boxes: Boxes  # in the mover's own frame, x forwards, the origin on the ground
     waypoints: FloatArray  # (M, 3) of the polyline, or one point for a mover that stands
@@ -100,7 +100,7 @@ class Mover:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A carrier's way; after the last waypoint it goes on at the first, and so revisits every place."""
+    """A carrier's path; after the last waypoint it continues at the first, and so revisits every place."""
 
     waypoints: FloatArray  # (M, 3) corners of a closed polyline on the ground
     corner_radius_m: float  # how far a corner may be cut, which a car needs and a walker does not
@@ -139,7 +139,7 @@ WORLDS = (
 
 
 def choose(kind: str, name: str, table: Mapping[str, T]) -> T:
-    """The entry of that name; an InputError lists the names there are."""
+    """The entry of that name; an InputError lists the known names."""
     if name not in table:
         raise InputError(f"no {kind} is called {name!r}; there are: {', '.join(table)}")
     return table[name]

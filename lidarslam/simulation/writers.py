@@ -83,7 +83,7 @@ _FULL_INTENSITY = 255.0  # KITTI's reach from 0 to 1
 _R_CAM_LIDAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 T_CAM_LIDAR = exp([0.007, -0.015, 0.009, 0.0, 0.0, 0.0]) @ make_transform(_R_CAM_LIDAR, [-0.004, -0.076, -0.272])
 
-# Two grey and two colour cameras, rectified: one focal length, one centre, and how far each sits beside the first.
+# Two grey and two colour cameras, rectified: one focal length, one centre, and their offsets from the first.
 _FOCAL_PX, _CENTRE_PX = 718.856, (607.193, 185.216)
 _BESIDE_M = (0.0, -0.537, 0.063, -0.469)
 
@@ -114,7 +114,7 @@ def write_kitti(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
 def compensate(scan: Scan, rig: Rig) -> FloatArray:
     """The points (N, 3) as they would have been measured at the stamp, all at once, from the true motion.
 
-    Exact for what stands still.
+    Exact for static surfaces.
     """
     if scan.time_offsets is None:
         return scan.points
@@ -127,7 +127,7 @@ def compensate(scan: Scan, rig: Rig) -> FloatArray:
 
 
 def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
-    # KITTI's own scans lie too low, and everybody who reads them raises them; exact points would come out too high.
+    # KITTI's own scans lie too low, and all readers raise them; exact points would come out too high.
     intensities = simulated.intensities / _FULL_INTENSITY
     return np.column_stack([correct_elevation(points, -KITTI_DEG), intensities]).astype("<f4")
 

@@ -1,4 +1,4 @@
-"""The folder of a comparison: its files, the recordings' folders, and in these the runs, one a method."""
+"""The folder of a comparison: its files, the recordings' folders, and in these the runs, one per method."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from lidarslam.storage.directory import TRAJECTORY_TUM
 
 # Each recording's folder holds its own comparison.json, where there are several.
 COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"
-# Beside the recordings' folders: recordings that a benchmark has made.
+# Next to the recordings' folders: recordings that a benchmark has made.
 RECORDINGS = "recordings"
 RESERVED = frozenset({COMPARISON, REPORT_HTML, REPORT_MD, RECORDINGS})
 
@@ -26,7 +26,7 @@ class _Method(TypedDict):
 
 
 class _Comparison(TypedDict, total=False):
-    """What is read back: of one recording, or of several."""
+    """The content that is read back: of one recording, or of several."""
 
     methods: dict[str, _Method]
     sequences: list[_Sequence] | None
@@ -55,7 +55,7 @@ def run_directories(path: Path) -> list[Path]:
         raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
     if not runs:
         raise InputError(f"{path}: none of its methods came to a result")
-    # Beside its methods' folders, or, of one of several recordings, in the same folder as these.
+    # Next to its methods' folders, or, of one of several recordings, in the same folder as these.
     return [path / run if (path / run).is_dir() else path.parent / run for run in runs]
 
 

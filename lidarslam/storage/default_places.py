@@ -1,4 +1,4 @@
-"""Where results go, and where a run is looked for, when no directory is named."""
+"""Default places of results, and of the run to read, when no directory is named."""
 
 import re
 from datetime import datetime
@@ -19,14 +19,14 @@ _TIMED = re.compile(r"_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(-\d+)?$")
 
 
 def new_place(folder: Path, name: str) -> Path:
-    """A path that does not exist yet: FOLDER/NAME_TIME, with the local time; a number follows where it is taken."""
+    """A path that does not exist yet: FOLDER/NAME_TIME, with the local time; a number follows if the name is taken."""
     first = folder / f"{safe_name(name)}_{datetime.now():{_TIME}}"
     numbered = (first.with_name(f"{first.name}-{number}") for number in count(2))
     return first if not first.exists() else next(path for path in numbered if not path.exists())
 
 
 def source_name(source: Path, sequence: str | None = None) -> str:
-    """What the results of a recording are named after: its file or folder, without suffix and time.
+    """The name for the results of a recording: its file or folder, without suffix and time.
 
     Of a folder with several sequences, followed by the one that is read; of evalio's, with that of the data set.
     """
@@ -39,7 +39,7 @@ def source_name(source: Path, sequence: str | None = None) -> str:
 
 
 def latest_run() -> Path | None:
-    """The run in `runs` whose trajectory was written last; None without any. Runs at work are left out."""
+    """The run in `runs` whose trajectory was written last; None without any. Running ones are left out."""
     found = [path.parent for path in RUNS.glob(f"*/{TRAJECTORY_TUM}") if _standing(path.parent) != "at work"]
     return max(found, key=lambda run: (run / TRAJECTORY_TUM).stat().st_mtime, default=None)
 
@@ -72,7 +72,7 @@ def _standing(run: Path) -> str | None:
 
 
 def _about(run: Path) -> About | None:
-    """Which run is unfinished there; None too where that is damaged."""
+    """The unfinished run there; None also where its file is damaged."""
     try:
         return About.read(run)
     except InputError:

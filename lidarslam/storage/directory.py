@@ -13,10 +13,10 @@ from lidarslam.core.files import cannot_write, make_directory, only_writer, remo
 
 _TILE = re.compile(r"-?\d+_-?\d+\.laz")
 
-# What a full or failing disk says.
+# Errors of a full or failing disk.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
-# The section of config.yaml that says what was run, not how; its first.
+# The section of config.yaml that describes the run, not its settings; its first.
 RUN_SECTION = "run"
 
 CONFIG = "config.yaml"
@@ -58,14 +58,14 @@ FILES = (
 # Columns of scans.csv: standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
 SIGMAS = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
 
-# The checkpoint of a run that is at work or was stopped, see `lidarslam.storage.unfinished`.
+# The checkpoint of a run that is running or was stopped, see `lidarslam.storage.unfinished`.
 UNFINISHED = "unfinished"
 ABOUT = f"{UNFINISHED}/run.json"
 STATE = f"{UNFINISHED}/state.npz"
 
 
 class RunDirectory:
-    """Writes the files of a run; of what lies there already, only the files of an earlier run are replaced."""
+    """Writes the files of a run; of the existing files, only those of an earlier run are replaced."""
 
     def __init__(self, path: Path, earlier: Iterable[str] = ()) -> None:
         self.path = path
@@ -76,7 +76,7 @@ class RunDirectory:
     @classmethod
     @contextlib.contextmanager
     def create(cls, path: Path, overwrite: bool = False, resume: bool = False) -> Iterator["RunDirectory"]:
-        """Make and lock the directory for the time of a run.
+        """Make and lock the directory for the duration of a run.
 
         The files of an earlier run stay until the new ones replace them; the rest is removed when the block ends
         without an error. A directory made here is removed again when nothing was written to it.
@@ -142,13 +142,13 @@ class RunDirectory:
         self.write_text(name, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
     def _remove_stale(self) -> None:
-        """Remove what is left of the earlier run."""
+        """Remove the remaining files of the earlier run."""
         for name in self._stale:
             _unlink(self.path, name)
         _remove_empty(self.path)
 
     def _discard_unless_run(self) -> None:
-        """Remove files that no config.yaml describes: they would be in the way of the next attempt."""
+        """Remove files that no config.yaml describes: they would obstruct the next attempt."""
         if not _is_run(self.path):
             for name in self._written:
                 _unlink(self.path, name)
@@ -185,16 +185,16 @@ def _unlink(path: Path, name: str) -> None:
 
 
 def _remove_empty(path: Path) -> None:
-    """Remove the folder of a map's tiles, when nothing lies there but what a killed process left."""
+    """Remove the folder of a map's tiles, when it holds at most the remains of a killed process."""
     folder = path / MAP_TILES
     if folder.is_dir() and not folder.is_symlink():
         remove_partial_files(folder)
-        with contextlib.suppress(OSError):  # something else lies there
+        with contextlib.suppress(OSError):  # other files are there
             folder.rmdir()
 
 
 def remove_run(path: Path) -> None:
-    """Remove a run's files, and its directory when nothing else lies there; leave anything else alone."""
+    """Remove a run's files, and its directory when it is empty then; leave all other files."""
     if _is_run(path):
         remove_files(path)
         if not any(path.iterdir()):
@@ -221,7 +221,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
 
 
 def _is_run(path: Path) -> bool:
-    """Whether a run's config.yaml lies there: its first section says what was run."""
+    """Whether a run's config.yaml lies there: its first section describes the run."""
     try:
         return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{RUN_SECTION}:")
     except (OSError, UnicodeDecodeError):

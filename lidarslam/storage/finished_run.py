@@ -68,11 +68,11 @@ class FinishedRun:
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
     map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
     frame_of: Path | None = None  # the run, or file, in whose map this one was localised
-    path: Path | None = None  # where it lies, resolved
+    path: Path | None = None  # its path, resolved
 
 
 def shown_map(path: Path) -> PointCloud:
-    """The map of a run as it is drawn; that which it was localised in, if it has none and that is still there.
+    """The map of a run as it is drawn; that in which it was localised, if it has none and that one still exists.
 
     Raises:
         InputError: as `load_map`.
@@ -245,7 +245,7 @@ class _Recording(TypedDict):
 
 @_keeping_others
 class _Summary(TypedDict, total=False):
-    """What is read back, of any version; other keys are kept as they are."""
+    """The content that is read back, of any version; other keys are kept as they are."""
 
     scans: NonNegativeInt
     lost_scans: NonNegativeInt
@@ -264,12 +264,12 @@ class _Summary(TypedDict, total=False):
 
 _SHAPE = TypeAdapter(_Summary)
 
-# Share of the way, of a metre at least, that may be unconstrained.
+# Share of the path, of a metre at least, that may be unconstrained.
 _MOST_UNCONSTRAINED, _SHORTEST_M = 0.1, 1.0
 
 
 def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
-    """Whether so much of a way lies along directions that hardly any surface constrains that its length is unknown."""
+    """Whether the length of a path is unknown because hardly any surface constrains much of it."""
     return unconstrained_m > _MOST_UNCONSTRAINED * max(length_m, _SHORTEST_M)
 
 

@@ -25,7 +25,7 @@ _REMEDY = "begin again with --overwrite"
 
 
 def write_state(path: Path, state: State) -> None:
-    """Write the file; after a crash or power failure, the earlier file or the whole new one is there.
+    """Write the file; after a crash or power failure, either the earlier file or the whole new one exists.
 
     Raises:
         OutputError: it cannot be written.
@@ -42,7 +42,7 @@ def write_state(path: Path, state: State) -> None:
 
 
 def read_state(path: Path) -> Saved:
-    """Read what `write_state` wrote; InputError where there is no such file, or it is damaged."""
+    """Read a file of `write_state`; InputError where there is no such file, or it is damaged."""
     try:
         with ONE_READER, np.load(path, allow_pickle=False) as file:
             values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT, any_number=True), file)

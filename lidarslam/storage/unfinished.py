@@ -1,4 +1,4 @@
-"""Which run is unfinished in a directory, and its checkpoint until it is finished: the folder `unfinished`."""
+"""The unfinished run of a directory, and its checkpoint until it is finished: the folder `unfinished`."""
 
 import contextlib
 import json
@@ -23,17 +23,17 @@ logger = logging.getLogger(__name__)
 # Differences to another run that an error lists.
 _LISTED = 3
 
-# At work; stopped, its results so far written; at work, with the results of an earlier run still whole.
+# Running; stopped, its results so far written; running, with the results of an earlier run still whole.
 Standing = Literal["at work", "stopped", "over an earlier run"]
 
 
 @dataclass(frozen=True)
 class About:
-    """Which run is unfinished; the content of run.json."""
+    """Description of the unfinished run; the content of run.json."""
 
-    description: dict[str, Any]  # everything that decides what it computes
+    description: dict[str, Any]  # everything that determines its results
     standing: Standing = "at work"
-    resumed_after: tuple[int, ...] = ()  # how many scans were done each time it was resumed
+    resumed_after: tuple[int, ...] = ()  # number of scans done each time it was resumed
 
     @classmethod
     def read(cls, run: Path) -> "About | None":
@@ -59,7 +59,7 @@ class About:
                 raise cannot_write(run / ABOUT, error) from error
 
     def remedy(self, run: Path) -> str:
-        """What to do about it, as the end of a sentence that begins with the directory."""
+        """The remedy, as the end of a sentence that begins with the directory."""
         if "merge" not in self.description:
             source = self.description.get("source", "SOURCE")
             return (
@@ -75,7 +75,7 @@ class About:
 
 
 def require_whole(run: Path) -> None:
-    """Refuse the results of a run that was killed or is at work, unless they are still those of the run before.
+    """Refuse the results of a run that was killed or is running, unless they are still those of the run before.
 
     Raises:
         InputError: they are.
@@ -98,7 +98,7 @@ def _warn_of_earlier(run: Path) -> None:
 
 
 def require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
-    """Refuse to go on with a run that was begun with another description than is asked for.
+    """Refuse to resume a run that was begun with another description than is asked for.
 
     Raises:
         InputError: they differ.
@@ -148,17 +148,17 @@ class CheckpointFiles:
             raise cannot_write(self.folder, error) from error
 
     def remove(self) -> None:
-        """Remove them, and their folder when nothing else lies there."""
-        if self.folder.is_symlink():  # what it leads to is not ours
+        """Remove them, and their folder when it is empty then."""
+        if self.folder.is_symlink():  # its target is not ours
             self.folder.unlink()
             return
-        (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are nothing
+        (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are useless
         self.clear()
-        with contextlib.suppress(OSError):  # another file lies there
+        with contextlib.suppress(OSError):  # another file is there
             self.folder.rmdir()
 
     def clear(self) -> None:
-        """Remove what was done; the folder still says which run is unfinished."""
+        """Remove the saved work; the folder still names the unfinished run."""
         if self.folder.is_dir():
             remove_partial_files(self.folder)
         for path in (self.state, self.submaps, self.tiles, self.tracked):
@@ -166,10 +166,10 @@ class CheckpointFiles:
 
 
 def remove_unfinished(run: Path) -> None:
-    """Remove a run, or a part of a merge, that was killed, and its directory when nothing else lies there.
+    """Remove a run, or a part of a merge, that was killed, and its directory when it is empty then.
 
     Raises:
-        OutputError: it is at work.
+        OutputError: it is running.
     """
     with only_writer(run):
         remove_partial_files(run)
@@ -184,8 +184,8 @@ class Unfinished:
 
     Attributes:
         run: its directory.
-        about: which run it is.
-        saved: the state to go on from, None to begin.
+        about: the description of the run.
+        saved: the state to resume from, None to begin.
         files: those of its checkpoint.
     """
 
@@ -193,7 +193,7 @@ class Unfinished:
         self.run, self.about, self._resumes = run, about, resumes
         self.files = CheckpointFiles(run)
         self.saved: Saved | None = None
-        self._keeps_earlier = False  # whether the results of an earlier run lie there, whole
+        self._keeps_earlier = False  # whether the whole results of an earlier run are there
 
     @classmethod
     @contextlib.contextmanager
@@ -235,11 +235,11 @@ class Unfinished:
 
     @property
     def is_resumable(self) -> bool:
-        """Whether something was done that need not be done again: by it, or by the parts of a merge."""
+        """Whether there is saved work: its own, or of the parts of a merge."""
         return self.files.state.is_file() or self.files.tracked.is_file() or any(self.run.glob(f"*/{ABOUT}"))
 
     def begin(self, scans: int) -> None:
-        """Mark the directory as one with a run at work; `scans` are done already where it resumes."""
+        """Mark the directory as one with a running run; `scans` are done already where it resumes."""
         resumed = (*self.about.resumed_after, scans) if self._resumes else ()
         standing: Standing = "over an earlier run" if self._keeps_earlier else "at work"
         self.about = replace(self.about, standing=standing, resumed_after=resumed)
@@ -260,7 +260,7 @@ class Unfinished:
 
 
 def _holds_results(run: Path) -> bool:
-    """Whether the results in a directory are whole: those of a run at work there may be mixed."""
+    """Whether the results in a directory are whole: those of a running one may be mixed."""
     try:
         about = About.read(run)
     except InputError:

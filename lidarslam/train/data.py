@@ -1,4 +1,4 @@
-"""The data of a training: recordings and simulations, prepared once, also side by side, and kept on disk."""
+"""The data of a training: recordings and simulations, prepared once, in parallel if asked for, and kept on disk."""
 
 import hashlib
 import json
@@ -46,7 +46,7 @@ class MapTeacher:
         mapped = self._mapper.process(scan, Prior())
         state = mapped.state
         self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * scan.middle_offset_s))
-        # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.
+        # When the first scan is registered its velocity is not known, and so neither is the middle of its sweep.
         self._is_ok.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
 
     def relabelled(self, recording: PreparedRecording) -> PreparedRecording:
@@ -62,11 +62,11 @@ class MapTeacher:
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
 PIECE = 500
-# Of the pairs, those from recordings where there are simulated ones beside.
+# Share of the pairs that are from recordings where there are simulated ones too.
 RECORDED_SHARE = 0.3
 # Draws the simulated recordings.
 _SIMULATION_SEED = 0
-# To be raised whenever preparation, or the simulation, computes something else than before.
+# To be raised whenever preparation, or the simulation, gives other results than before.
 _KIND = Kind("a recording prepared for training", version=3)
 
 Counter = Callable[[int], None]
@@ -78,7 +78,7 @@ class Stretch:
     """Consecutive scans of a recording that is opened when it is needed."""
 
     name: str  # of the recording
-    # differs from that of any other recording, and of itself before it was changed; values that JSON can hold
+    # differs from that of any other recording, and of the same before a change; values that JSON can hold
     identity: dict[str, Any]
     open: Callable[[], ScanSequence]  # gives its scans; can be pickled
     # first, stop: which of them, as in `range`
@@ -173,7 +173,7 @@ def hold_out(stretches: Sequence[Stretch], share: float, seed: int) -> tuple[lis
 def draw_weights(stretches: Sequence[Stretch]) -> list[float]:
     """How often each prepared recording is drawn, relative to the others, in the order of `prepared`.
 
-    Where there are simulated recordings beside, the others have `RECORDED_SHARE` together, by their numbers of scans.
+    Where there are simulated recordings too, the others have `RECORDED_SHARE` together, by their numbers of scans.
     """
     pieces = [piece for stretch in stretches for piece in stretch.pieces()]
     recorded_scans = sum(len(piece) for piece in pieces if not piece.is_simulated)
@@ -192,7 +192,7 @@ def prepared(
     """The stretches prepared for training, from the cache where they are in it already.
 
     Raises:
-        InputError: a recording turns out unreadable.
+        InputError: a recording is unreadable.
         OutputError: the cache cannot be written.
     """
     return [prepared_piece(piece, config, cache, count) for stretch in stretches for piece in stretch.pieces()]
@@ -207,7 +207,7 @@ def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: C
         kept.require(len(piece), config.images)
         if _digest({**content, "name": ""}) != _digest({**key, "name": ""}):
             raise InputError(f"{path}: is of another recording")
-    except (InputError, TypeError, ValueError):  # not there yet, damaged, or of another recording: made anew
+    except (InputError, TypeError, ValueError):  # not there yet, damaged, or of another recording: made again
         made = _prepare(piece, config, count)
         write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **key})
         return made
@@ -216,7 +216,7 @@ def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: C
 
 
 def _key(piece: Stretch, config: TrainingConfig) -> dict[str, Any]:
-    """What a prepared stretch depends on."""
+    """The parameters that a prepared stretch depends on."""
     images = config.images.model_dump(mode="json")
     key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": images}
     return key if piece.is_simulated else {**key, "teacher": config.teacher}
@@ -259,9 +259,9 @@ def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, c
     """Prepare the stretches into the cache, where they are not in it already.
 
     Raises:
-        InputError: a recording turns out unreadable.
+        InputError: a recording is unreadable.
         OutputError: the cache cannot be written, or is another folder on the nodes of a cluster.
-        KeyboardInterrupt: Ctrl-C; what is finished stays in the cache.
+        KeyboardInterrupt: Ctrl-C; finished recordings stay in the cache.
     """
     pieces = [piece for stretch in stretches for piece in stretch.pieces()]
     wanted = [piece for piece in pieces if not file_of(piece, config, cache).is_file()]

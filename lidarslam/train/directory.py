@@ -1,4 +1,4 @@
-"""The directory of a training: its files, and the state from which it goes on as if it had never stopped."""
+"""The directory of a training: its files, and the state from which it resumes without a difference."""
 
 import shutil
 from collections.abc import Iterable
@@ -48,7 +48,7 @@ def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
 
 
 def remove_results(path: Path, names: Iterable[str]) -> None:
-    """Make room for another training; what is left by a kill can neither be resumed nor is it foreign."""
+    """Make room for another training; the remains of a killed one can neither be resumed nor are they foreign."""
     for name in sorted(names, key=lambda name: (name == CONFIG, name != STATE)):
         if (path / name).is_dir() and not (path / name).is_symlink():
             shutil.rmtree(path / name)
@@ -70,12 +70,12 @@ _NETWORK, _OPTIMIZER = "network/", "optimizer/"
 
 @dataclass
 class Progress:
-    """The state beside weights and moments."""
+    """The state other than weights and moments."""
 
-    step: int = 0  # how many steps are done
+    step: int = 0  # number of steps done
     best: float | None = None  # the lowest score of a validation so far, None before the first
     sums: dict[str, float] = field(default_factory=dict)  # of each part of the loss since the last line of the log
-    counted: int = 0  # over how many steps
+    counted: int = 0  # number of these steps
     data: str = ""  # digest of the recordings
 
 

@@ -17,7 +17,7 @@ from lidarslam.train import directory as files
 
 
 class TrainingLog:
-    """Appends to the tables; lines after the step that the training goes on from are dropped, all of a new one."""
+    """Appends to the tables; lines after the step that the training resumes from are dropped, all of a new one."""
 
     def __init__(self, out: Path, step: int | None) -> None:
         self._out = out
@@ -39,7 +39,7 @@ class TrainingLog:
         self._curves.flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the rest."""
         self._curves.close()
 
     def _write(self, table: str, curves: str, step: int, row: Mapping[str, float]) -> None:

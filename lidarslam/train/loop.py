@@ -1,4 +1,4 @@
-"""The steps of a training on its devices: draw pairs, lower the loss, and now and then log, validate and save."""
+"""The steps of a training on its devices: draw pairs, lower the loss, and at intervals log, validate and save."""
 
 import contextlib
 import math
@@ -34,11 +34,11 @@ class Devices:
 
     Attributes:
         device: of this process.
-        processes: how many there are.
-        process: number of this one; the first writes and speaks.
+        processes: their number.
+        process: number of this one; only the first writes and prints.
 
     Raises:
-        ConfigError: the device is not there.
+        ConfigError: the device is not available.
     """
 
     def __init__(self, name: DeviceName) -> None:
@@ -55,7 +55,7 @@ class Devices:
 
     @property
     def is_first(self) -> bool:
-        """Whether this process is the one that writes and speaks."""
+        """Whether this process is the one that writes and prints."""
         return self.process == 0
 
     def shared(self, module: nn.Module) -> nn.Module:
@@ -66,7 +66,7 @@ class Devices:
         return DistributedDataParallel(module, find_unused_parameters=True)
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Wait for all processes."""
         if self.processes > 1:
             distributed.barrier()
 
@@ -104,7 +104,7 @@ class Recordings:
 
 
 class _LossModule(nn.Module):
-    """From a batch to its loss as one module, which is what several processes can share."""
+    """From a batch to its loss as one module, the unit that several processes can share."""
 
     def __init__(self, network: nn.Module, config: TrainingConfig) -> None:
         super().__init__()
@@ -117,15 +117,15 @@ class _LossModule(nn.Module):
 
 
 class TrainingLoop:
-    """One training in one process; only the first process validates, writes and speaks.
+    """One training in one process; only the first process validates, writes and prints.
 
     Args:
         config: of the training.
         network, optimizer: on the device.
-        progress: where the training stands.
+        progress: the state of the training.
         devices: of the processes.
         out: its directory.
-        about: what the weights are trained on.
+        about: the data that the weights are trained on.
         say: prints a line.
     """
 
@@ -148,7 +148,7 @@ class TrainingLoop:
         self._clock = time.perf_counter()
 
     def run(self, recordings: Recordings, is_interrupted: Callable[[], bool]) -> bool:
-        """Do the steps that are left; whether all of them were done.
+        """Do the remaining steps; whether all of them were done.
 
         Raises:
             ConfigError: the loss is no longer a number.

@@ -10,7 +10,7 @@ from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, load_model
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 
-# What `--losses` stands for, as settings.
+# The settings that `--losses` stands for.
 LOSSES = {
     "both": ("training.geometric={}", "training.alignment_weight=0"),
     "point-to-plane": ("training.geometric={plane_to_plane: false}", "training.alignment_weight=0"),
@@ -21,7 +21,7 @@ LOSSES = {
 
 
 class TrainConfig(BaseModel):
-    """Everything that decides what a training computes."""
+    """Everything that determines the results of a training."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

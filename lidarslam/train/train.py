@@ -51,7 +51,7 @@ class TrainRequest:
     start_from: Path | None = None  # weights to begin with instead of random ones
     device: DeviceName = "auto"  # where to compute
     prepared: Path | None = None  # where prepared recordings are kept; None: in `out`
-    resume: bool = False  # go on with the training in `out`
+    resume: bool = False  # continue the training in `out`
     overwrite: bool = False  # replace it
     where: Where = SERIAL  # whether recordings are prepared one after another or side by side
 
@@ -59,7 +59,7 @@ class TrainRequest:
 def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
     """Train and write the directory; whether all steps were done.
 
-    Ctrl-C ends the training after the step at work, and it can be resumed.
+    Ctrl-C ends the training after the current step, and it can be resumed.
 
     Raises:
         LidarSlamError: sources, configuration, weights or output directory are not usable.
@@ -145,7 +145,7 @@ def _loop(
     request: TrainRequest, config: TrainingConfig, start: Checkpoint | None, devices: Devices,
     about: dict[str, Any], say: Callable[[str], None],
 ) -> tuple[TrainingLoop, Progress]:  # fmt: skip
-    """The training, at its beginning or where it was left."""
+    """The training, at its beginning or where it was stopped."""
     network = _first_network(config, start).to(devices.device)
     optimizer = make_optimizer(network, config)
     progress = Progress(data=about["digest"])
@@ -165,7 +165,7 @@ def _loop(
 
 
 def _first_network(config: TrainingConfig, start: Checkpoint | None) -> nn.Module:
-    """The network as the training begins with it: its random weights follow from the seed alone."""
+    """The initial network: its random weights follow from the seed alone."""
     if start is not None:
         return network_of(start).train()
     with torch.random.fork_rng(devices=[]):
@@ -206,7 +206,7 @@ def _best(weights: Path) -> Validation | None:
 
 @contextlib.contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
-    """For the time of a training, Ctrl-C and a request to end are noted; Ctrl-C once more ends it at once."""
+    """During a training, Ctrl-C and a request to end are noted; Ctrl-C once more ends it at once."""
     asked = threading.Event()
 
     def note(signum: int, frame: Any) -> None:  # noqa: ARG001
@@ -221,7 +221,7 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: Any) -> bool:
     """Train with the options of `lidarslam train --help`; whether all steps were done.
 
-    A training that is resumed is as it was, but for what is given anew.
+    A resumed training keeps its settings, except those that are given again.
 
     Raises:
         LidarSlamError: options contradict each other, a value does not fit, or as `execute`.
@@ -252,7 +252,7 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
 
 
 def _earlier_sources(earlier: Path | None) -> tuple[Path, ...]:
-    """The recordings that a training was begun on."""
+    """The recordings that a training began with."""
     section = {} if earlier is None else read_yaml(earlier).get(SOURCES_SECTION)
     sources = section.get("sources", []) if isinstance(section, dict) else []
     return tuple(Path(str(source)) for source in sources)

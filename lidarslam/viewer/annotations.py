@@ -62,7 +62,7 @@ class ColourScale:
 
     @property
     def ends(self) -> tuple[str, str]:
-        """What stands on both sides of the scale."""
+        """The labels on both sides of the scale."""
         (label, unit), digits = _UNITS[self.quantity], 1 if self.high >= 1.0 or self.quantity == "height" else 3
         return f"{label} {self.low:.{digits}f}", f"{self.high:.{digits}f}{unit}"
 
@@ -104,14 +104,14 @@ class Entry:
 def draw_path(
     picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], wider: float = 1.0
 ) -> None:
-    """Draw a path through positions (N, 3) above everything, in the colours of its poses, and so many times wider."""
+    """Draw a path through positions (N, 3) above everything, in the colours of its poses, widened by a factor."""
     pixels = _pixels(view, positions)
     for first, last in _stretches(colours):
         _line(picture, pixels[first : last + 1], colours[last], wider * _line_width(view))
 
 
 def draw_outline(picture: Image.Image, view: View, positions: FloatArray, colour: Colour, wider: float = 1.0) -> None:
-    """Draw what is seen on both sides of a path that is drawn above it, so many times wider."""
+    """Draw the outline below a path that is widened by a factor."""
     _line(picture, _pixels(view, positions), colour, (wider + 1.0) * _line_width(view))
 
 
@@ -207,7 +207,7 @@ def _font(width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def short(text: str) -> str:
-    """Shortened, and without the characters that Pillow's font lacks."""
+    """The text, shortened, without the characters that Pillow's font lacks."""
     text = text.encode("ascii", "replace").decode()
     return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..."
 

@@ -28,7 +28,7 @@ from lidarslam.viewer.annotations import UNKNOWN, Colour, ColourScale, Entry, Qu
 from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view
 
 TOP, OBLIQUE = 90.0, 35.0
-# Drawn on so many times more pixels along each side, and averaged.
+# Factor of the pixels along each side that are drawn and then averaged.
 _SUPERSAMPLING = 2
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _PATH_COLOURS: dict[Status, Colour] = {
@@ -41,7 +41,7 @@ _RUN_COLOURS: tuple[Colour, ...] = (
     (0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (120, 40, 90),
     (110, 80, 50),
 )  # fmt: skip
-# Of several paths each is so much wider than the next, which is drawn above it: both are seen where they coincide.
+# Of several paths each is this much wider than the next, which is drawn above it: both are seen where they coincide.
 _WIDENING = 0.8
 _REFERENCE: Colour = (150, 150, 150)
 _REFERENCE_WIDER = 2.0
@@ -59,7 +59,7 @@ _LACKS: dict[Quantity, str] = {
 
 @dataclass(frozen=True, eq=False)
 class DrawnRun:
-    """What is drawn of a run; of a cloud alone, no trajectory."""
+    """The drawn parts of a run; of a cloud alone, no trajectory."""
 
     name: str
     cloud: PointCloud
@@ -69,7 +69,7 @@ class DrawnRun:
     distances_m: FloatArray | None = None  # of the cloud's points to a reference map
 
     def point_values(self, quantity: Quantity) -> FloatArray | None:
-        """What the points of the cloud are coloured by; None where they have no such number."""
+        """The values that colour the points of the cloud; None where they have none."""
         intensity = self.cloud.attributes.intensity
         values = {
             "height": self.cloud.points[:, 2],
@@ -79,13 +79,13 @@ class DrawnRun:
         return values.get(quantity)
 
     def pose_values(self, quantity: Quantity) -> FloatArray | None:
-        """What the path is coloured by; None for its status."""
+        """The values that colour the path; None for its status."""
         return self.errors_m if quantity == "error" and self.distances_m is None else None
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What pictures that are compared have in common."""
+    """The common properties of pictures that are compared."""
 
     view: View
     quantity: Quantity  # that a single run is coloured by
@@ -108,13 +108,13 @@ def fit_frame(
     quantity: Quantity = "height",
     turn_deg: float | None = None,
 ) -> Frame:
-    """The frame that holds runs but for those that diverge; arguments as in `draw_runs` and `fit_view`."""
+    """The frame that holds all runs except diverging ones; arguments as in `draw_runs` and `fit_view`."""
     view = fit_view(*framed(runs, reference), elevation_deg, turn_deg, width)
     return Frame(view, quantity, _fit_scale(runs, quantity))
 
 
 def framed(runs: Sequence[DrawnRun], reference: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-    """The points (N, 3) and positions (M, 3) that a picture has to hold: not those of runs that diverge."""
+    """The points (N, 3) and positions (M, 3) that a picture has to hold: not those of diverging runs."""
     moved = [run for run in runs if len(run.positions)]
     kept = dict(zip(map(id, moved), paths_in_bulk([run.positions for run in moved], reference), strict=True))
     shown = [run for run in runs if kept.get(id(run), True)]
@@ -260,7 +260,7 @@ def _entries(
     frame: Frame,
     with_reference: bool,
 ) -> Iterator[Entry]:
-    """The legend, the size of the frame, the scale bar, and who leaves the picture."""
+    """The legend, the size of the frame, the scale bar, and the runs that leave the picture."""
     view = frame.view
     single = runs[0] if len(runs) == 1 else None
     by_status = single is None or single.pose_values(frame.quantity) is None
@@ -305,7 +305,7 @@ def load_drawn_runs(paths: Sequence[Path], truth: Trajectory | None = None) -> l
 
 
 def require_quantity(run: DrawnRun, quantity: Quantity) -> None:
-    """Refuse to colour a run by what is not known of it.
+    """Refuse to colour a run by a quantity that it lacks.
 
     Raises:
         InputError: it has no such attribute, or there is nothing to compare with.

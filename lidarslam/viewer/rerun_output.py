@@ -1,4 +1,4 @@
-"""What is shown in Rerun, and where: in a file, a window or a browser."""
+"""Scenes shown in Rerun: in a file, a window or a browser."""
 
 import tempfile
 from collections.abc import Callable
@@ -66,7 +66,7 @@ def show_in_window(show: Show) -> None:
 
 
 def show_on_page(show: Show, page: WebPage) -> None:
-    """Show it in a browser; it lies in a temporary file that has no name, and goes with the program.
+    """Show it in a browser; it is in a temporary file without a name, removed with the program.
 
     Raises:
         OutputError: there is no room for it.

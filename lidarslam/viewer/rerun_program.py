@@ -22,11 +22,11 @@ from lidarslam.viewer.web_page import LOCAL, WebPage
 # Rerun's own default.
 GRPC_PORT = 9876
 
-# What says that Linux has a display.
+# Set where Linux has a display.
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _START_S, _POLL_S = 30.0, 0.05
 _PAGE_FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico")
-# It asks GitHub for a newer version of itself, by way of a proxy if there is one; at this port there is none.
+# It asks GitHub for a newer version of itself, through a proxy if there is one; at this port there is none.
 _NOWHERE = f"http://{LOCAL}:1"
 _NO_NETWORK = dict.fromkeys(("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy"), _NOWHERE)
 # The program serves its page alone, and no recordings, where it is given a server of recordings.
@@ -40,7 +40,7 @@ def is_taken(port: int) -> bool:
 
 
 def require_window(instead: str) -> None:
-    """Check that a window can be opened, before anything is computed for it; `instead` is what else to do.
+    """Check that a window can be opened, before anything is computed for it; `instead` names the alternative.
 
     Raises:
         OutputError: there is no display.
@@ -69,7 +69,7 @@ def open_window(port: int, recording: Path | None = None) -> None:
 
 @contextlib.contextmanager
 def served_page(announce: Callable[[str], None]) -> Iterator[WebPage]:
-    """A page for browsers on this machine, for the time of the block; its address is announced with the first content.
+    """A page for browsers on this machine, during the block; its address is announced with the first content.
 
     Raises:
         OutputError: it cannot be served.
@@ -85,7 +85,7 @@ def _page_files() -> dict[str, bytes]:
     """The files of the viewer for browsers, by their paths on its page; they are part of the program.
 
     Raises:
-        OutputError: they cannot be had.
+        OutputError: they cannot be loaded.
     """
     with socket.socket() as probe:
         probe.bind((LOCAL, 0))
@@ -111,7 +111,7 @@ def _fetch(port: int, path: str) -> bytes:
 
 
 def _program() -> str:
-    """The program that came with the library, beside this Python if not on the path."""
+    """The program that came with the library, next to this Python if not on the path."""
     beside = Path(sys.executable).with_name("rerun")
     found = str(beside) if beside.is_file() else shutil.which("rerun")
     if found is None:
@@ -146,7 +146,7 @@ def _launch(*options: str) -> "subprocess.Popen[bytes]":
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """With whatever it started."""
+    """Kill the program with its children, and wait for its end."""
     if process.poll() is None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

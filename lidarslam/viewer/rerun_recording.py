@@ -27,9 +27,9 @@ from lidarslam.viewer.annotations import levels
 
 _log = logging.getLogger(__name__)
 
-# How a complete .rrd file of this version ends, before the four bytes of its flags.
+# The end of a complete .rrd file of this version, before the four bytes of its flags.
 _FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
-# Timeouts against a writer that died; there is hardly anything left to write by then.
+# Timeouts against a writer that died; hardly anything remains to be written by then.
 FLUSH_S, _DISCONNECT_S, _PIPE_S = 20.0, 10.0, 60.0
 # Where an open file of this process has a path, and how much is written at a time.
 OPEN_FILES = Path("/dev/fd")
@@ -132,7 +132,7 @@ def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3
 
 
 def set_stamp(recording: rr.RecordingStream, index: int, stamp: float) -> None:
-    """Set the time of what is logged next: that of the scan with this number."""
+    """Set the time of the next logged data: that of the scan with this number."""
     recording.set_time(SCAN, sequence=index)
     if _is_date(stamp):
         recording.set_time(TIME, timestamp=stamp)
@@ -156,7 +156,7 @@ def _is_date(stamp: float) -> bool:
 
 
 def every_nth(rows: NDArray[Any], count: int) -> NDArray[Any]:
-    """So many rows at most."""
+    """At most `count` of the rows."""
     return rows[:: max(1, -(-len(rows) // count))]
 
 
@@ -184,7 +184,7 @@ class _PipedFile:
         os.close(self._inlet)
 
     def finish(self) -> bool:
-        """Wait until all is written; whether it came to that."""
+        """Wait until all is written; whether it was."""
         self._thread.join(_PIPE_S)
         return not self._thread.is_alive()
 

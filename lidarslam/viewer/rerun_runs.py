@@ -79,7 +79,7 @@ def _in_one_world(runs: Sequence[FinishedRun], reference: Trajectory | None) -> 
         base = next((other for other in runs if other.path is not None and other.path == run.frame_of), None)
         if reference is None:
             yield shown
-        elif base is not None:  # it goes with the run in whose map it was localised
+        elif base is not None:  # it is moved with the run in whose map it was localised
             found = _association(base, reference)
             yield shown if found is None else _moved(shown, align(found.estimate, found.reference))
         else:
@@ -139,7 +139,7 @@ def _log_run(recording: rr.RecordingStream, shown: _Shown, several: bool, config
 
 
 def _blueprint(shown: Sequence[_Shown]) -> rrb.Blueprint:
-    """One space for all, with the map of the first; the eye beside an entity's name shows and hides it."""
+    """One space for all, with the map of the first; the eye icon next to an entity's name shows and hides it."""
     overrides: dict[rr.encodings.EntityPath | str, rrb.VisibleTimeRanges | rrb.EntityBehavior] = {}
     for number, one in enumerate(shown):
         for name in ("trajectory", "loops", "lost"):

@@ -45,7 +45,7 @@ def show_scans(
     """Scans about the sensor, by intensity or else by height; where there is a true path, the scans on it too.
 
     The scans are read while they are logged; `bar` makes a progress bar of a name, to be called with the number of
-    scans done, and of all, and `tell` is called with what is wrong with the recording, a line each.
+    scans done, and the total, and `tell` is called with each fault of the recording, as a line.
     """
     truth = recording.ground_truth
     if truth is not None:  # the viewer counts in single precision
@@ -85,7 +85,7 @@ def _log_scan(recording: rr.RecordingStream, index: int, scan: Scan, truth: Traj
 
 
 def _blueprint(has_truth: bool) -> rrb.Blueprint:
-    """The scan in the frame of the sensor, beside the scan on the true path."""
+    """The scan in the frame of the sensor, next to the scan on the true path."""
     scan = rrb.Spatial3DView(origin=f"/{_LIDAR}", name="Scan", background=BACKGROUND)
     views = [scan]
     if has_truth:

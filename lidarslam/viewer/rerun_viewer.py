@@ -1,4 +1,4 @@
-"""A run in Rerun while it is at work."""
+"""A run in Rerun while it is running."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -53,7 +53,7 @@ class RerunViewer(Viewer):
             recording.log(f"plots/{plot}", rr.SeriesLines(names=names), static=True)
 
     def wants_map(self, index: int) -> bool:
-        """Every so many scans."""
+        """Whether the map is shown after this scan: at a fixed interval."""
         return index % self._config.map_every == 0
 
     def show_reference(self, reference: Trajectory) -> None:
@@ -88,7 +88,7 @@ class RerunViewer(Viewer):
         log_map(self._recording, "world/map", points, self._config.map_points)
 
     def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]]) -> None:
-        """The corrected path beside the one before, and the loops."""
+        """The corrected path next to the one before, and the loops."""
         path = rr.LineStrips3D([positions], colors=[_CLOSED_COLOUR], radii=PATH_RADIUS, labels=["loops closed"])
         self._recording.log("world/closed/trajectory", path)
         self._recording.log("world/closed/loops", loop_lines(positions, np.array(loops, dtype=np.intp).reshape(-1, 2)))
@@ -124,7 +124,7 @@ def rerun_viewer(
 
 
 def _blueprint() -> rrb.Blueprint:
-    """A 3D view beside time series; the other panels are folded."""
+    """A 3D view next to time series; the other panels are folded."""
     space = rrb.Spatial3DView(
         origin="/world",
         name="Trajectory and map",

@@ -125,7 +125,7 @@ def _page(run: Path, accuracy: Accuracy, picture: str | None) -> RunPage:
 
 
 def with_run(result: MethodResult, run: Path) -> MethodResult:
-    """The result with what a run directory holds.
+    """The result with the content of a run directory.
 
     Raises:
         InputError: a file is damaged, or lacks a quantity.
@@ -183,7 +183,7 @@ def _column(rows: list[dict[str, str]], name: str) -> FloatArray:
 
 
 def describe_source(described: Mapping[str, Any]) -> list[str]:
-    """Lines about what was run, from config.yaml's section about it."""
+    """Lines that describe the run, from config.yaml's section about it."""
     chosen = {name: described.get(name) for name in ("start", "stop", "step")}
     part = chosen != {"start": 0, "stop": None, "step": 1}
     lines = [f"Source: {described.get('source', 'unknown')}"]
@@ -193,7 +193,7 @@ def describe_source(described: Mapping[str, Any]) -> list[str]:
 
 
 def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Quantities of summary.json in words, but for those in the report's tables."""
+    """Quantities of summary.json in words, except those in the report's tables."""
     lost, degraded, scans = summary["lost_scans"], summary["degraded_scans"], summary["scans"]
     shown = {
         "path": f"{summary['length_m']:.1f} m in {summary['duration_s']:.1f} s, {count(scans, 'scan')}",

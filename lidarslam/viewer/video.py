@@ -69,7 +69,7 @@ def save_video(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
 
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
     images = map(Image.fromarray, frames)
-    # One palette without dithering, so that what stands still is the same in successive frames.
+    # One palette without dithering, so that static parts are the same in successive frames.
     first = next(images).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
     others = (image.quantize(palette=first, dither=Image.Dither.NONE) for image in images)
     duration_ms = 1000 // _PER_SECOND

@@ -14,7 +14,7 @@ from lidarslam.core.geometry import FloatArray
 WIDTH = 1600
 # Height of a picture and its margin, relative to its width.
 _TALLEST, _LOWEST, _MARGIN = 0.625, 0.2, 0.025
-# The frame holds this share of the occupied cells, along each axis, and up to so much of the size beyond.
+# The frame holds this share of the occupied cells, along each axis, and up to this share of the size beyond.
 _FRAMED_PERCENT, _BEYOND = (0.5, 99.5), 0.3
 _CELLS = 300
 _SAMPLED = 5_000
@@ -33,7 +33,7 @@ _AMBIENT = 0.55
 # darkened.
 _REACHES, _EDGE_STRENGTH, _STEEPEST = (1, 3), 0.8, 4.0
 _NOTHING = np.float32(-1e9)  # depth where there is no point, behind all points
-# Surfaces that face away by more than this are left out, so that one looks through ceilings into rooms.
+# Surfaces that face away by more than this are left out, so that rooms are visible through ceilings.
 _LEAST_FACING = -0.1
 
 
@@ -51,7 +51,7 @@ class View:
 
     @property
     def area_m2(self) -> float:
-        """What the picture shows."""
+        """The area of the scene that the picture shows."""
         return self.width * self.height * self.pixel_m**2
 
     @property

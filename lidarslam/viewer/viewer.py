@@ -1,4 +1,4 @@
-"""Viewers of a run at work."""
+"""Viewers of a run in progress."""
 
 from collections.abc import Sequence
 from typing import Literal

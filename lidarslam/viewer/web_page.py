@@ -105,7 +105,7 @@ class _Request(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """A file of the viewer, or the recording."""
         host, place = self.headers.get("Host", ""), urlsplit(self.path)
-        if urlsplit(f"//{host}").hostname not in (LOCAL, "localhost"):  # a name that was made to point here
+        if urlsplit(f"//{host}").hostname not in (LOCAL, "localhost"):  # a foreign name that resolves to here
             self.send_error(HTTPStatus.FORBIDDEN)
         elif place.path == _INDEX and "url=" not in place.query:
             # The address as the browser knows it, which at the end of a tunnel may be another.
@@ -130,7 +130,7 @@ class _Request(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _send_recording(self) -> None:
-        """From its beginning, and what is written to it from now on."""
+        """From its beginning, and the data written to it from now on."""
         self._begin(HTTPStatus.OK, {"Content-Type": "application/octet-stream", "Transfer-Encoding": "chunked"})
         for piece in self._pieces():
             self.wfile.write(b"%x\r\n%b\r\n" % (len(piece), piece))
@@ -139,7 +139,7 @@ class _Request(BaseHTTPRequestHandler):
     def _pieces(self) -> Iterator[bytes]:
         offset, server = 0, self.server
         while True:
-            complete = server.complete.is_set()  # before reading: what is written in between is read next time
+            complete = server.complete.is_set()  # before reading: data written in between is read next time
             piece = b"" if server.descriptor is None else os.pread(server.descriptor, _PIECE, offset)
             if piece:
                 offset += len(piece)

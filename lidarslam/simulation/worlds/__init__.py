@@ -1,1 +1,1 @@
-"""One world a file."""
+"""Worlds, one per file."""

@@ -1,6 +1,6 @@
-"""A street along a given path, such as one that a car drove with a real LiDAR: as long as it takes, nothing in the way.
+"""A street along a given path, such as that of a car with a real LiDAR: as long as the path, without obstacles on it.
 
-Everything keeps its distance from all of the path, so also from where it crosses itself, comes back or turns round.
+Everything keeps its distance from all of the path, also where it crosses itself, returns or turns round.
 """
 
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ from lidarslam.simulation.worlds.street import (
 )
 
 _STEP_M = 0.5
-# The road goes on straight for this long before the path and behind it.
+# The road continues straight for this long before the path and after it.
 _BEYOND_M = 12.0
 # Directions are averaged over this length: a path has jitter, and a row of houses none.
 _SMOOTH_M = 3.0
@@ -51,11 +51,11 @@ _FULL_M = 700.0
 def build_along(path: FloatArray, seed: int, fullness: float | None = None) -> World:
     """A street with the path in its middle; within `FREE_SIDE_M` of the path, at any height, there is only the road.
 
-    The route goes along the path and back.
+    The route follows the path and back.
 
     Args:
         path: (N, 2) polyline, or (N, 3) with the height of the ground; else the ground is gently hilly.
-        seed: of everything that the path leaves open.
+        seed: of everything that the path does not determine.
         fullness: share of houses with ornaments, and of kerbs with cars and trees; None: less the longer the path.
 
     Raises:
@@ -88,7 +88,7 @@ class Course:
 
     @classmethod
     def along(cls, path: FloatArray) -> "Course":
-        """The course of a polyline (M, 2) or (M, 3), at least one metre long, longer than it at either end."""
+        """The course of a polyline (M, 2) or (M, 3), at least one metre long, extended at either end."""
         at = lengths_along(path[:, :2])
         points = points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / _STEP_M)) + 1)))
         first, last = (np.append(-left_of(left), np.zeros(path.shape[1] - 2)) for left in cls(points).lefts[[0, -1]])
@@ -97,12 +97,12 @@ class Course:
 
     @property
     def length_m(self) -> float:
-        """About how long it is."""
+        """Its approximate length."""
         return _STEP_M * (len(self.points) - 1)
 
     @cached_property
     def lefts(self) -> FloatArray:
-        """(N, 2) unit, to the left of the way."""
+        """(N, 2) unit, to the left of the direction of travel."""
         smooth = gaussian_filter1d(self.points[:, :2], _SMOOTH_M / _STEP_M, axis=0, mode="nearest")
         ahead = np.gradient(smooth, axis=0)
         return left_of(ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9))
@@ -113,7 +113,7 @@ class Course:
         return cKDTree(self.points[:, :2])
 
     def sides(self) -> Iterator["Course"]:
-        """The course and its reverse: what is placed along the left of each is placed on both sides."""
+        """The course and its reverse: things placed along the left of each are on both sides."""
         yield self
         yield Course(self.points[::-1])
 
@@ -142,7 +142,7 @@ def _ground(rng: np.random.Generator, course: Course) -> HeightField:
 
 @dataclass
 class _Rows:
-    """Puts things beside a course, none on another, none near any part of the course."""
+    """Places things next to a course, none on another, none near any part of the course."""
 
     rng: np.random.Generator
     course: Course
@@ -153,7 +153,7 @@ class _Rows:
     _loose: Builder = field(default_factory=Builder)  # may reach into the free space, and is pruned
 
     def build(self, free: Route) -> None:
-        """Add everything; houses first, they need most room."""
+        """Add everything; houses first, which need most room."""
         for side in self.course.sides():
             self._houses(side)
         for side in self.course.sides():
@@ -181,7 +181,7 @@ class _Rows:
                 if at + width > side.length_m or not 5.0 < front < 20.0:
                     continue
                 along = (end - start) / front
-                # Fronts are straight where the road bends, and may come a metre closer.
+                # Fronts are straight where the road bends, and may be a metre closer.
                 if self._claim(_rectangle(start, along, front, depth), _FRONT_M - 1.0):
                     self._house(start, along, front - 0.02, depth)
                     at += width

@@ -10,7 +10,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Boxes, Cylinders
 
 UP = np.array([0.0, 0.0, 1.0])
-HAIR_M = 0.002  # by which neighbouring faces miss one plane
+HAIR_M = 0.002  # by which neighbouring faces are offset from one plane
 
 Limits = tuple[float, float] | Sequence[float]  # lower and upper bound along an axis
 Vector = Sequence[float] | FloatArray

@@ -17,13 +17,13 @@ _BOXES = 12
 _DEEPEST_BOX_M = 0.45  # leaves the route's free side free
 _FREE_SIDE_M, _FREE_HEIGHT_M, _SPEED_LIMIT_MPS = 0.45, 2.2, 1.6
 _FRONT_M = 5.5  # height of the building that the corridor leads out of
-_ENTRY_M, _FROM_WALLS_M = 4.0, 5.5  # the way round the yard: from the mouth, and from the other sides
+_ENTRY_M, _FROM_WALLS_M = 4.0, 5.5  # the path round the yard: distance from the mouth, and from the other sides
 _CELL_M, _MARGIN_M = 0.5, 12.0
 
 
 @dataclass(frozen=True)
 class CorridorPlan:
-    """The corridor's middle is x from -length to 0 at y = 0; there begins the yard, `depth` long and `width` wide."""
+    """The corridor's middle is x from -length to 0 at y = 0; there the yard begins, `depth` long and `width` wide."""
 
     length: float
     depth: float
@@ -64,7 +64,7 @@ def _ground(plan: CorridorPlan, rng: np.random.Generator) -> HeightField:
 
 
 def _draw_corridor(plan: CorridorPlan, builder: Builder, rng: np.random.Generator) -> None:
-    """Walls, ceiling and the closed end; boxes against the walls at uneven distances, no two alike."""
+    """Walls, ceiling and the closed end; boxes against the walls at uneven distances, all different."""
     start, half, top = -plan.length, 0.5 * WIDTH_M, HEIGHT_M + OUTER_WALL_M
     for y in (-half - OUTER_WALL_M, half):
         builder.block((start, y, -0.3), (0.0, y + OUTER_WALL_M, top))
@@ -78,7 +78,7 @@ def _draw_corridor(plan: CorridorPlan, builder: Builder, rng: np.random.Generato
 
 
 def _draw_yard(plan: CorridorPlan, builder: Builder, ground: HeightField, rng: np.random.Generator) -> None:
-    """A front with windows beside the corridor's mouth, walls of different heights, a house on every other side."""
+    """A front with windows next to the corridor's mouth, walls of different heights, a house on every other side."""
     half, depth = 0.5 * plan.width, plan.depth
     front = Spot(builder, np.array([0.0, half, 0.0]), -0.5 * np.pi)
     mouth = Opening((half - 0.5 * WIDTH_M - HAIR_M, half + 0.5 * WIDTH_M + HAIR_M), (0.0, HEIGHT_M + HAIR_M))
@@ -102,7 +102,7 @@ def _plant_yard(
     plan: CorridorPlan, solid: Builder, green: Builder, ground: HeightField, clearance: Clearance,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Trees, lamp posts and benches off the way."""
+    """Trees, lamp posts and benches off the path."""
     low, high = np.array([2.0, 2.5 - 0.5 * plan.width]), np.array([plan.depth - 2.5, 0.5 * plan.width - 2.5])
     for k in range(14):
         where = rng.uniform(low, high)

@@ -1,4 +1,4 @@
-"""A foyer full of people: some go along with the carrier, others stand or cross its way."""
+"""A foyer full of people: some walk with the carrier, others stand or cross its path."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from lidarslam.simulation.worlds.interior import Furnisher, Room
 from lidarslam.simulation.worlds.office import draw_room_ceiling
 from lidarslam.simulation.worlds.paths import Clearance
 
-# The route's limit: every carrier that walks or drives keeps it, and so do those who go along.
+# The route's limit: every carrier that walks or drives keeps it, and so do those who walk with it.
 SPEED_MPS = 0.9
 COMPANIONS, STANDING, CROSSING = 15, 8, 7
 _ROUTE_FROM_WALLS_M, _FREE_SIDE_M, _FREE_HEIGHT_M = 5.2, 0.6, 2.2
@@ -20,7 +20,7 @@ _CROWD_SIDE_M = 3.4  # how far from the route the people are; furniture is farth
 _LANES_M = (-2.1, -1.15, 1.15, 2.1)
 _SLOTS_M = np.arange(-6.0, 6.5, 1.6)  # ahead of the carrier
 _JITTER_M = 0.15
-# A carrier rests and then picks up speed, while those who go along are on the move: by so much they are ahead then.
+# A carrier rests and then accelerates, while those who walk with it already move: by this much they are ahead then.
 _HEAD_START_M = 1.9
 
 
@@ -70,10 +70,10 @@ def _furnish(room: Room, height: float, put: Furnisher) -> None:
 
 
 def draw_people(route: Route, rng: np.random.Generator) -> tuple[Mover, ...]:
-    """Those who go along, those who stand and those who cross, in this order.
+    """Those who walk along, those who stand and those who cross, in this order.
 
-    Whoever goes along keeps beside the route. Whoever crosses it to and fro is at one end of the way when the carrier
-    comes by on its first lap.
+    Those who walk along stay at a distance from the route. Those who cross it to and fro are at one end of their path
+    when the carrier passes on its first lap.
     """
     loop = _from_start(route)
     ahead = (loop[1] - loop[0]) / np.linalg.norm(loop[1] - loop[0])

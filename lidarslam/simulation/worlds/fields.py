@@ -1,4 +1,4 @@
-"""Open, rolling fields with a road round them: grass and crops, and of fences, hedges, trees and poles only a few."""
+"""Open, rolling fields with a road round them: grass and crops, and a few fences, hedges, trees and poles."""
 
 from itertools import pairwise
 
@@ -98,7 +98,7 @@ def _fences(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: 
 
 
 def _barn(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
-    """One barn with a pitched roof, some way off the road."""
+    """One barn with a pitched roof, at some distance from the road."""
     where, yaw = road[0], 0.0
     while paths.distance_to_loop(where[None], road)[0] < 22.0:
         index, side = int(rng.integers(len(road))), rng.choice([-1.0, 1.0])

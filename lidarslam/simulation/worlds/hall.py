@@ -48,14 +48,14 @@ class HallPlan:
     depth: float
     height: float  # inside
     aisle_y: tuple[float, float]  # of the two aisles across the ground floor
-    turn_x: float  # where the way changes from one aisle to the other
+    turn_x: float  # where the route changes from one aisle to the other
     ramps: FloatArray  # (4, 2, 3) foot and head of A to D in the picture above, the middle of their upper faces' ends
     decks: tuple[Deck, ...]  # deck 1, deck 2, landing
     route: Route
 
 
 def draw_hall(rng: np.random.Generator) -> HallPlan:
-    """A hall no two seeds share, its route 230 to 300 m long, its ramps at most 11.7 % steep."""
+    """A hall that is different for each seed, its route 230 to 300 m long, its ramps at most 11.7 % steep."""
     width, depth, height = rng.uniform(58.0, 64.0), rng.uniform(40.0, 43.0), rng.uniform(11.5, 13.0)
     run = rng.uniform(25.0, depth - _STRIP_M - 4.8)
     rise = run * rng.uniform(0.106, 0.117)
@@ -127,7 +127,7 @@ def _draw_ramp(foot: FloatArray, head: FloatArray, builder: Builder, clearance: 
 
 
 def _stand(top: FloatArray, thickness: float, builder: Builder, clearance: Clearance) -> None:
-    """A square column from the ground to below a slab, where the way and other things leave room."""
+    """A square column from the ground to below a slab, where the route and other things leave room."""
     low, high = np.append(top[:2] - 0.1, 0.0), np.append(top[:2] + 0.1, top[2] - thickness)
     if not clearance.on_route(low, high):
         clearance.take(low, high)
@@ -181,7 +181,7 @@ _GAP_M = 0.5
 
 @dataclass(frozen=True)
 class Yard:
-    """Puts things down where there is room for them."""
+    """Places things where there is room for them."""
 
     builder: Builder
     clearance: Clearance
@@ -199,7 +199,7 @@ class Yard:
 
 
 def _send_forklifts(plan: HallPlan, yard: Yard) -> tuple[Mover, ...]:
-    """Two or three fork-lifts that go around in rectangles off the way."""
+    """Two or three fork-lifts that drive in rectangles off the route."""
     rng = yard.rng
     movers: list[Mover] = []
     wanted = int(rng.integers(2, 4))
@@ -221,7 +221,7 @@ def _send_forklifts(plan: HallPlan, yard: Yard) -> tuple[Mover, ...]:
 
 
 def _set_racks(plan: HallPlan, yard: Yard) -> None:
-    """Rows of racks between the aisles, to the right of where the way turns."""
+    """Rows of racks between the aisles, to the right of where the route turns."""
     rng = yard.rng
     spacing, levels = rng.uniform(3.2, 4.0), int(rng.integers(3, 5))
     for y in np.arange(plan.aisle_y[0] + 2.2, plan.aisle_y[1] + 1.5, spacing):
@@ -238,7 +238,7 @@ def _set_racks(plan: HallPlan, yard: Yard) -> None:
 
 
 def _set_machines(plan: HallPlan, yard: Yard) -> None:
-    """Machines in rows, kinds by turns."""
+    """Machines in rows, of alternating kinds."""
     rng = yard.rng
     xs, ys = np.arange(3.0, plan.width - 2.0, 3.6), np.arange(6.0, plan.depth - 10.0, 3.2)
     places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
@@ -310,7 +310,7 @@ def _mirrored(world: World, signs: FloatArray) -> World:
 
 
 def draw_shell(plan: HallPlan, builder: Builder, clearance: Clearance, rng: np.random.Generator) -> None:
-    """Everything that carries or closes the hall, and what is fastened to it."""
+    """The structure of the hall, and the fittings fastened to it."""
     middle = (0.5 * plan.width, 0.5 * plan.depth)
     size = (plan.width + 2.0 * _WALL_M, plan.depth + 2.0 * _WALL_M)
     builder.box((*middle, -0.2), (*size, 0.4))
@@ -383,7 +383,7 @@ def _draw_truss(plan: HallPlan, x: float, builder: Builder) -> None:
 def _draw_columns(
     plan: HallPlan, frames: FloatArray, rows: tuple[float, float], builder: Builder, clearance: Clearance
 ) -> None:
-    """Columns of H section on footings below the trusses, wherever the way and the ramps leave room; girders on top."""
+    """Columns of H section on footings below the trusses, where the route and the ramps leave room; girders on top."""
     top = plan.height - _TRUSS_M - 0.08
     for y in rows:
         builder.box((0.5 * plan.width, y, top - 0.3), (plan.width, 0.25, 0.6))

@@ -112,7 +112,7 @@ def generator(spot: Spot, size: Size, rng: np.random.Generator) -> None:
 
 
 def control_cabinets(spot: Spot, size: Size, rng: np.random.Generator) -> None:
-    """A row of switch cabinets of one height, doors proud, a cable duct on top."""
+    """A row of switch cabinets of one height with protruding doors, a cable duct on top."""
     x, y, z = size
     a, b, top = 0.5 * x, min(0.5 * y, 0.35), min(z, 2.1)
     edges = np.linspace(-a, a, max(2, round(x / 0.8) + 1))
@@ -154,7 +154,7 @@ def rack(spot: Spot, size: Size, rng: np.random.Generator) -> None:
 
 
 def pallet(spot: Spot, most: float, rng: np.random.Generator) -> None:
-    """A pallet, 1.2 by 0.9 m, with one load on it or several, at most so high."""
+    """A pallet, 1.2 by 0.9 m, with one load on it or several, at most `most` high."""
     spot.box((-0.6, 0.6), (-0.45, 0.45), (0.02, 0.14))
     if rng.random() < 0.5:
         x, y = rng.uniform(0.45, 0.6), rng.uniform(0.35, 0.46)
@@ -179,7 +179,7 @@ def drums(spot: Spot, size: Size, rng: np.random.Generator) -> None:
 
 
 def cabin(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
-    """A foreman's cabin: windows set back in two sides, a door, a roof that stands over."""
+    """A foreman's cabin: windows set back in two sides, a door, a projecting roof."""
     a, b = 0.5 * (size[0] - 0.4), 0.5 * (size[1] - 0.4)
     spot.box((-a + 0.08, a - 0.08), (-b + 0.08, b - 0.08), (0.0, 2.4))
     spot.box((-a, a), (-b, b), (0.0, 1.0))

@@ -13,7 +13,7 @@ from lidarslam.simulation.worlds.building import Builder, rotation_z
 
 # Walls go this far down: houses stand level on streets that slope.
 _FOUNDATION_M = 2.0
-# Faces that would lie in one plane are set apart by this much.
+# Faces that would be in one plane are set apart by this much.
 _OFFSET_M = 0.02
 
 

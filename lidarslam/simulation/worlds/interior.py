@@ -1,4 +1,4 @@
-"""Furniture, and putting it into the rooms of a floor.
+"""Furniture, and its placement in the rooms of a floor.
 
 Each piece fills a width, depth and height in a spot's frame, x along its width, z up from the floor. Pieces for walls
 have their back at y = 0 and reach to y = depth; the others have their middle at the spot.
@@ -75,7 +75,7 @@ def _goods(spot: Spot, x: Limits, depth: float, z: Limits, rng: np.random.Genera
 
 
 def cabinet(spot: Spot, size: Size, rng: np.random.Generator) -> None:
-    """A closed cabinet on a plinth, with doors or drawers standing a little proud."""
+    """A closed cabinet on a plinth, with doors or drawers that protrude a little."""
     (width, depth, height), half = size, 0.5 * size[0]
     spot.box((-half + 0.02, half - 0.02), (0.0, depth - 0.05), (0.0, 0.08))
     spot.box((-half, half), (0.0, depth - 0.02), (0.08, height))
@@ -111,7 +111,7 @@ def sofa(spot: Spot, size: Size, rng: np.random.Generator) -> None:
 
 
 def plant(spot: Spot, size: Size, rng: np.random.Generator) -> None:
-    """A pot with leaves standing out to all sides, about 0.35 m around its middle."""
+    """A pot with leaves to all sides, about 0.35 m around its middle."""
     spot = spot.shifted(0.0, 0.5 * size[1] - 0.005)
     pot, height = rng.uniform(0.28, 0.42), size[2]
     spot.pillar(0.0, 0.0, (0.0, pot), rng.uniform(0.14, 0.19))
@@ -242,7 +242,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Furnisher:
-    """Puts furniture where there is room for it."""
+    """Places furniture where there is room for it."""
 
     builder: Builder
     clearance: Clearance
@@ -282,7 +282,7 @@ class Furnisher:
     def some(
         self, room: Room, piece: Piece, count: int | tuple[int, int], size: tuple[Measure, Measure, Measure]
     ) -> None:
-        """So many pieces at the walls, each of its own size."""
+        """A number of pieces at the walls, each of its own size."""
         for _ in range(count if isinstance(count, int) else int(self.rng.integers(*count))):
             self.at_wall(room, self.drawn(size), piece)
 
@@ -301,7 +301,7 @@ def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
 
 
 def furnish_corridor(corridor: Room, height: float, put: Furnisher) -> None:
-    """Pillars, lockers, plants, extinguishers and notice boards, as far as the way allows."""
+    """Pillars, lockers, plants, extinguishers and notice boards, as far as the route allows."""
     area = float((corridor.high - corridor.low).prod())
     for _ in range(int(area / 6.0)):
         put.at_wall(corridor, put.drawn((0.35, (0.12, 0.2), height)), pilaster, tries=6)

@@ -63,7 +63,7 @@ class WallLine:
 class Plan:
     """A floor plan."""
 
-    loop: FloatArray  # (M, 2) corners of the closed way along the middle of the corridors
+    loop: FloatArray  # (M, 2) corners of the closed path along the middle of the corridors
     corridors: tuple[Room, ...]  # overlapping where they cross
     rooms: dict[int, Room]  # by label
     walls: tuple[WallLine, ...]  # every wall once
@@ -71,7 +71,7 @@ class Plan:
 
 
 def draw_plan(rng: np.random.Generator) -> Plan:
-    """A plan no two seeds share."""
+    """A plan that is different for each seed."""
     xs = _grid_lines(rng, "rcrrcrrcr", (2.7, 3.6))
     ys = _grid_lines(rng, "rcrcrcr", (3.3, 4.3))
     nodes = _loop_nodes(rng)
@@ -171,7 +171,7 @@ def _runs(left: Labels, right: Labels) -> list[tuple[int, int, tuple[int, int]]]
     return runs
 
 
-# How long the route may get, drawn between these.
+# Limits between which the largest length of the route is drawn.
 _ROUTE_LENGTHS_M = (76.0, 89.0)
 _FREE_SIDE_M = 0.4
 DOOR_HEIGHT_M = 2.12
@@ -193,7 +193,7 @@ class Door:
 
 @dataclass(frozen=True)
 class _Visit:
-    """A way (K, 2) from a leg of the loop into a room, around in it, and back to the same point."""
+    """A path (K, 2) from a leg of the loop into a room, around in it, and back to the same point."""
 
     door: Door
     leg: int
@@ -216,7 +216,7 @@ def into_room(wall: WallLine) -> FloatArray:
 
 
 def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]:
-    """A door or two for every room, and the route, which goes through open ones as long as it does not get too long."""
+    """A door or two for every room, and the route, which leads through open ones up to its largest length."""
     candidates: list[Door] = []
     for label in plan.rooms:
         walls = [k for k, w in enumerate(plan.walls) if {w.left, w.right} == {CORRIDOR, label} and w.length > 1.75]
@@ -227,7 +227,7 @@ def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]
             opened = rng.choice([0.0, rng.uniform(0.3, 1.1), rng.uniform(1.6, 1.8)], p=[0.45, 0.25, 0.3])
             candidates.append(Door(int(k), along, rng.uniform(0.85, 1.1), label, opened, rng.choice([-1.0, 1.0])))
     visits = _choose_visits(plan, candidates, rng)
-    # A second door into a visited room is shut: its leaf would stand in the way.
+    # A second door into a visited room is shut: its leaf would obstruct the route.
     visited = {visit.door.room for visit in visits.values()}
     others = [replace(door, opened=0.0) if door.room in visited else door for door in candidates]
     doors = [visits[k].door if k in visits else door for k, door in enumerate(others)]
@@ -241,7 +241,7 @@ def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]
 
 
 def _choose_visits(plan: Plan, doors: list[Door], rng: np.random.Generator) -> dict[int, _Visit]:
-    """Visits by the index of their door: in random order while the route has length to spare."""
+    """Visits by the index of their door: in random order up to the route's largest length."""
     length = loop_length(plan.loop)
     longest = rng.uniform(*_ROUTE_LENGTHS_M)
     chosen: dict[int, _Visit] = {}
@@ -255,7 +255,7 @@ def _choose_visits(plan: Plan, doors: list[Door], rng: np.random.Generator) -> d
 
 
 def _visit(plan: Plan, door: Door, rng: np.random.Generator) -> _Visit | None:
-    """The way in through a door and around a rectangle, or None where room or loop does not allow it."""
+    """The path in through a door and around a rectangle, or None where room or loop does not allow it."""
     wall, room = plan.walls[door.wall], plan.rooms[door.room]
     threshold, inwards = wall.a + door.along * wall.direction, into_room(wall)
     leg = _leg_at(plan.loop, threshold, inwards)
@@ -269,7 +269,7 @@ def _visit(plan: Plan, door: Door, rng: np.random.Generator) -> _Visit | None:
     across, depth = min(across, rng.uniform(1.6, 2.6)), min(depth, rng.uniform(2.4, 3.4))
     near, far, aside = threshold + _TURN_M * inwards, threshold + depth * inwards, across * (side * wall.direction)
     path = np.stack([start, near, near + aside, far + aside, far, start])
-    # The leaf hangs on the side that the way does not turn to, and lies back against the wall.
+    # The leaf hangs on the side that the path does not turn to, and opens back to the wall.
     open_door = Door(door.wall, door.along, rng.uniform(1.1, 1.2), door.room, rng.uniform(1.65, 1.8), -side)
     return _Visit(open_door, index, along, path)
 
@@ -317,7 +317,7 @@ def build(seed: int) -> World:
         furnish_corridor(corridor, height, put)
     kinds: list[str] = []
     for room in plan.rooms.values():
-        # Every kind comes once before any comes again.
+        # Every kind occurs once before any occurs again.
         kinds = kinds or list(rng.permutation(list(KINDS)))
         kind = kinds.pop()
         for _ in range(max(1, round(float((room.high - room.low).prod()) / 13.0))):
@@ -345,7 +345,7 @@ def draw_walls(plan: Plan, doors: list[Door], height: float, builder: Builder, c
 
 
 def _draw_door(spot: Spot, wall: WallLine, door: Door, clearance: Clearance) -> None:
-    """Frame and leaf; the swing and the way in are kept free of furniture."""
+    """Frame and leaf; the swing and the entrance are kept free of furniture."""
     inwards = 1.0 if into_room(wall) @ wall.to_left > 0.0 else -1.0
     half, reach, top = 0.5 * door.width, 0.5 * WALL_M + 0.02, DOOR_HEIGHT_M + _FRAME_M + 0.03
     for side in (-1.0, 1.0):

@@ -9,12 +9,12 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Grass, HeightField
 from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise
 
-# Feet go this far down, so that nothing hovers on a slope.
+# Feet extend this far down, so that nothing hovers on a slope.
 SUNK_M = 0.3
 
 
 def upright(ground: HeightField, xy: FloatArray, yaw: float) -> FloatArray:
-    """T_world_part (4, 4) of a part that stands plumb at (2,), whatever the slope."""
+    """T_world_part (4, 4) of a part that stands upright at (2,), whatever the slope."""
     return make_transform(rotation_z(yaw), np.append(xy, ground.height_at(np.asarray(xy)[None])))
 
 
@@ -113,7 +113,7 @@ def bench(rng: np.random.Generator) -> Builder:
 
 
 def bin_row(rng: np.random.Generator, count: int) -> Builder:
-    """Wheeled bins in a row along y, their lids a little proud."""
+    """Wheeled bins in a row along y, with slightly protruding lids."""
     part = Builder()
     for k in range(count):
         y, high, turn = 0.75 * (k - 0.5 * (count - 1)), rng.uniform(0.95, 1.15), rng.normal(0.0, 0.08)
@@ -158,7 +158,7 @@ def log_pile(rng: np.random.Generator, rows: int) -> Builder:
     return part
 
 
-# Roots go this far down, so that nothing hovers on a slope.
+# Roots extend this far down, so that nothing hovers on a slope.
 _ROOTS_M = 0.4
 # Of meadows: at 10 degrees of incidence a ray sees half a decimetre deep.
 _FREE_PATH_M = 0.3

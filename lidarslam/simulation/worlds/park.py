@@ -11,7 +11,7 @@ from lidarslam.simulation.worlds.outdoor import upright
 _CELL_M = 0.5
 _MARGIN_M = 60.0
 _FREE_SIDE_M = 1.8
-# Along the path stands something upright every so often, however bare the rest is.
+# Interval of upright things along the path, however bare the rest is.
 _LAMP_SPACING_M = 24.0
 
 
@@ -42,7 +42,7 @@ def _ground(rng: np.random.Generator, path: FloatArray) -> HeightField:
 
 
 def _along_the_path(solid: Builder, rng: np.random.Generator, path: FloatArray, ground: HeightField) -> None:
-    """Lamp posts by turns on either side, and between them a bench with a litter bin, a sign, or nothing."""
+    """Lamp posts on alternate sides, and between them a bench with a litter bin, a sign, or nothing."""
     count = max(6, round(0.5 * len(path) / _LAMP_SPACING_M))
     side = 1.0
     for place in np.arange(count) + rng.uniform(-0.2, 0.2, count):
@@ -62,7 +62,7 @@ def _along_the_path(solid: Builder, rng: np.random.Generator, path: FloatArray, 
 
 
 def _pavilion(solid: Builder, rng: np.random.Generator, path: FloatArray, ground: HeightField) -> FloatArray:
-    """An open pavilion on columns beside the path; its middle and radius (3,), where nothing else may stand."""
+    """An open pavilion on columns next to the path; its middle and radius (3,), where nothing else may stand."""
     size, high = rng.uniform(5.0, 8.0), rng.uniform(2.9, 3.4)
     where, yaw = path[0], 0.0
     while paths.distance_to_loop(where[None], path)[0] < 0.75 * size + 2.5:
@@ -133,7 +133,7 @@ def _borders(
 
 
 def _strollers(rng: np.random.Generator, path: FloatArray, ground: HeightField) -> tuple[Mover, ...]:
-    """People who walk or run round the meadow beside the path, never on it."""
+    """People who walk or run round the meadow next to the path, never on it."""
     movers = []
     for _ in range(int(rng.integers(2, 5))):
         radius, phase = rng.uniform(4.0, 8.0), rng.uniform(0.0, 2.0 * np.pi)

@@ -1,4 +1,4 @@
-"""Closed lines on the plane: ways through a world, distances from them, and the free space along them."""
+"""Closed lines on the plane: paths through a world, distances from them, and the free space along them."""
 
 from dataclasses import dataclass, field
 
@@ -157,7 +157,7 @@ _SPACING_M = 0.1
 
 @dataclass
 class Clearance:
-    """Upright blocks of space that are taken, beside the free space along a route."""
+    """Upright blocks of space that are taken, besides the free space along a route."""
 
     route: Route
     margin_m: float = 0.08  # around the route's free space
@@ -178,7 +178,7 @@ class Clearance:
         return bool((beside & level).any())
 
     def claim(self, low: FloatArray, high: FloatArray, gap_m: float = 0.0) -> bool:
-        """Take the block if it keeps off the route, and `gap_m` beside all blocks that are taken; whether it did."""
+        """Take the block if it keeps off the route, and `gap_m` from all blocks that are taken; whether it did."""
         gap = np.array([gap_m, gap_m, 0.0])
         if self.on_route(low, high) or ((low < self._highs + gap) & (self._lows < high + gap)).all(axis=1).any():
             return False

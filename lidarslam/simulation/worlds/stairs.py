@@ -21,7 +21,7 @@ from lidarslam.simulation.worlds.paths import Clearance
 
 RISE_M, TREAD_M = 0.17, 0.28
 _SLAB_M, _RAIL_ASIDE_M = 0.2, 0.06
-_TURN_M = 1.3  # from the lobby's end to where the way turns
+_TURN_M = 1.3  # from the lobby's end to where the route turns
 _FREE_SIDE_M, _FREE_HEIGHT_M, _SPEED_LIMIT_MPS = 0.4, 2.1, 0.8
 
 

@@ -36,7 +36,7 @@ class Side(NamedTuple):
         return left_of(self.along)
 
     def at(self, along_m: float, left_m: float) -> FloatArray:
-        """A place (2,) beside the middle line."""
+        """A place (2,) by its distances along the middle line and outward from it."""
         return self.start + along_m * self.along + left_m * self.outward
 
 
@@ -108,7 +108,7 @@ class StreetNetwork:
                 yield from pairwise(_quarter(node, one, other, self.half_width_m + middle))
 
     def _leads(self, at: FloatArray, direction: FloatArray) -> bool:
-        """Whether a street leads that way from the node at (2,)."""
+        """Whether a street leads in that direction from the node at (2,)."""
         node = int(np.abs(self.nodes - at).sum(axis=1).argmin())
         return bool(self.arms(node)[int((_DIRECTIONS @ direction).argmax())])
 
@@ -130,8 +130,8 @@ class StreetPlan:
 
     network: StreetNetwork
     pavement_m: float  # width of the pavements
-    tour: FloatArray  # (M, 2) corners of the carrier's way along the middle lines
-    oncoming: FloatArray  # (K, 2) of a way that meets it, but crosses it nowhere if all keep to the right
+    tour: FloatArray  # (M, 2) corners of the carrier's path along the middle lines
+    oncoming: FloatArray  # (K, 2) of a path that meets it, but crosses it nowhere if all keep to the right
     blocks: FloatArray  # (B, 2, 2) lowest and highest corner of each block, to the streets' middle lines
 
 
@@ -162,7 +162,7 @@ def _rectangle(west: float, east: float, height: float) -> FloatArray:
 
 
 def draw_plan(rng: np.random.Generator) -> StreetPlan:
-    """One block of 80 to 110 m, or two of 56 to 66 m that are driven round in the figure of an eight."""
+    """One block of 80 to 110 m, or two of 56 to 66 m with a tour in a figure of eight."""
     is_double = bool(rng.random() < 0.4)
     pavement = rng.uniform(3.4, 4.2)
     if is_double:
@@ -219,14 +219,14 @@ def _draw_network(rng: np.random.Generator, outline: FloatArray, is_double: bool
 
 @dataclass
 class LotSurvey:
-    """Lays out lots along all streets, none on a street or on another lot; `gaps` are lots without a house."""
+    """Places lots along all streets, none on a street or on another lot; `gaps` are lots without a house."""
 
     plan: StreetPlan
     lots: list[Lot] = field(default_factory=list)
     gaps: list[Lot] = field(default_factory=list)
 
     def walk(self, rng: np.random.Generator) -> None:
-        """Go along each side of each street, dead ends first, and build up what is still free."""
+        """Build up the free parts of each side of each street, dead ends first."""
         for start, length, along in self._frontages():
             at = 0.0
             while at < length:
@@ -246,7 +246,7 @@ class LotSurvey:
                     at += gap.width
 
     def repeat(self, width_m: float, depth_m: float) -> None:
-        """Build up each side of each street with lots that are all alike, none set back."""
+        """Build up each side of each street with equal lots, none set back."""
         for start, length, along in self._frontages():
             at = 0.0
             while at + width_m <= length:
@@ -260,7 +260,7 @@ class LotSurvey:
         network, front = self.plan.network, self.plan.network.half_width_m + self.plan.pavement_m
         is_dead = np.array([network.arms(k).sum() == 1.0 for k in range(len(network.nodes))])
         for a, b in network.edges:
-            if is_dead[b]:  # dead ends are drawn from their foot
+            if is_dead[b]:  # dead ends run from their foot
                 ahead = (network.nodes[b] - network.nodes[a]) / np.linalg.norm(network.nodes[b] - network.nodes[a])
                 along = -left_of(ahead)
                 yield network.nodes[b] + front * (ahead - along), 2.0 * front, along
@@ -453,6 +453,6 @@ def people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> l
 
 
 def _starts(rng: np.random.Generator, count: int, waypoints: FloatArray) -> list[float]:
-    """Where along a closed polyline so many movers start, spread unevenly."""
+    """Start positions of `count` movers along a closed polyline, spread unevenly."""
     at = paths.loop_length(waypoints) * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     return [float(one) for one in at]

@@ -1,4 +1,4 @@
-"""Terraced housing: the same house again and again along hundreds of metres, so that every period looks alike."""
+"""Terraced housing: the same house repeated along hundreds of metres, so that all periods look the same."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from lidarslam.simulation.worlds.paths import grid_nodes, on_ground
 from lidarslam.simulation.worlds.street import LotSurvey, StreetPlan, draw_terrace_plan
 
 _SPEED_LIMIT_MPS = 14.0  # 50 km/h
-# Hardly a slope: houses that step up with it would tell one from another.
+# Hardly a slope: houses that step up with it would be distinguishable.
 _HILLS_M = (0.05, 0.15)
 _PARKED_SHARE = (0.02, 0.08)
 _STOREYS = (2, 3)
@@ -22,7 +22,7 @@ _GRASS_M = 0.1
 
 
 def build(seed: int) -> World:
-    """Two long terraces back to back, with the like across the street; lamp posts keep step with the houses."""
+    """Two long terraces back to back, and the same across the street; lamp posts repeat with the houses."""
     rng = np.random.default_rng(seed)
     plan = draw_terrace_plan(rng)
     ground = street.lay_ground(rng, plan, _HILLS_M)

@@ -11,7 +11,7 @@ from lidarslam.simulation.worlds.along import FREE_SIDE_M, build_along
 from lidarslam.simulation.worlds.paths import on_ground
 from lidarslam.simulation.worlds.street import lane_of
 
-# Crossings, before some streets are left out: rows and columns, about so far apart, each moved by so much at most.
+# Crossings, before some streets are left out: rows and columns, their distance, and the largest displacement of each.
 _ROWS = 6
 _SPACING_M = (95.0, 115.0)
 _SHIFT_M = 16.0
@@ -47,10 +47,10 @@ def draw_network(rng: np.random.Generator) -> tuple[FloatArray, list[tuple[int, 
 
 
 def draw_tour(rng: np.random.Generator, crossings: int, streets: list[tuple[int, int]]) -> list[int]:
-    """The crossings along a closed drive, once through every street in either direction, which turns round nowhere.
+    """The crossings along a closed drive, once through every street in either direction, without a U-turn.
 
-    Whoever arrives by a street leaves by another, drawn for each crossing; drawn again here and there, and
-    mostly kept where the round has become longer, these ways end as a single round.
+    Each street is left by another one, drawn for each crossing; drawn again at random places, and mostly kept where the
+    round has become longer, these choices end as a single round.
     """
     around = [[b if a == node else a for a, b in streets if node in (a, b)] for node in range(crossings)]
     leaves = [_turns(rng, len(nodes)) for nodes in around]
@@ -67,7 +67,7 @@ def draw_tour(rng: np.random.Generator, crossings: int, streets: list[tuple[int,
 
 
 def _turns(rng: np.random.Generator, count: int) -> NDArray[np.intp]:
-    """(count,) the street by which to leave after arriving by each of so many, never the same."""
+    """(count,) the street by which to leave after arriving by each of `count`, never the same."""
     while True:
         leave = rng.permutation(count)
         if (leave != np.arange(count)).all():

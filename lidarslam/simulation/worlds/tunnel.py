@@ -1,4 +1,4 @@
-"""A mine in rough rock: a loop of changing width and height, side galleries, and what was left in them."""
+"""A mine in rough rock: a loop of changing width and height, side galleries, and things left in them."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -34,7 +34,7 @@ class MinePlan:
 
 
 def draw_mine(rng: np.random.Generator) -> MinePlan:
-    """A mine no two seeds share, its loop 155 to 260 m long."""
+    """A mine that is different for each seed, its loop 155 to 260 m long."""
     loop, pillars = _with_chambers(_draw_loop(rng), rng)
     galleries = [loop, _draw_cut(loop, rng)]
     for _ in range(60):
@@ -158,7 +158,7 @@ _CELL_M = 0.2
 _BORDER_M = 8.0
 # Walls lean: steeper than this and the grid would show as teeth.
 _WALL_SLOPE = 3.2
-# Half the width that is left open along the loop whatever the roughness, and the headroom over half of it.
+# Half the width that is left open along the loop for any roughness, and the headroom over half of it.
 _CORE_M, _HEADROOM_M = 1.75, 2.35
 _BEND_M = 0.12
 # Further than this from a gallery, its rock is solid whatever its width and roughness.
@@ -220,14 +220,14 @@ def _blend(plan: MinePlan, nodes: FloatArray) -> tuple[FloatArray, FloatArray, F
     weights = np.exp((depths - deepest) / 0.5)
     weights /= weights.sum(axis=0)
     floor, height = (weights * floors).sum(axis=0), (weights * heights).sum(axis=0)
-    # On the loop the floor is the loop's own, so that the way does not jerk at junctions.
+    # On the loop the floor is the loop's own, so that the path has no steps at junctions.
     share = np.exp(-((to_loop / 1.5) ** 4))
     floor = share * floors[0] + (1.0 - share) * floor
     return deepest, gaussian_filter(floor, 2.0), gaussian_filter(height, 3.0), to_loop
 
 
 def _floor_roughness(depth: FloatArray, to_loop: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Trodden flat along the way, rubble towards the walls."""
+    """Trodden flat along the path, rubble towards the walls."""
     trodden = np.clip((to_loop - 0.9) / 0.8, 0.15, 1.0)
     rubble = np.exp(-np.clip(depth, 0.0, None) / 0.6)
     fine, coarse = smooth_noise(rng, depth.shape, 1.5), smooth_noise(rng, depth.shape, 7.0)
@@ -254,7 +254,7 @@ class Stations:
         return len(self.floor)
 
     def at(self, k: int, aside: float, up: float) -> FloatArray:
-        """A point (3,) that far to the left of station k (counted round and round) and above its floor."""
+        """A point (3,) that far to the left of station k (modulo their number) and above its floor."""
         k %= len(self)
         return np.append(self.floor[k, :2] + aside * self.left[k], self.floor[k, 2] + up)
 
@@ -265,9 +265,9 @@ class Stations:
         return point
 
     def is_beside(self, point: FloatArray, reach: float) -> bool:
-        """Whether what reaches that far around a point (3,) keeps out of the free space along the way."""
+        """Whether a thing that reaches that far around a point (3,) is outside the free space along the path."""
         nearest = float(np.linalg.norm(self.floor[:, :2] - point[:2], axis=1).min())
-        # Between two stations the way is up to this much closer.
+        # Between two stations the path is up to this much closer.
         return nearest > float(np.hypot(self.free_side_m + reach + 0.05, 0.5 * _STATION_M))
 
     def wall(self, side: float, up: float) -> FloatArray:
