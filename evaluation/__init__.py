@@ -1,1 +1,1 @@
-"""How good a trajectory or a map is, against a reference."""
+"""Errors of a trajectory or a map relative to a reference."""

@@ -82,7 +82,7 @@ class MappingConfig(_Settings):
     @field_validator("method", mode="before")
     @classmethod
     def _off_is_a_word(cls, value: Any) -> Any:
-        """YAML makes false of off."""
+        """YAML parses `off` as false."""
         return "off" if value is False else value
 
     @model_validator(mode="after")
@@ -95,7 +95,7 @@ class MappingConfig(_Settings):
 
 
 class GlobalMapConfig(_Settings):
-    """The merged map that a run leaves behind."""
+    """The merged map of a run."""
 
     voxel_size_m: float | None = Field(
         None, ge=0.01, le=10.0, description="one point a voxel; null: follows the median range of the first scan"

@@ -65,10 +65,10 @@ class PlacedPoints:
 
 @dataclass(frozen=True)
 class ElevationBias:
-    """By how much all points of a sensor lie too low, in radians: raised by it, they are right."""
+    """The angle by which all points of a sensor lie too low, radians; raised by it, they are right."""
 
     angle: float
-    # standard deviations: of what differs from stretch to stretch, and of what the sensor's other errors contribute
+    # standard deviations: of the scatter between stretches, and of the contribution of the sensor's other errors
     scatter: float
     systematic: float
 

@@ -6,7 +6,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import MappingConfig
 
-# Fewer points make no pose, and no scale.
+# Least number of points for a pose, and for the scale.
 MIN_POINTS = 60
 # Cells per median range, and bounds of their size. Where walls are closer than a few metres, the cells are the
 # smallest: steps and door frames are as large in a wider stairwell.

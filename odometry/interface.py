@@ -1,4 +1,4 @@
-"""The protocol of every odometry method, and the method that measures nothing."""
+"""The protocol of every odometry method, and the method without measurements."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ class Motion:
 
     # (4, 4), from this scan's LiDAR frame to the previous one's, each at its stamp; identity for the first scan
     T_prev_curr: Annotated[FloatArray, TRANSFORM]
-    points_used: int  # how many points of the scan the estimate rests on; 0 for a prediction
+    points_used: int  # number of points of the scan that the estimate is based on; 0 for a prediction
     failure: str | None = None  # why the motion is only a prediction, None when it was measured
     # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the method has none
     covariance: Annotated[FloatArray, Shape(6, 6)] | None = None
@@ -59,7 +59,7 @@ class SkippingOdometry(Odometry, Protocol):
     """An odometry that need not be asked at every scan."""
 
     def skip(self, scan: Scan) -> None:
-        """Take a scan with points whose motion is not asked for; that of the next is since this one."""
+        """Take a scan with points whose motion is not asked for; the next motion is relative to this scan."""
 
 
 class ConstantVelocity(Stateful):

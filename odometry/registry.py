@@ -20,7 +20,7 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         ConfigError: the method is `external` and there is no prior, or the other way round; or the learned odometry's
             device, its shipped weights or the libraries for a file of weights are missing; or another package's cannot
             be loaded.
-        InputError: the learned odometry's weights are no weights.
+        InputError: the learned odometry's weights are invalid.
     """
     if (config.method == "external") != (prior is not None):
         raise ConfigError("a prior trajectory and odometry.method=external go together; give both or neither")

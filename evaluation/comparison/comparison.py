@@ -14,7 +14,7 @@ from lidarslam.evaluation.comparison.table import Table
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
 
 MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
-"""`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with what there was. The last four:
+"""`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with a partial result. The last four:
 no result but the message; `not run`: the comparison was interrupted before, or something is missing that it needs."""
 
 TimesCover = Literal["reading, registration and map", "registration"]

@@ -161,7 +161,7 @@ def judge_comparison(
 
 
 def format_gates(judged: Sequence[JudgedGate]) -> str:
-    """A line for each gate, and how many failed."""
+    """A line for each gate, and the number that failed."""
     rows = []
     for each in judged:
         sign = "<=" if each.gate.kind == "max" else ">="

@@ -25,12 +25,12 @@ class TiledMap:
     """A map in tiles, each of them with at least one point."""
 
     tiling: Tiling
-    points: dict[Tile, int]  # how many there are in each tile
+    points: dict[Tile, int]  # their number in each tile
     brightest: float  # the largest intensity in all of them
 
     @property
     def total(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return sum(self.points.values())
 
     def to_json(self) -> dict[str, float | int]:

@@ -19,7 +19,7 @@ _GROUND_M, _REFITS = 0.1, 10
 _FEWEST = 100
 # The octree's finest level; deeper ones take minutes and gigabytes.
 _DEEPEST = 12
-# Reconstructed surface farther from the points is invented.
+# Reconstructed surface farther from the points is extrapolated.
 _TRIM_CELLS = 1.0
 
 

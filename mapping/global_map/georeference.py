@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, exp, make_transform, skew
 from lidarslam.core.trajectory import Trajectory
 
-# The world's z is up to about this angle, a standard deviation: what positions on a straight line leave open.
+# Prior standard deviation of the tilt of the world's z axis, which positions on a straight line leave open.
 _TILT = float(np.deg2rad(5.0))
 _ITERATIONS = 30
 # Of the scale of the residuals: of the median of |N(0, 1)|, a floor in metres, and Cauchy's weights.

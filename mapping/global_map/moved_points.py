@@ -22,7 +22,7 @@ from lidarslam.core.state import Shape, Stateful
 
 Ranges = NDArray[np.float32]
 TWO_PI = 2.0 * math.pi
-# Of the nine pixels around a point, its own and this many in all must hold a return: glass and the sky prove nothing.
+# Of the nine pixels around a point, its own and this many in all must hold a return: glass and the sky are no evidence.
 _LEAST_RETURNS = 6
 # A return is at a point's range within this margin and a voxel: noise, errors of poses, and a surface seen at a slant.
 _MARGIN_M = 0.1
@@ -201,7 +201,7 @@ def judge(
         images, grids: (V, rows, columns) and (V, 3), the views, in random order.
         reach_m: farther points get no vote.
         voxel_size_m: of the map that the points are of.
-        least_through: of a dynamic point, how many views see through it at least.
+        least_through: least number of views that see through a dynamic point.
         moved: (M,) written.
     """
     views = len(images)

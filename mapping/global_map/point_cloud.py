@@ -222,7 +222,7 @@ def write_e57(path: Path, cloud: PointCloud) -> None:
         file.close()
 
 
-# With what they raise where a file cannot be written; laspy, its compressor and libE57Format raise anything.
+# With their exceptions where a file cannot be written; laspy, its compressor and libE57Format raise any.
 _WRITERS: dict[str, tuple[Callable[[Path, PointCloud], None], type[Exception]]] = {
     ".ply": (_write_ply, OSError),
     ".pcd": (_write_pcd, OSError),

@@ -35,8 +35,8 @@ _reach_m = compiled_part(reach_m)
 class Layout:
     """The columns of rows (N, width) besides position (3), direction to the sensor (3) and number of points."""
 
-    intensity: bool = False  # its sum, and how many points have one
-    rgb: bool = False  # the sums of red, green and blue, and how many points have them
+    intensity: bool = False  # its sum, and the number of points that have one
+    rgb: bool = False  # the sums of red, green and blue, and the number of points that have them
     # the time of the earliest point as the sum of two float32, exact to some microseconds since 1970, and its ring
     first: bool = False
 
@@ -52,12 +52,12 @@ class Layout:
 
     @property
     def summed(self) -> int:
-        """How many columns are sums, the first ones."""
+        """Number of columns that are sums, the first ones."""
         return _GEOMETRY + _INTENSITY * self.intensity + _RGB * self.rgb
 
     @property
     def width(self) -> int:
-        """How many columns there are."""
+        """Number of columns."""
         return self.summed + _FIRST * self.first
 
     def parts(self, rows: Rows) -> tuple[Rows, Rows, Rows]:
@@ -109,7 +109,7 @@ class Layout:
 
 
 def _means(sums: Rows, unknown: float) -> NDArray[np.float32]:
-    """Rows divided by their last column, how many they are of."""
+    """Rows divided by their last column, the number of points."""
     counts = sums[:, -1:]
     return np.where(counts > 0.0, sums[:, :-1] / np.maximum(counts, 1.0), np.float32(unknown))
 

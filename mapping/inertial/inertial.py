@@ -55,7 +55,7 @@ class Inertial(Stateful):
     _up_world: Annotated[FloatArray, Shape(3)] | None  # unit, as first known well
     _up_sigma: float  # radians
     _direction: GravityDirection | None
-    # of the turns that were compared: how many, and the sums of squares of their angles and of the differences
+    # of the turns that were compared: their number, and the sums of squares of their angles and of the differences
     _turns: int
     _angles2: float
     _differences2: float
@@ -75,11 +75,11 @@ class Inertial(Stateful):
         self._window.use(self._preintegration)
 
     def anew(self) -> "Inertial":
-        """A new one of the same samples."""
+        """A new instance with the same samples."""
         return Inertial(self._samples, self._extrinsics, self._lever_sigma_m)
 
     def reversed(self, about_s: float) -> "Inertial":
-        """A new one of the same samples, with time reversed about an instant."""
+        """A new instance with the same samples, with time reversed about an instant."""
         samples = self._samples
         stamps = 2.0 * about_s - samples.stamps[::-1]
         reversed_ = ImuSamples(stamps, -samples.angular_velocities[::-1], samples.accelerations[::-1])

@@ -24,7 +24,7 @@ _LINE_RATIO, _PLANE_RATIO = 3.0, 0.0225
 _FLAT_RATIO = 3.0
 # Largest distance of a plane's neighbours from it: of these, the smaller one.
 _PLANE_M, _PLANE_CELLS = 0.2, 0.5
-# Standard deviation of a range, and how many points it counts as in the scatter of few.
+# Standard deviation of a range, and the number of points it counts as in the scatter of few.
 _RANGE_NOISE_M, _COUNTED = 0.02, 2.0
 # A line or plane is as uncertain as if this many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
@@ -120,7 +120,7 @@ def match_features(
 def _nearest(
     point: FloatArray, key: int, voxels: Voxels, around: NDArray[np.int64], near: NDArray[np.int64], squared: FloatArray
 ) -> int:  # fmt: skip
-    """Write the rows of the nearest voxels to a point (3,), and their squared distances; return how many.
+    """Write the rows of the nearest voxels to a point (3,), and their squared distances; return their number.
 
     `around` (27,) holds the rows of all while their sums are prefetched.
     """
@@ -153,7 +153,7 @@ def _nearest(
 def _moments(
     point: FloatArray, near: NDArray[np.int64], sums: FloatArray, mean: FloatArray, scatter: FloatArray
 ) -> float:
-    """Write mean (3,) and covariance (6,) of the points in the nearest voxels (K,); return how many they are.
+    """Write mean (3,) and covariance (6,) of the points in the nearest voxels (K,); return their number.
 
     Sums are taken about a point (3,) nearby, for the sake of rounding.
     """

@@ -99,9 +99,9 @@ class Regions:
     Args:
         fixed_map: the map.
         cell_m: edge of the surfel cells.
-        reach_m: how far around a position a region must reach.
-        spare_m: how much farther it reaches, so that it serves other positions too.
-        kept: how many are kept.
+        reach_m: distance around a position that a region must cover.
+        spare_m: margin beyond that, so that a region serves other positions too.
+        kept: number of regions that are kept.
     """
 
     def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:

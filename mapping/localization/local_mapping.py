@@ -139,7 +139,7 @@ class LocalMapping:
         return self._count % _NEARBY_EVERY == 0
 
     def searches_anywhere(self) -> bool:
-        """Whether the whole map is to be searched now; the next search is put off."""
+        """Whether the whole map is to be searched now; the next search is postponed."""
         if self._count < self._next_search:
             return False
         self._wait = min(_GROWTH * self._wait, float(_LONGEST))

@@ -21,10 +21,10 @@ from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
 
-# Places around a supposed one that are tried: how far, in cells, and turned by how much.
+# Places around a supposed one that are tried: distance, in cells, and turn.
 _NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
 # Radius of the view from above and of the points that are registered, in median ranges; places that are
-# tried, and how many of one heading.
+# tried, and the largest number with one heading.
 _RANGES, _PLACES, _PEAKS = 3.0, 32, 8
 # Points that are registered first, and the share of the best quality above which all points are.
 _FEW_POINTS, _LIKELY = 500, 0.5
@@ -32,7 +32,7 @@ _FEW_POINTS, _LIKELY = 500, 0.5
 _PROMISING = 16
 # A region of the map serves several places: it is larger than the scans' reach by this factor. Number of them kept.
 _SPARE, _REGIONS = 1.5, 8
-# Other scans that must fit, and their largest distance and angle from where the recording's own motion puts them.
+# Other scans that must fit, and their largest deviation from the recording's own motion: angle and distance.
 _OTHERS = 5
 _MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
 # Standard deviations of a place that may be anywhere near, and of one that follows from another: radians, metres.
@@ -193,7 +193,7 @@ class PlaceSearch:
         return self.among(scans, list(complete(best_starts(latest.keypoints, np.concatenate(starts), region))))
 
     def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: Regions) -> Place:
-        """A place with the fits of the other scans; none where one is off from where the motion puts it."""
+        """A place with the fits of the other scans; none where one contradicts the motion between the scans."""
         fits, last, T_map_last = list(place.fits), kept[0], place.T_map_lidar
         for scan in kept[1:]:
             motion = inverse(last.T_local_lidar) @ scan.T_local_lidar
@@ -236,7 +236,7 @@ def _decided(places: Sequence[Place]) -> Search:
 
 
 def _is_off(start: FloatArray, found: FloatArray, motion: FloatArray, cell_m: float) -> bool:
-    """Whether a scan was registered elsewhere than where the motion (4, 4) from another one puts it."""
+    """Whether the registered pose of a scan contradicts the motion (4, 4) from another one."""
     off, way_m = inverse(start) @ found, float(np.linalg.norm(motion[:3, 3]))
     far = np.linalg.norm(off[:3, 3]) > _MOST_SHIFT_CELLS * cell_m + _MOST_SHIFT_SHARE * way_m
     return bool(far or rotation_angle(off) > _MOST_TURN)

@@ -58,7 +58,7 @@ class BirdEyeView:
 
 
 def compare(descriptor: NDArray[np.complex64], others: NDArray[np.complex64]) -> tuple[FloatArray, FloatArray]:
-    """Similarities (M,), at most 1, with other descriptors (M, ...), and by how much (M,) the sensor has turned.
+    """Similarities (M,), at most 1, with other descriptors (M, ...), and the turns (M,) of the sensor.
 
     The turn, in radians from 0 to pi, may be half a turn more.
     """

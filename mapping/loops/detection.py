@@ -1,6 +1,6 @@
 """Loop detection: candidates for each new keyframe, verified one by one, accepted when they are consistent.
 
-Precision comes before recall: a false closure tears a map apart, a missed one leaves it as good as it was. A closure
+Precision comes before recall: a false closure corrupts the map, a missed one leaves it unchanged. A closure
 that drift cannot explain is rejected within a segment; where tracking was lost, a new segment begins.
 """
 
@@ -30,7 +30,7 @@ _ALONE_RANGES = 0.5
 _CONSISTENT, _SPAN_RANGES = 2, 1.0
 # Distance after which a closure that no other is consistent with is rejected.
 _PENDING_M = 100.0
-# A cycle whose standard deviation exceeds this part of the median range closes whatever the links are.
+# A cycle whose standard deviation exceeds this part of the median range closes for any links.
 _SIGNIFICANT_RANGES = 0.25
 # A closure by appearance needs this many times the support of its rivals, of which the last count.
 _OUTVOTED = 3

@@ -43,7 +43,7 @@ def recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDA
 def in_frames(poses: FloatArray, frames: NDArray[np.intp], registered: FloatArray) -> FloatArray:
     """Keyframe poses (K, 4, 4) moved rigidly for each frame (K,), its first keyframe to its registered pose (K, 4, 4).
 
-    An outlier closure may have moved a component that no edge takes back.
+    An outlier closure may have moved a component that no edge moves back.
     """
     moved = poses.copy()
     for frame in np.unique(frames):

@@ -14,7 +14,7 @@ from lidarslam.mapping.surfels.voxel_hash import key_steps, point_keys
 
 # The spacing follows the scene: the median range over this, within these limits.
 _RANGES_APART, _LEAST_M, _MOST_M = 4.0, 0.5, 4.0
-# The next keyframe is due when less of a scan lies where the last one saw something.
+# The next keyframe is due when less than this share of a scan lies where the last keyframe saw something.
 _LEAST_OVERLAP = 0.5
 # Cells in which two scans are compared, as a part of the median range; finer ones differ from noise alone.
 _CELL_RANGES = 0.1
@@ -41,7 +41,7 @@ class GraphScan:
 class Keyframe:
     """A keyframe of the pose graph."""
 
-    scan: int  # which of all scans
+    scan: int  # its index among all scans
     segment: int  # stretch of continuous tracking, across which no drift model holds
     path_m: float  # path length from the recording's start
     # (6, 6) of its registration to the map, rotation first; None when it was not registered
@@ -74,7 +74,7 @@ class KeyframeSelector(Stateful):
         )
 
     def take(self, T_world_lidar: FloatArray, points: FloatArray) -> None:
-        """This scan is the last keyframe now."""
+        """Make this scan the last keyframe."""
         self._T_world_keyframe = T_world_lidar
         range_m = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 1.0
         follows = float(np.clip(range_m / _RANGES_APART, _LEAST_M, _MOST_M))

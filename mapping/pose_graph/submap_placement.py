@@ -1,6 +1,6 @@
 """The running local map, rebuilt after a loop closure: submaps at their corrected places around the sensor.
 
-Scans are registered in a frame without jumps, in which the first visit of a place lies where drift has put it, or is
+Scans are registered in a frame without jumps, in which the first visit of a place lies displaced by drift, or is
 forgotten. After a closure the submaps around the sensor are placed as in the corrected graph relative to the
 latest keyframe, so that the surfaces of both visits coincide.
 """
@@ -72,7 +72,7 @@ class SubmapPlacement(Stateful):
         return len(self._poses)
 
     def follow(self, T_odom_keyframe: FloatArray) -> None:
-        """The next keyframe begins; what is beyond the radius is forgotten."""
+        """The next keyframe begins; submaps beyond the radius are forgotten."""
         self._held.append(len(self._poses))
         self._poses.append(T_odom_keyframe)
         near = self._distances(np.array([self._poses[key] for key in self._held])) < self.radius_m

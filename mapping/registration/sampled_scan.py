@@ -16,7 +16,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
 
-# Fewer keypoints, or correspondences of them, make no pose.
+# Least number of keypoints, and of their correspondences, for a pose.
 MIN_CORRESPONDENCES = MIN_POINTS
 # Spacing of the keypoints, in cells.
 _KEYPOINT_SPACING = 2.5

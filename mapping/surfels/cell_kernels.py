@@ -121,7 +121,7 @@ def add_moments(
 
 @compiled
 def within(keys: Keys, cell_m: float, centre: FloatArray, radius_m: float, rows: NDArray[np.intp]) -> int:
-    """Write which cells (M,) have their centres within a radius of a point (3,), ascending; return how many."""
+    """Write which cells (M,) have their centres within a radius of a point (3,), ascending; return their number."""
     count = 0
     for n in range(len(keys)):
         x, y, z = middle_of(keys[n])

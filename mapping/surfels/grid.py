@@ -83,7 +83,7 @@ class SurfelGrid(Stateful):
             points: in the world.
             elevations: (N,) their angles above the sensor's equator, radians.
             views: (N, 3) unit directions from the points to the sensor.
-            weight: how many points each of them counts as.
+            weight: number of points that each of them counts as.
         """
         if not len(points):
             return

@@ -27,7 +27,7 @@ ORIGIN = OFFSET * (STRIDE_X + STRIDE_Y + 1)
 _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
 _ABOVE_BITS = 3
 OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
-# How many elements ahead loops prefetch.
+# Number of elements ahead that loops prefetch.
 PREFETCHED = 16
 
 

@@ -29,7 +29,7 @@ def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: floa
         points: in the LiDAR frame.
         elevations: (N,) above the sensor's equator, radians.
         cell_m: of the map.
-        most: how many at most.
+        most: largest number of indices.
     """
     points, origin = np.ascontiguousarray(points), np.zeros(3)
     views = np.empty((len(points), 3), dtype=np.float32)

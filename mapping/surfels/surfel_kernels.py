@@ -18,9 +18,9 @@ from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenve
 _TOGETHER = 16
 # A surfel is computed again when its cell has grown by this factor.
 _GROWTH = np.float32(1.5)
-# By how much less a neighbouring cell's points weigh, for each coordinate in which it differs.
+# Decrease of the weight of a neighbouring cell's points, for each coordinate in which it differs.
 _LESS_PER_AXIS = 0.2
-# Fewer points make no plane.
+# Least number of points of a plane.
 _FEWEST_POINTS = 6
 # Sine of the least angle to a plane at which one of its sides is seen.
 _LEAST_SINE = 0.17

@@ -1,4 +1,4 @@
-"""The result of a registration attempt, and how good it is."""
+"""The result of a registration attempt, and its quality."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from lidarslam.mapping.tracking.fit import Fit
 # A correction beyond this many standard deviations of the prediction, and beyond degrees and metres, is a jump.
 _MOST_SIGMAS = 5.0
 _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
-# How much faster than predicted a sensor may move and turn, m/s and rad/s, and for how long after it was tracked; then
+# Speeds beyond the predicted ones, m/s and rad/s, that a sensor may have for this time after it was tracked; then
 # it may have been carried anywhere. The same where a consistent odometry measured the motion since.
 _MORE_SPEED_M_S, _MORE_TURN_RAD_S, _REACH_S = 3.0, np.deg2rad(200.0), 1.0
 _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S = 0.3, np.deg2rad(20.0), 3.0

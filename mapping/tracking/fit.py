@@ -23,8 +23,8 @@ _HALF_CELLS = 0.5
 _RIDGE = 0.001
 # Standard deviation of a range: thicker surfaces, as planes across an edge, count less.
 _RANGE_NOISE_M = 0.02
-# Along a direction, inliers constrain the translation by this many times what the noise of their normals would, or
-# hardly. In a corridor with little in it, that is 3 to 14 at true poses; at wrong ones in fields, 3 to 8; elsewhere
+# Least information of inliers on the translation along a direction, relative to that feigned by the noise of their
+# normals. In a corridor with little in it, that is 3 to 14 at true poses; at wrong ones in fields, 3 to 8; elsewhere
 # over 20.
 _LEAST_EVIDENCE = 7.0
 
@@ -42,8 +42,8 @@ class Fit:
     # the inlier ratio of the points that constrain the least supported direction of translation: most points fit
     # wherever a scan slides along a street, the constraining ones do not. None when there are none.
     support: float | None = None
-    # information of the inliers along the least constrained direction of translation, in units of what the noise of
-    # their normals would feign; None where that noise is unknown, or there are none.
+    # information of the inliers along the least constrained direction of translation, relative to that feigned by the
+    # noise of their normals; None where that noise is unknown, or there are none.
     evidence: float | None = None
     weakest: tuple[float, float, float] | None = None  # that direction, unit, in the world
 
@@ -58,7 +58,7 @@ class Fit:
             distances: (M,) of the matched points from their surfaces.
             normals: (M, 3) unit, of the surfaces, in the world.
             ranges: (M,) of the matched points from the sensor.
-            points: how many there are, with and without a correspondence.
+            points: their number, with and without a correspondence.
             cell_m: spacing of the map.
             thickness_m, tilt: (M,) standard deviations of the surfaces along their normals, and of the normals in
                 radians; None where they are unknown.
@@ -134,7 +134,7 @@ NO_FIT = Fit(0, 0.0, None, None)
 
 
 def directional_support(normals: FloatArray, distances: FloatArray) -> float:
-    """The least inlier ratio over all directions of translation, points weighted by how much they constrain it.
+    """The least inlier ratio over all directions of translation, points weighted by their constraint on it.
 
     The smallest generalised eigenvalue of the sums of `n n^T` over the points, with and without inlier weights.
 

@@ -59,7 +59,7 @@ class Mapper(Stateful):
     Args:
         config: of the mapping.
         clock: seconds, for the budget of a scan.
-        kept_scans: how many of the latest scans are kept, for `redraw`.
+        kept_scans: number of the latest scans that are kept, for `redraw`.
     """
 
     _sampler: Sampler
@@ -150,7 +150,7 @@ class Mapper(Stateful):
         """Replace the local map of surfels by a rebuilt one without the latest `scans` scans, which are then inserted.
 
         Returns:
-            False where another map has begun since, or a search of the map is under way: the map stays.
+            False where another map has begun since, or a search of the map is in progress: the map stays.
         """
         if self._map is None or self._tracker.is_searching or self._map_since > self._scans - scans:
             return False

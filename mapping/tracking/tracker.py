@@ -39,7 +39,7 @@ _FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
 # offices, streets and crowds none. There an odometry counts with at most this many times its own standard deviations,
 # after motions of fewer cells than this: after longer ones it may itself be off by a step.
 _WEAK_SUPPORT, _WEAK_EVIDENCE, _WEAK_CAUTION, _WEAK_CELLS = 0.65, 40.0, 2.0, 2.0
-# Where even less constrains it, as in a corridor, nothing but the prediction does: evidence in units of the least.
+# Where even less constrains it, as in a corridor, only the prediction does: evidence in units of the least.
 _LEAST_CONSTRAINT = 2.0
 # Factors by which the quality of a result with any acceleration, and with any displacement, must be better.
 _BETTER, _CLEARLY_BETTER = 1.05, 1.1

@@ -1,4 +1,4 @@
-"""Tracking state: how certain the sensor's pose is, and therefore how widely the next scan is searched."""
+"""Tracking state: the certainty of the sensor's pose, and therefore the extent of the search for the next scan."""
 
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status

@@ -100,7 +100,7 @@ class Alignment:
     explained: float
     weakest: FloatArray  # (3,) that direction, unit, in the previous frame
     residual_m: float  # root mean square of the inliers
-    inliers: int  # how many
+    inliers: int  # their number
 
 
 def align(start: InitialEstimate, sweeps: SweepPair, effort: Effort = NORMAL) -> Alignment:
@@ -269,7 +269,7 @@ def find_degeneracy(information: FloatArray, inliers: int, images: SweepImages) 
 
     Args:
         information: (6, 6) sum over the inliers of squared Jacobians, rotation first.
-        inliers: how many.
+        inliers: their number.
         images: of the current sweep; its median range is the lever of rotations, its ranges the noise of normals.
     """
     if images.share_with_normal() < _MOST:

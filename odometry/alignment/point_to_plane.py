@@ -3,7 +3,7 @@
 Each point of the current sweep corresponds to the pixel of the previous one that it is projected into. The pixels are
 as measured, each at its own time: points are taken to that time, projected, and compared there.
 
-Points are worked on in blocks, of which a processor takes eight numbers of single precision at once: each quantity of a
+Points are worked on in blocks, which are vectorised, eight numbers of single precision at a time: each quantity of a
 block lies in a part of one array, so that the compiler sees that no two overlap.
 """
 
@@ -21,8 +21,7 @@ from lidarslam.odometry.images.sweep_images import SweepImages
 
 # Points that are worked on together.
 _BLOCK = 256
-# From one quantity of a block to the next. Were it a power of two, the processor would take a store for what the next
-# load needs, and wait.
+# From one quantity of a block to the next. Were it a power of two, loads would wait for stores to other quantities.
 _STRIDE = _BLOCK + 32
 # Where the quantities of a block begin. Of the points: coordinates, normals and seconds from the middle of the sweep.
 _POINT_X, _POINT_Y, _POINT_Z, _POINT_U, _POINT_V, _POINT_W, _POINT_T = (n * _STRIDE for n in range(7))
@@ -213,7 +212,7 @@ def _sum_up(
             in view and of inliers.
 
     Returns:
-        How many points are in view, and how many are inliers.
+        Number of points in view, and of inliers.
     """
     work = np.zeros(_SIZE, dtype=np.float32)
     seen, matches = 0, 0
@@ -289,7 +288,7 @@ def _products(size: int, first: int, second: int, by: int, work: Floats) -> tupl
 
 @compiled_part
 def _mirror(total: FloatArray, in_view: FloatArray, inlier: FloatArray) -> None:
-    """Complete the sums from what is above the diagonals of their blocks."""
+    """Complete the sums from the upper triangles of their blocks."""
     for p in range(6):
         for q in range(p):
             total[p, q + 6] = total[q, p + 6]
@@ -312,7 +311,7 @@ class InlierSums:
     # share_in_view, inlier_share: of the points with a normal
     share_in_view: float
     inlier_share: float
-    inliers: int  # how many
+    inliers: int  # their number
     squared_residuals: float  # their sum
 
 

@@ -14,18 +14,17 @@ from lidarslam.core.compiled import compiled, compiled_part
 
 Floats = NDArray[np.float32]
 
-# All in single precision, of which a processor does twice as many at once.
+# All in single precision, for twice as many numbers per vector instruction.
 _ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0))
 _TINY, _FAR = np.float32(1e-30), np.float32(np.inf)
 # A patch narrower than this share of its range is narrower than the rounding of its coordinates.
 _NARROWEST = np.float32(1e-5)
 # Range noise spreads the points of a single ring over a plane that holds the rays themselves. Such a plane, 2.3
-# degrees or less from the ray, is no surface, and which of its sides faces the sensor is chance.
+# degrees or less from the ray, is no surface, and the side that faces the sensor is random.
 _MOST_GRAZING = np.float32(0.04)
-# Pixels of a row that are fitted together, so that the processor takes several at once.
+# Pixels of a row that are fitted together, in vectorised loops.
 _BLOCK = 240
-# From one quantity of a block to the next. Were it a power of two, the processor would take a store for what the next
-# load needs, and wait.
+# From one quantity of a block to the next. Were it a power of two, loads would wait for stores to other quantities.
 _STRIDE = _BLOCK + 32
 # Neighbours that are added together, in registers.
 _AT_ONCE = 3
@@ -156,7 +155,7 @@ def _add(
 ) -> None:  # fmt: skip
     """Add neighbours of each pixel that are next to each other in a row to the moments, `count` of three at most.
 
-    One of them may be the pixel itself. The more at once, the less often moments are read and written.
+    One of them may be the pixel itself. The more of them, the less often moments are read and written.
     """
     for k in range(size):
         px, py, pz, distance = work[k], work[_STRIDE + k], work[2 * _STRIDE + k], work[3 * _STRIDE + k]
@@ -184,7 +183,7 @@ def _add(
 def _fit(size: int, work: Floats, patch: Patch, found: Floats) -> None:
     """Write the normals (3 * STRIDE,) of a block of pixels by the moments of their neighbours; zero without a plane.
 
-    Without branches, so that the processor takes several at once. The smallest eigenvalue is the root of the
+    Without branches, so that the loop is vectorised. The smallest eigenvalue is the root of the
     characteristic polynomial that Newton's method finds from below; of a plane, in few steps. Where it is not small the
     answer is too small, and still too large for a plane.
     """

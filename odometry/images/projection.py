@@ -143,7 +143,7 @@ def _keep_nearest(
                 inside = row >= 0.0 and row < height
                 pixel = int(row) * width + int(column_of(math.atan2(py, px), width)) if inside else _OUTSIDE
             if pixel != _OUTSIDE:
-                # Without a branch on which is nearer, which no processor would predict.
+                # Without a branch on which is nearer, which would be mispredicted.
                 nearest[pixel] = min(nearest[pixel], (np.int64(bits[i]) << _INDEX_BITS) | i)
 
 
@@ -152,7 +152,7 @@ def _find_pixels(
     ranges: Floats, elevations: Floats, azimuths: Floats, height: int, width: int, low: float, per_radian: float,
     pixels: NDArray[np.int32],
 ) -> None:  # fmt: skip
-    """Write the pixels of a block of points in a loop that takes several at once, OUTSIDE or UNSURE."""
+    """Write the pixels of a block of points in a vectorised loop, OUTSIDE or UNSURE."""
     rows, columns, lowest = np.float32(height), np.float32(width), np.float32(low)
     rows_per_radian, columns_per_radian = np.float32(per_radian), np.float32(width / _TURN)
     for k in range(len(ranges)):
@@ -195,7 +195,7 @@ def column_of(azimuth: float, width: int) -> float:
 
 @compiled
 def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: Floats) -> None:
-    """Write the angles of points to single precision, in loops each of which takes several at once."""
+    """Write the angles of points to single precision, in vectorised loops."""
     for i in range(len(x)):
         elevations[i] = arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
     for i in range(len(x)):
@@ -204,7 +204,7 @@ def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: 
 
 @compiled_part
 def arc_tangent(y: np.float32, x: np.float32) -> np.float32:
-    """atan2 in single precision without branches, so that the processor takes several at once; NaN for NaN.
+    """atan2 in single precision without branches, so that loops are vectorised; NaN for NaN.
 
     Cephes Mathematical Library, atanf.c (Moshier, 1989).
     """

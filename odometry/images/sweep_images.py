@@ -66,7 +66,7 @@ class SweepImages:
         return float((1.0 / squares).mean()) if len(squares) else 0.0
 
     def with_normal(self) -> int:
-        """How many pixels have a normal."""
+        """Number of pixels with a normal."""
         return _filled(self.normals)
 
     def share_with_normal(self) -> float:
@@ -75,7 +75,7 @@ class SweepImages:
 
 
 def _filled(image: Floats) -> int:
-    """How many pixels of an image (3, H, W) are not zero."""
+    """Number of pixels of an image (3, H, W) that are not zero."""
     x, y, z = image != 0.0
     return int(np.count_nonzero(x | y | z))
 
@@ -159,7 +159,7 @@ def _fill_near(normals: Floats, ranges: Floats, wider: Floats, wider_ranges: Flo
 
 
 def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageGrid) -> int:
-    """How many rows an image can have without many of its pixels being empty, from those of the grid to 64.
+    """Largest number of rows of an image with few empty pixels, from those of the grid to 64.
 
     As many as there are rings, where these are known; else as many as are filled as well as the rows of the grid.
     """

@@ -35,7 +35,7 @@ _MAX_POINTS = 20_000
 
 @dataclass(frozen=True)
 class Consistency:
-    """How well a scan fits the previous one."""
+    """Fit of a scan to the previous one."""
 
     residual_m: float | None  # median point-to-plane distance; None with too few planes
     inlier_ratio: float | None  # of the points that have a plane, 0 to 1; None likewise

@@ -23,7 +23,7 @@ class ExternalOdometry(Stateful):
 
     Args:
         trajectory: T_odom_lidar at its own stamps; its world does not matter, only its motions do.
-        tolerance_s: how far outside the trajectory's time a scan may lie and still be extrapolated.
+        tolerance_s: largest time outside the trajectory's over which a scan is extrapolated.
         largest_interval_s: a scan in a longer gap between two poses is not covered; None: a second, or five times the
             trajectory's median step where that is longer.
 
@@ -62,7 +62,7 @@ class ExternalOdometry(Stateful):
 
     @property
     def warning(self) -> str | None:
-        """How many scans had no pose; None where all had."""
+        """Warning with the number of scans without a pose; None where all had one."""
         return f"the prior does not cover {self._uncovered} of {self._scans} scans" if self._uncovered else None
 
     def estimate(self, scan: Scan) -> Motion:

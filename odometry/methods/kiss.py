@@ -123,7 +123,7 @@ class KissOdometry:
             self._worker = None
 
     def _points_in_range(self, scan: Scan) -> int:
-        """How many points the library uses."""
+        """Number of points that the library uses."""
         ranges = np.linalg.norm(scan.points, axis=1)
         return int(((ranges > self._config.min_range_m) & (ranges < self._config.max_range_m)).sum())
 
@@ -137,8 +137,8 @@ class KissOdometry:
         """The instant of KISS-ICP's next pose.
 
         It moves every point to the end of the sweep with the motion before. The first two scans come before any
-        motion is known and stay smeared over the sweep, as all do without deskewing: what is registered then is the
-        sweep's middle.
+        motion is known and stay smeared over the sweep, as all do without deskewing: the registered pose is
+        that of the sweep's middle.
         """
         if self._registered < 2 or not len(offsets):
             return scan.stamp + scan.middle_offset_s
@@ -176,7 +176,7 @@ class KissOdometry:
         return Motion(inverse(previous.T_map_lidar) @ self._previous.T_map_lidar, 0, failure)
 
     def _bury_worker(self) -> str:
-        """After the child died; the next scan begins an empty map. Returns the message."""
+        """Clean up after the child died; the next scan begins an empty map. Returns the message."""
         status = self._worker.close() if self._worker is not None else 0
         self._worker, self._last, self._registered = None, None, 0
         message = f"KISS-ICP's process ended (status {status}); it starts again with an empty map"

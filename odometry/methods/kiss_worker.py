@@ -54,7 +54,7 @@ def receive(stream: IO[bytes]) -> NDArray[Any]:
 
 
 def main() -> None:
-    """Serve on the standard streams; whatever the library prints goes to standard error."""
+    """Serve on the standard streams; the library's output goes to standard error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends this process
     requests, replies = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

@@ -124,7 +124,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """Read weights and check that they fit their network.
 
     Raises:
-        InputError: there is no such file, it is none of ours, or its weights do not fit or are not finite.
+        InputError: there is no such file, it is no file of weights, or its weights do not fit or are not finite.
     """
     weights, content = read_tensor_file(path, WEIGHTS)
     try:

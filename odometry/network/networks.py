@@ -385,7 +385,7 @@ def _head(outputs: int) -> nn.Sequential:
 @torch.no_grad()
 def _initialise(network: DeloraNetwork) -> None:
     """Kaiming's normal weights by fan-out for the convolutions, and a first answer close to the identity."""
-    # The gain of relu for tanh as well, as ResNets have it: without normalisation a smaller one lets signals die out.
+    # The gain of relu for tanh as well, as ResNets have it: without normalisation a smaller one makes signals vanish.
     draw = partial(nn.init.kaiming_normal_, mode="fan_out", nonlinearity="relu")
     for module in network.modules():
         if isinstance(module, nn.Conv2d):

@@ -11,7 +11,7 @@ def default_weights() -> Path:
     """The file of weights, for training and for accelerators.
 
     Raises:
-        ConfigError: it came without.
+        ConfigError: the program was installed without it.
     """
     return _required("correlation.safetensors")
 

@@ -48,7 +48,7 @@ AUGMENTATION = Augmentation()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PairBatch(PairImages):
-    """B pairs of scans: the raw sweeps, which the network sees, and what the losses compare."""
+    """B pairs of scans: the raw sweeps, which the network sees, and the surfaces that the losses compare."""
 
     # previous_surfaces, current_surfaces: (B, 6, H, W) points and normals as of the middle of each sweep; None
     # where the losses do not need them

@@ -30,7 +30,7 @@ class Validation:
     rotation_median_deg: float
     translation_median_m: float
     covered_percent: tuple[float, float, float]  # of the errors that lie within one, two and three standard deviations
-    pairs: int  # how many; without any, all else is not a number
+    pairs: int  # their number; without any, all else is NaN
 
 
 def learning_rate(step: int, config: TrainingConfig) -> float:
