@@ -33,7 +33,7 @@ _KEPT, FEWEST_COMPARED, MOST_CORRECTIONS = 600, 30, 3
 _CLOCK_SIGMA_S = 0.001
 # Turns about an axis are observed where their power is this many times that of errors; axes that agree correlate.
 _CLEAR, _CORRELATED = 100.0, 0.8
-# Accelerations are reversed where their ratio is below this, and below zero by this many standard deviations.
+# Accelerations are reversed where their ratio is below minus this, and below zero by this many standard deviations.
 _REVERSED, _DEVIATIONS = 0.3, 4.0
 _REWEIGHTED = 8
 _AXES = np.array(["x", "y", "z"])

@@ -25,8 +25,8 @@ def inflation_of_small(
 ) -> FloatArray | None:
     """Factors (N,) on the standard deviations of the points' surfaces, larger for small ones; None where these agree.
 
-    Relative to a crowd that walks along, a sensor is at rest; only walls, floor and ceiling differ. In a bare corridor or
-    a stairwell, large surfaces do not suffice for a pose, and small ones count in full.
+    Relative to a crowd that walks along, a sensor is at rest; only walls, floor and ceiling differ. In a bare corridor
+    or a stairwell, large surfaces do not suffice for a pose, and small ones count in full.
 
     Args:
         points: (N, 3) in the LiDAR frame.
