@@ -27,7 +27,7 @@ _NARROW = 0.06
 _POLE = 0.7
 # Pixels of the range image: 3 degrees of azimuth and elevation.
 PIXELS = (120, 60)
-# Largest angle between "up" and the sensor's axis.
+# Cosine of the largest angle between "up" and the sensor's axis.
 _LARGEST_TILT = np.cos(np.deg2rad(45.0))
 # Submaps that stay in memory, those used last: about 15 MB.
 _KEPT = 256

@@ -201,7 +201,7 @@ class Verification:
     # (6, 6) of xi in `T_true = T_target_source @ exp(xi)`; that of the guess along degenerate directions
     covariance: FloatArray
     overlap: float  # inliers among the points that either side sees of the other; the worse side
-    information: float  # the same, weighed by information on the worst constrained direction of translation
+    information: float  # the same, weighed by information, for the direction of translation with the least share
     residual_m: float  # root mean square residual of the inliers
     inlier_ratio: float  # inliers among the source's points
     inliers: int  # their number
