@@ -135,7 +135,7 @@ def execute(
     """Localise, and write the run directory; the map is only read.
 
     Args:
-        request: what is localised, and where.
+        request: the recording, and the map to localise it in.
         progress: called after every scan.
         phase: called with a short text on the progress before the first scan and after the last.
         page: shows it in browsers, with `rerun="web"`.
@@ -219,7 +219,7 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
 
 
 def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
-    """A localisation in a few lines: where it was found, what was tracked, what was lost, and where the files are."""
+    """A localisation in a few lines: where it was found, tracked and lost scans, and where the files are."""
     return joined(_lines(request, outcome))
 
 

@@ -107,7 +107,7 @@ class LidarSlam(Pipeline):
 
 
 def main() -> None:
-    """Run evalio's command line, which goes without Rerun: of rerun-sdk 0.41, evalio 0.6.1 fails to load."""
+    """Run evalio's command line, without Rerun: evalio 0.6.1 fails to load rerun-sdk 0.41."""
     sys.modules["rerun"] = None  # type: ignore[assignment]
     register_pipeline(LidarSlam)  # before the command line, which lists the pipelines when it is loaded
     from evalio.cli import app

@@ -21,7 +21,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """The errors of a trajectory, and of its map where there is a reference for it: the content of metrics.json.
 
-    Nothing is written. What cannot be computed is None.
+    Nothing is written. Errors that cannot be computed are None.
 
     Args:
         estimate: a trajectory; the path of one in TUM or KITTI text; or a run directory.

@@ -214,7 +214,7 @@ def load_reference_map(path: Path) -> ReferenceMap:
 
 
 def find_reference_map(source: Path) -> ReferenceMap | None:
-    """The exact map of a simulated recording, which lies in its folder; None of any other.
+    """The exact map of a simulated recording, which is in its folder; None of any other.
 
     Raises:
         InputError: it cannot be read.

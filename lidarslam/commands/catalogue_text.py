@@ -26,7 +26,7 @@ _TRIED = {
     "not yet": "not yet run",
 }
 _WIDTH = 100
-# How deep recordings are searched for, and among how many entries of a folder.
+# Depth of the search for recordings, and the largest number of entries of a folder.
 _DEPTH, _MOST_ENTRIES = 3, 1000
 
 

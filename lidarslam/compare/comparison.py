@@ -253,7 +253,7 @@ def run_task(task: MethodTask) -> MethodDone:
             fetch(task.url, request.source)
         if task.is_remote:
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarslam-")))
-            # The last two parts stand in the result.
+            # The last two parts are in the result.
             request = replace(request, out=place / request.out.parent.name / request.out.name)
         run = replace(task.run, request=request)
         result, _ = run_method(run, task.limits, lambda *_: None, task.command or COMMAND)

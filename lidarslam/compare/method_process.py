@@ -1,6 +1,6 @@
 """One method of a comparison in a process of its own: a run that reports its progress.
 
-The arguments are the folder to stand in, the peer's name or nothing, its maximum range or nothing, and the request as
+The arguments are the working directory, the peer's name or nothing, its maximum range or nothing, and the request as
 JSON. After every scan a line goes to standard output: its number from 1, and the total. Libraries' output goes
 to standard error. The exit status is that of `lidarslam run`.
 """

@@ -83,7 +83,7 @@ def run_method(
 
 
 def clear(folder: Path) -> None:
-    """Make a method's directory, or remove what a run of an earlier comparison left there."""
+    """Make a method's directory, or remove the files of a run of an earlier comparison."""
     for one in (folder.parent, folder):
         if one.is_symlink():  # its target is not of this comparison
             one.unlink()

@@ -23,7 +23,7 @@ from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, PoseGraphCo
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.storage.directory import RUN_SECTION
 
-# Sections of config.yaml that are not settings: what was run, and what was trained on.
+# Sections of config.yaml that are not settings: they describe the run, and the training data.
 SOURCES_SECTION = "trained_on"
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
 
@@ -193,7 +193,7 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 
 
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
-    """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
+    """All faults in one line: the key, the fault, and for a misspelt key the likely one."""
     # A value that may be one of several kinds has a fault for each, of which the first one has the bounds.
     texts = (_explain_fault(fault, model) for fault in reversed(error.errors(include_url=False)))
     explained = [*{text.partition(": ")[0]: text for text in texts}.values()][::-1]
@@ -221,7 +221,7 @@ def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, FieldInfo | None]:
-    """The setting at a place, None of a section, and how many keys lead to it: a kind or an index may follow."""
+    """The setting at a place, None of a section, and the number of keys to it: a kind or an index may follow."""
     section, field = model, None
     for depth, key in enumerate(location):
         if key not in section.model_fields:

@@ -40,7 +40,7 @@ class YamlError(ConfigError):
 class _StrictLoader(yaml.SafeLoader):
     """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one, and texts with NUL.
 
-    What is no decimal number is a text.
+    Any value that is no decimal number is a text.
     """
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
@@ -138,7 +138,7 @@ def _flow(value: Any) -> str:
 
 
 def bounds_of(field: FieldInfo) -> tuple[float, float] | None:
-    """The least and the largest value of a number, also where it may be null or lies in a tuple; None of no number."""
+    """The least and the largest value of a number, also where it may be null or is in a tuple; None of no number."""
     marks = list(_marks(field.metadata, field.annotation))
     low = next((mark.ge for mark in marks if isinstance(mark, Ge)), None)
     high = next((mark.le for mark in marks if isinstance(mark, Le)), None)

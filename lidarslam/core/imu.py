@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 
-# Median of the specific force's size, m/s^2: what is carried feels gravity on average.
+# Median of the specific force's size, m/s^2: a carried sensor measures gravity on average.
 GRAVITY_RANGE = (7.0, 15.0)
 
 
@@ -18,7 +18,7 @@ class ImuSamples:
     angular_velocities: FloatArray  # (N, 3) rad/s, with the gyroscope's bias
     accelerations: FloatArray  # (N, 3) specific force, m/s^2: about +9.8 along the axis that points up at rest
     T_lidar_imu: FloatArray | None = None  # (4, 4) extrinsic calibration; None where the recording has none
-    notes: tuple[str, ...] = ()  # what was inferred about them or repaired, one sentence each
+    notes: tuple[str, ...] = ()  # inferences about them and repairs, one sentence each
 
     def __post_init__(self) -> None:
         expected = (len(self.stamps), 3)

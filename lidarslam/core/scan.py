@@ -62,11 +62,11 @@ class Scan:
     time_offsets: Annotated[FloatArray, Shape(None)] | None = None
     # (N,) int32, the laser each point came from; None when unknown
     rings: Annotated[NDArray[np.int32], Shape(None)] | None = None
-    dropped: int = 0  # how many points of the raw sweep were left out as invalid
+    dropped: int = 0  # number of points of the raw sweep that were left out as invalid
     # (N,) as recorded, on whatever scale; None when unknown
     intensities: Annotated[NDArray[np.float32], Shape(None)] | None = None
     colours: Annotated[NDArray[np.uint8], Shape(None, 3)] | None = None  # (N, 3) red, green, blue; None when unknown
-    untimed: int = 0  # how many points had no time of their own and got one between those of their neighbours
+    untimed: int = 0  # number of points whose missing time was interpolated between those of their neighbours
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -186,7 +186,7 @@ def _write_squared_ranges(points: FloatArray, squared: FloatArray) -> None:
 
 @compiled
 def _find_valid(points: FloatArray, valid: NDArray[np.bool_]) -> int:
-    """Write which points (N, 3) are valid: finite, not at the origin, within 10 km; return how many are not."""
+    """Write which points (N, 3) are valid: finite, not at the origin, within 10 km; return the number of others."""
     dropped = 0
     for n in range(len(points)):
         x, y, z = abs(points[n, 0]), abs(points[n, 1]), abs(points[n, 2])
@@ -242,7 +242,7 @@ class ScanSequence(Protocol):
         """T_world_lidar at the truth's own stamps (the world is the truth's); None when the recording has none."""
 
     def __len__(self) -> int:
-        """How many scans the recording holds."""
+        """Number of scans of the recording."""
 
     def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`; the ones between are not decoded."""

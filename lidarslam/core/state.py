@@ -49,7 +49,7 @@ class Saved:
     Args:
         values: the tree.
         place: the file, and where in it, for errors.
-        remedy: what to do where it cannot be used, for errors.
+        remedy: the remedy where it cannot be used, for errors.
     """
 
     def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:

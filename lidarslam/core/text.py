@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from lidarslam.core.errors import ConfigError
 
-# Control characters control terminals, bidirectional marks reorder what is read, lone surrogates cannot be encoded.
+# Control characters control terminals, bidirectional marks reorder text, lone surrogates cannot be encoded.
 _UNSEEN = (
     "\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff\ufff9-\ufffb\U000e0000-\U000e007f"
 )
@@ -98,7 +98,7 @@ def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
 
     Args:
         name: of unknown origin.
-        what: it is the name of, for the error.
+        what: the kind of thing with this name, for the error.
         reserved: names of other files in the same folder.
 
     Raises:

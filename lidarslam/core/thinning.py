@@ -13,7 +13,7 @@ _SLOTS = 1 << 20
 _PRIME_X, _PRIME_Y, _PRIME_Z = 73_856_093, 19_349_669, 83_492_791
 # Points farther away, in cells, share one cell: the range of the integers.
 _FARTHEST = float(1 << 31)
-# How many elements ahead loops prefetch.
+# Number of elements that loops prefetch ahead.
 _PREFETCHED = 32
 
 # Slots of this thread; they are never cleared, as allocating them for every scan takes longer than all other work.
@@ -82,7 +82,7 @@ def _write_slots(points: FloatArray, per_metre: np.float32, slots: NDArray[np.in
 
 @compiled
 def _last_comers(slots: NDArray[np.int32], last_comer: NDArray[np.int32], kept: NDArray[np.intp]) -> int:
-    """Write which points are the last in their slots (N,), ascending; return how many."""
+    """Write which points are the last in their slots (N,), ascending; return their number."""
     for n in range(len(slots)):
         last_comer[slots[n]] = n
     count = 0
@@ -98,7 +98,7 @@ def _most_central(
     points: FloatArray, slots: NDArray[np.int32], cells: NDArray[np.int32], sums: NDArray[np.float32],
     nearest: NDArray[np.intp],
 ) -> int:  # fmt: skip
-    """Write which points (N, 3) are the nearest to the means of those in their slots (N,); return how many.
+    """Write which points (N, 3) are the nearest to the means of those in their slots (N,); return their number.
 
     Args:
         points, slots: which.

@@ -90,7 +90,7 @@ class Trajectory:
             path: of the file.
             stamps: (N,) seconds; None: scans come at 10 Hz, from 0.
             T_cam_lidar: (4, 4) where the poses are those of a camera, as in KITTI's ground truth: the extrinsic
-                calibration, which makes them those of the LiDAR. None: they are as they stand in the file.
+                calibration, which makes them those of the LiDAR. None: they are used as they are in the file.
 
         Raises:
             InputError: the file is missing, a line is not a pose, or there are not as many stamps as poses.
@@ -215,7 +215,7 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read a TUM file; lines may stand in any order, of equal stamps the first is kept.
+    """Read a TUM file; lines may be in any order, of equal stamps the first is kept.
 
     Raises:
         InputError: the file is missing or a line is not a pose.

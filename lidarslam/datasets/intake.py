@@ -20,9 +20,9 @@ _MOST_POINTS = 1 << 20
 _CELL_M = 0.02
 # Of ranges: this share is nearer than the near one, and farther than the far one.
 _SHARE = 0.01
-# Something is always nearer to a sensor on the ground; sensors with a view all round do not reach so far.
+# A sensor on the ground always has nearer surfaces; sensors with a view all round have a shorter range.
 _NEAR_M, _FAR_M = 20.0, 400.0
-# From an aircraft everything lies on one side and is about as far; this far, with such a spread, nothing does.
+# From an aircraft all surfaces are on one side and at similar ranges; none are this far with such a spread.
 _HALF_M, _SPREAD = 3000.0, 5.0
 # Length of the points' mean direction: near 0 for points all round, 0.75 in a cone of 60 degrees about its axis.
 _ALL_ROUND = 0.5

@@ -128,7 +128,7 @@ def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
 
 
 def elevation_of(recording: Recording) -> tuple[float, float]:
-    """By how many degrees a recording's points are raised, and the cosine between its recorded z axis and up."""
+    """The degrees by which a recording's points are raised, and the cosine between its recorded z axis and up."""
     if not isinstance(recording, MountedRecording):
         return 0.0, 1.0
     return recording.raised_deg, float(recording.T_upright_recorded[2, 2])

@@ -29,8 +29,8 @@ class Reader(NamedTuple):
     module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`
     reads: str  # the layout, in words
     recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
-    takes_sequence: bool = False  # whether --sequence chooses among what a source holds
-    elevation_deg: float = 0.0  # by how much its points have to be raised, unless the settings have it
+    takes_sequence: bool = False  # whether --sequence chooses one of several in a source
+    elevation_deg: float = 0.0  # angle by which its points have to be raised, unless it is configured
 
 
 def _is_rosbag(source: Path) -> bool:

@@ -216,12 +216,12 @@ def _last_number(name: str) -> int | None:
 
 
 def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | None:
-    """The true trajectory in the first folder that has one; `<stem>.tum` in any of them goes before general names."""
+    """The true trajectory in the first folder that has one; `<stem>.tum` in any of them precedes general names."""
     own = [folder / f"{stem}.tum" for folder in folders] if stem else []
     general = [folder / name for folder in folders for name in _TRUTH_NAMES]
     return next((path for path in own + general if path.is_file()), None)
 
 
 def truth_beside(source: Path, name: str) -> Path | None:
-    """The true trajectory in a recording's folder, or in the one that its file or folder lies in."""
+    """The true trajectory in a recording's folder or its parent, or in the folder of its file."""
     return find_truth_file([source, source.resolve().parent] if source.is_dir() else [source.parent], name)

@@ -15,13 +15,13 @@ ReaderOf = Callable[[Path], str | None]
 """The name of the reader that recognises a path; None where none does."""
 
 _LISTED = 5
-# How deep recordings are searched for, and among how many entries of a folder.
+# Depth of the search for recordings, and the largest number of entries of a folder.
 _DEPTH, _MOST_ENTRIES = 3, 1000
 _URL = re.compile(r"[a-z][a-z0-9+]+:/", re.IGNORECASE)
 # Of a run's config.yaml.
 _SOURCE = re.compile(r"^  source: (.+?)(?: +#.*)?$", re.MULTILINE)
 
-# Readers of recordings of many folders; scans and bags may lie anywhere.
+# Readers of recordings of many folders; scans and bags may be anywhere.
 _LAYOUTS = ("kitti-odometry", "kitti-raw")
 _CONVERT = "convert each scan to .ply, .pcd or .npy"
 _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (

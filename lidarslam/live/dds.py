@@ -58,7 +58,7 @@ class DdsNode:
 
     def __init__(self, domain: int) -> None:
         self.domain = domain
-        # Held, as the library deletes what has no reference.
+        # Held, as the library deletes objects without a reference.
         self._domain = Domain(domain, f"{_CONFIG},{os.environ.get('CYCLONEDDS_URI', '')}".rstrip(","))
         self._participant = DomainParticipant(domain)
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)

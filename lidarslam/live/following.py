@@ -45,7 +45,7 @@ class Follower:
     """Registers the clouds of a topic, and publishes their poses.
 
     Args:
-        request: what is followed, and until when.
+        request: the topic to follow, and the end of the run.
         node: where topics are subscribed to and published.
         register: registers the scans.
         decoder: makes scans of messages.

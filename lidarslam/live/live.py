@@ -41,7 +41,7 @@ class LiveOutcome:
 
     run: RunOutcome  # as of a recording
     topic: str
-    counts: LiveCounts  # of the scans: received, lost, delayed
+    counts: LiveCounts  # of the scans
     is_interrupted: bool  # whether Ctrl-C ended it
 
 
@@ -49,7 +49,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     """Follow a robot, publish its poses, and write the run directory.
 
     Args:
-        request: what is followed, and until when; Ctrl-C ends it at any time, with all results.
+        request: the topic to follow, and the end of the run; Ctrl-C ends it at any time, with all results.
         show: called with a short text on the progress, every second while scans arrive.
         page: shows the run in browsers, with `rerun="web"`.
 
@@ -164,7 +164,7 @@ def _require_scans(topic: str, log: ScanLog, faults: Faults) -> None:
 
 
 def _describe(request: LiveRequest, topic: str) -> dict[str, Any]:
-    """The section of config.yaml about what was run."""
+    """The section of config.yaml that describes the run."""
     return {
         "version": version("lidarslam"),
         "source": None,

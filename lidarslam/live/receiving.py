@@ -1,4 +1,4 @@
-"""What a live run receives: topics once they are published, messages in a queue of bounded length, IMU samples."""
+"""Reception for a live run: topics once they are published, messages in a queue of bounded length, IMU samples."""
 
 import logging
 import threading
@@ -120,7 +120,7 @@ class IncomingQueue:
         is_ended: whether nothing more is received; messages may still be queued.
 
     Args:
-        receive: the next messages, waiting for so many seconds at most.
+        receive: the next messages, after at most the given seconds.
         longest: number of messages that may be queued.
         on_arrival: called on the thread that receives, with each message.
     """
@@ -221,7 +221,7 @@ class ImuReceiver:
     """Gives the messages of an IMU to a stream, on a thread of its own; a context manager.
 
     Args:
-        receive: the next messages, waiting for so many seconds at most.
+        receive: the next messages, after at most the given seconds.
         stream: takes the samples.
     """
 

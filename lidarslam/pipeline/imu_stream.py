@@ -128,7 +128,7 @@ class ImuStream(Stateful):
         return prior if self._inertial is None else self._inertial.prior(scan, prior)
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
-        """Follow the result of a scan, and compare the IMU with the scans so far."""
+        """Update with the result of a scan, and compare the IMU with the scans so far."""
         if self._inertial is not None:
             self._inertial.update(scan, mapped)
         self._scans += 1

@@ -63,7 +63,7 @@ class GraphOutcome:
     keyframe_poses: FloatArray
     edges: tuple[RelativePose, ...]
     loops: tuple[LoopReport, ...]  # accepted and rejected
-    largest_correction_m: float  # by how much a scan moved; a move into the frame of another run does not count
+    largest_correction_m: float  # of a scan's position; a move into the frame of another run does not count
     keyframe_ms: tuple[float, ...]  # wall time of each keyframe, on a thread of its own
 
 

@@ -78,7 +78,7 @@ def log_choices(request: RunRequest, scans: range, recorded: int) -> None:
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:
-    """The section of config.yaml about what was run."""
+    """The section of config.yaml that describes the run."""
     given = {"loops": request.given.closed, "no_loops": request.given.forbidden}
     return {
         "version": version("lidarslam"),

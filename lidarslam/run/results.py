@@ -131,7 +131,7 @@ def write_results(
 
     Args:
         directory: of the run.
-        config, described: the settings, and what was run, for config.yaml.
+        config, described: the settings, and the description of the run, for config.yaml.
         tracked, closed: the results.
         map_formats: further formats of the map.
         show: called with the map.

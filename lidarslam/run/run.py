@@ -32,7 +32,7 @@ def execute(
     resumed, to the same results.
 
     Args:
-        request: what is run.
+        request: the run to execute.
         progress: called after every scan.
         phase: called with a short text on the progress before the first scan and after the last.
         page: shows the run in browsers, with `rerun="web"`.

@@ -108,7 +108,7 @@ class RunSession:
             self.log.warn(f"no {RERUN}: {error}")
 
     def close_viewer(self) -> None:
-        """Nothing more is shown; a warning goes into the summary."""
+        """End the viewer; a warning is added to the summary."""
         self._shown.close()
 
     def take(self, estimate: ScanEstimate, total_ms: float, built: MapBuilder) -> None:
@@ -136,7 +136,7 @@ class RunSession:
 
         Args:
             tracked: the scans.
-            described: what was run, for config.yaml.
+            described: the description of the run, for config.yaml.
             gnss: constrains the pose graph.
 
         Raises:
@@ -177,7 +177,7 @@ def open_session(
     """Load the odometry and lock the directory; after the block, everything is closed and the report is drawn.
 
     Args:
-        request: what is run.
+        request: the run to execute.
         phase: called with a short text on the progress.
         recording: its source, which an external odometry has to overlap with.
         is_placed: whether the results are written in UTM as well.

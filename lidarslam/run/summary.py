@@ -150,7 +150,7 @@ class GraphSummary:
     keyframes: int
     edges: int
     loops: tuple[LoopReport, ...]  # accepted loop closures, and rejected candidates
-    largest_correction_m: float  # by how much the graph moved a scan
+    largest_correction_m: float  # of a scan's position by the graph
     ms_per_keyframe: Milliseconds | None  # on the thread of the graph; None when there was no keyframe
 
     @classmethod

@@ -14,7 +14,7 @@ IntArray = NDArray[np.int32]
 
 CYLINDER_SIDES = 24
 
-# Corner k of a box lies at its half sizes times these signs; a face is two triangles, counter-clockwise from outside.
+# Corner k of a box is at its half sizes times these signs; a face is two triangles, counter-clockwise from outside.
 _BOX_CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
 _BOX_FACES = [
     [[0, 2, 3], [0, 3, 1]],  # -z
@@ -157,7 +157,7 @@ def pieces_near(mesh: Mesh, voxels: NDArray[np.int64], voxel_m: float) -> Pieces
     found = []
     for block in np.array_split(np.flatnonzero(ends > starts), len(ends) // _BLOCK + 1):
         pieces = _cut(Pieces(mesh.vertices[mesh.triangles[block]], starts[block], ends[block]), size)
-        # A piece no larger than a cell lies in its middle's cell and those that touch it.
+        # A piece no larger than a cell is within its middle's cell and those that touch it.
         found.append(pieces[np.isin(_place(pieces, size), near)])
     pieces = _together(found)
     return pieces[np.argsort(_place(pieces, size), kind="stable")]

@@ -17,7 +17,7 @@ from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 
-# Drawn by turns.
+# Used in turn.
 MIXED_WORLDS = ("street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace")
 # How often each is drawn, relative to the others.
 SENSOR_WEIGHTS = {

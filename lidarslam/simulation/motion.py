@@ -259,7 +259,7 @@ def motion_along(
             carrier; else take the poses as they are, for aircraft and hand-held sensors.
         carrier: whose footprint and sensor height are meant when on the ground.
         smoothing_s: time within which the trajectory's noise is evened out: centimetres of a GPS receiver at 10 Hz
-            are accelerations far beyond a car's, which 0.25 s removes. 0 goes through every pose.
+            are accelerations far beyond a car's, which 0.25 s removes. 0 passes through every pose.
 
     Raises:
         InputError: the trajectory has fewer than two poses, points straight up or down, or on the ground moves along

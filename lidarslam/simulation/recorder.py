@@ -38,7 +38,7 @@ class SimulatedScan:
 
 
 # Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives
-# the same bytes; far from zero, so that readers can tell offsets from a stamp from readings of the clock.
+# the same bytes; far from zero, so that readers can distinguish offsets from a stamp and readings of the clock.
 CLOCK_START_NS = 1_704_067_200 * 10**9
 
 

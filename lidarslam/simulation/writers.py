@@ -127,7 +127,7 @@ def compensate(scan: Scan, rig: Rig) -> FloatArray:
 
 
 def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
-    # KITTI's own scans lie too low, and all readers raise them; exact points would come out too high.
+    # KITTI's own scans are too low, and all readers raise them; exact points would come out too high.
     intensities = simulated.intensities / _FULL_INTENSITY
     return np.column_stack([correct_elevation(points, -KITTI_DEG), intensities]).astype("<f4")
 

@@ -107,7 +107,7 @@ class RunDirectory:
 
     @property
     def has_earlier(self) -> bool:
-        """Whether files of an earlier run lie there that have not been replaced."""
+        """Whether files of an earlier run remain that have not been replaced."""
         return bool(self._stale - {ABOUT})
 
     @property
@@ -163,12 +163,12 @@ def remove_files(path: Path) -> None:
 
 
 def files_in(path: Path) -> list[str]:
-    """The files of a run that lie in a directory."""
+    """The existing files of a run in a directory."""
     return [*(name for name in FILES if (path / name).exists()), *tile_names(path)]
 
 
 def tile_names(path: Path) -> list[str]:
-    """The index of a map's tiles, and then the tiles, as far as they lie in the directory of a run itself."""
+    """The index of a map's tiles, and then the tiles, as far as they are in the directory of a run itself."""
     folder = path / MAP_TILES
     if folder.is_symlink() or not folder.is_dir():
         return []
@@ -202,7 +202,7 @@ def remove_run(path: Path) -> None:
 
 
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
-    """The files of a run that lies in the directory already, if it may be replaced."""
+    """The files of a run that is in the directory already, if it may be replaced."""
     present = files_in(path)
     if (path / ABOUT).exists():  # the other files are of that run or merge, even without a config.yaml
         if not overwrite and not resume:
@@ -221,7 +221,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
 
 
 def _is_run(path: Path) -> bool:
-    """Whether a run's config.yaml lies there: its first section describes the run."""
+    """Whether there is a run's config.yaml: its first section describes the run."""
     try:
         return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{RUN_SECTION}:")
     except (OSError, UnicodeDecodeError):

@@ -55,7 +55,7 @@ def show_scans(
         if truth is not None:
             path = rr.LineStrips3D([truth.positions], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
             stream.log("world/ground truth", path, static=True)
-            # The eye follows only what is drawn.
+            # The eye follows only drawn entities.
             place = rr.Points3D([[0.0, 0.0, 0.0]], colors=[REFERENCE_COLOUR], radii=2.0 * PATH_RADIUS)
             stream.log(_LIDAR, place, static=True)
         faults, done = Faults(), 0

@@ -49,7 +49,7 @@ class Estimate:
 
 
 def describe_peer(request: RunRequest, peer: Peer, range_m: float | None) -> dict[str, object]:
-    """The section of config.yaml about what was run."""
+    """The section of config.yaml that describes the run."""
     by_scene = {} if range_m is None else {"max_range_m": range_m}
     return {**describe_run(request), PEER_KEY: peer.version, **by_scene}
 

@@ -88,7 +88,7 @@ class EvalioEstimator:
         changes = {**pipeline.parameters, **(pipeline.compensated if first.is_compensated else {})}
         if range_m is not None:
             changes |= {name: size_m * range_m / MAX_RANGE_M for name, size_m in pipeline.voxels_m.items()}
-        # `set_params` sets only what it is given.
+        # `set_params` sets only the given parameters.
         self._native.set_params({**self._native.default_params(), **changes})
         rows, columns = self._shape
         rate = 10.0 if first.is_compensated else 1.0 / (first.end - first.start)

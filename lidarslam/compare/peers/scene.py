@@ -16,7 +16,7 @@ from lidarslam.datasets.recording import Recording
 
 BY_SCENE = "scene"
 _SCANS, _PERCENT, _TIMES = 10, 99.0, 2.0
-# What KISS-ICP's authors name for indoor data; finer voxels than a tenth of the default would hold single points.
+# As KISS-ICP's authors advise for indoor data; finer voxels than a tenth of the default would hold single points.
 _SHORTEST_M = 10.0
 
 
@@ -33,7 +33,7 @@ def scene_range_m(recording: Recording, chosen: range) -> float:
 
 
 def scene_note(range_m: float) -> str:
-    """A sentence on what the name means on this recording."""
+    """A sentence on the meaning of the name on this recording."""
     return (
         f"@{BY_SCENE}: maximum range {range_m:g} m instead of {MAX_RANGE_M:g} m, and voxels in proportion, by the"
         " ranges of the first scans"

@@ -23,11 +23,11 @@ _MOST_SCANS = 10**9
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 TableReader = Callable[[Path], NDArray[np.void]]
-# Fields of the float32 numbers of a .bin point, by how many there are; in the order of preference.
+# Fields of the float32 numbers of a .bin point, by their number; in the order of preference.
 _BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
 _MOST_RINGS = 256
 _WIDEST_ARRAY = 16
-# Bytes; no format has a point with so many fields.
+# Bytes; no format has larger points.
 _WIDEST_POINT = 1 << 16
 _LONGEST_HEADER = 1 << 16
 _TYPES = {

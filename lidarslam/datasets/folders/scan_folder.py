@@ -115,7 +115,7 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
 
 
 def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int, list[str]]:
-    """The stamps, how many of them were replaced, and a warning where lines and scans differ in number."""
+    """The stamps, the number of replaced ones, and a warning where lines and scans differ in number."""
     lines = read_stamps(path)
     stamps, numbers = lines[np.isfinite(lines)], np.arange(len(files))
     warnings, left = [], max(0, len(files) - len(stamps))

@@ -1,6 +1,6 @@
 """A synchronised drive of KITTI's raw data: `DATE/DATE_drive_NNNN_sync/{velodyne_points, oxts}`.
 
-The scans are as measured, not motion compensated. The calibration files lie in the date's folder above the drive."""
+The scans are as measured, not motion compensated. The calibration files are in the date's folder above the drive."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -162,7 +162,7 @@ class KittiRawRecording(FileRecording):
         path = self._source / "oxts" / "timestamps.txt"
         if path.is_file():
             rows, table = oxts.numbers, read_stamps(path)
-        else:  # the stamps of the scans with the rows' numbers stand in
+        else:  # the stamps of the scans with the rows' numbers are used instead
             rows = np.searchsorted(self._numbers, oxts.numbers)
             rows = np.where(np.append(self._numbers, -1)[rows] == oxts.numbers, rows, len(self))
             table = self.stamps

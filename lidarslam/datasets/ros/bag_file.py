@@ -25,7 +25,7 @@ from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
 # Recorders write chunks of 1 to 16 MB, and a cloud of two million points has some 100 MB.
 MOST_BYTES = 1 << 28
-# How many times as large a file may become that is compressed as a whole; clouds do not become twenty times as large.
+# Largest ratio of decompression of a file that is compressed as a whole; that of clouds is below twenty.
 _MOST_GROWTH = 100
 _STORAGE_SUFFIXES = (".db3", ".mcap")
 _LAST_MESSAGES_NS = 1_000_000_000

@@ -167,7 +167,7 @@ def _parts(name: str, separator: str = "/") -> list[str]:
 
 
 def _common(first: Sequence[str], second: Sequence[str]) -> int:
-    """How many parts two names share from the left."""
+    """Number of leading parts that two names share."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(first, second, strict=False)))
 
 

@@ -27,7 +27,7 @@ _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 # A damaged database may hold anything for a name.
 _TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
-# By the table itself, because the pages of its index lie at the end.
+# By the table itself, because the pages of its index are at the end.
 _ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
 
 

@@ -71,7 +71,7 @@ class SweepOrder:
 def turned_angles(points: FloatArray, rings: NDArray[np.generic] | None = None) -> FloatArray | None:
     """Angle in degrees by which the sensor had turned since the first point, for returns (N, 3) in their stored order.
 
-    The points stand in the order of firing, or, where there are rings, ring by ring with each in this order.
+    The points are stored in the order of firing, or, where there are rings, ring by ring with each in this order.
 
     Returns:
         (N,) from 0; None where the points are in another order, or not of one turn.

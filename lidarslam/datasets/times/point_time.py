@@ -35,7 +35,7 @@ MISTAKEN_UNITS_PER_SECOND = {"ks": 1e-3, "Ms": 1e-6, "ps": 10**12}
 CLOCK_LIMIT_S = 1.0
 _MEDIAN_SAMPLE = 2048
 logger = logging.getLogger(__name__)
-# How many clouds are looked at, and how many of them may lack usable times.
+# Number of clouds that are examined, and how many of them may lack usable times.
 _CLOUDS_LOOKED_AT, _CLOUDS_WITHOUT_TIME = 30, 3
 # Sweeps last 0.02 to 0.3 s. The limits leave room for partial ones and are less than one unit (1000) apart.
 _SWEEP_S, _SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 0.1, 0.005, 1.0
@@ -91,7 +91,7 @@ class PointTimeModel:
 
     @property
     def units_per_second(self) -> float:
-        """How many units a second has."""
+        """Number of units per second."""
         return UNITS_PER_SECOND.get(self.unit) or MISTAKEN_UNITS_PER_SECOND[self.unit]
 
     def offsets(self, values: NDArray[np.generic], stamp: float) -> FloatArray:

@@ -128,7 +128,7 @@ def mend_stamps(stamps: FloatArray, numbers: FloatArray) -> tuple[FloatArray, in
     """Replace stamps (N,) that are missing or do not increase, on a line over the scans' numbers (N,).
 
     Returns:
-        The strictly increasing stamps and how many were replaced.
+        The strictly increasing stamps and the number of replaced ones.
 
     Raises:
         ValueError: fewer than two stamps increase, so that there is no line.

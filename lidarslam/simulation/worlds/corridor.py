@@ -31,7 +31,7 @@ class CorridorPlan:
 
 
 def build(seed: int) -> World:
-    """The corridor of that seed, 24 to 40 m long, and its yard; the route goes out, round the yard and back in."""
+    """The corridor of that seed, 24 to 40 m long, and its yard; the route leads out, round the yard and back in."""
     rng = np.random.default_rng(seed)
     plan = CorridorPlan(rng.uniform(24.0, 40.0), rng.uniform(25.0, 40.0), rng.uniform(25.0, 40.0))
     ground = _ground(plan, rng)

@@ -56,7 +56,7 @@ class StreetNetwork:
         return np.asarray((np.sign(steps) @ _DIRECTIONS.T > 0.5).any(axis=0), dtype=np.float64)
 
     def corners(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, int]]:
-        """The four quarters round each node: the node, the two directions that bound it, how many are streets."""
+        """The four quarters round each node: the node, its two directions, the number of streets among them."""
         for node, at in enumerate(self.nodes):
             arms = self.arms(node)
             for k in range(4):
