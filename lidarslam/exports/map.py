@@ -185,7 +185,7 @@ def upwards(run: Path) -> FloatArray:
 
 
 def redrawn(run: Path, least_through: int) -> tuple[PointCloud, int]:
-    """The map, in one piece, and the number of removed points: those that `least_through` range images see through, 0: none.
+    """The map in one piece, and the number of points left out: those that `least_through` images see through, 0: none.
 
     Scans are deskewed along the final trajectory; those on which tracking was lost are left out.
 
