@@ -13,10 +13,12 @@ demo: $(VENV)/.base
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
 
 test: install
+	@echo "running the tests: about 20 minutes on two cores"
 	$(PYTEST)
 
 # The slow tests too, those on recordings where they are at hand.
 test-all: install
+	@echo "running all tests, the slow ones too"
 	$(PYTEST) -m "slow or not slow"
 
 lint: install
