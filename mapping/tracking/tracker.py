@@ -218,7 +218,10 @@ class Tracker(Stateful):
             inertial = prior.without_odometry()
             alone = self.predict(matcher.scan, inertial, matcher.last)
             other = matcher.register(alone, self._begins_coarse(matcher.scan, alone))
-            best = max(best, self._or_turning(matcher, inertial, alone, other), key=lambda attempt: attempt.quality)
+            other = self._or_turning(matcher, inertial, alone, other)
+            # Where odometry and last motion agree, another pose is that of a similar place, as the next flight.
+            is_similar = not prediction.contradicted and self._contradicts(prior, other, matcher.last)
+            best = other if other.quality > best.quality and not is_similar else best
             is_poor = has_odometry and best.status is not Status.OK
         if (is_poor or not self._state.velocity_known) and not self._budget.is_spent:
             rotations = prediction.T_world_lidar, matcher.last.T_world_lidar
