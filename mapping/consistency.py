@@ -57,7 +57,7 @@ _LEAST_WAY_M = 0.2
 # a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
-# Least contradicting pairs of a stretch, in runs of at least this many; one elsewhere, or where another confirms it
+# Least contradicting pairs of a stretch in runs of at least this many; one in others, or where another confirms it.
 _LEAST_PAIRS, _FEW_PAIRS = 2, 4
 
 

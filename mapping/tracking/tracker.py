@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarslam.core.geometry import displacement_m, inverse
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
@@ -143,7 +143,7 @@ class Tracker(Stateful):
             state = self._velocity_bias.corrected(state)
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not attempt.relocalised:
-            self._update_noise(state, prior, last)
+            self._update_noise(state, motion, prior, last)
         error_m = displacement_m(attempt.correction, scan.range_m)
         self._prediction_error_m = max(_ERROR_DECAY * self._prediction_error_m, error_m)
         self._state.velocity_known = not (jumped or attempt.relocalised)
@@ -197,7 +197,7 @@ class Tracker(Stateful):
         """Take the last registration back, but for the observed error of the predictions."""
         self._state = copy(earlier._state)
         self._process_noise, self._odometry_noise = earlier._process_noise, earlier._odometry_noise
-        self._velocity_bias = earlier._velocity_bias
+        self._velocity_bias, self._is_measured = earlier._velocity_bias, earlier._is_measured
         self._end_search()
 
     def _begins_coarse(self, scan: SampledScan, prediction: Prediction) -> bool:
@@ -299,10 +299,9 @@ class Tracker(Stateful):
         self._search.drop()
         self._map_is_due = self._in_vain = False
 
-    def _update_noise(self, state: MotionState, prior: Prior, last: MotionState) -> None:
+    def _update_noise(self, state: MotionState, motion: FloatArray, prior: Prior, last: MotionState) -> None:
         interval_s = state.stamp - last.stamp
         if interval_s > 0.0 and self._state.velocity_known:
             variance = np.diag(state.covariance + last.covariance)[6:]
             self._process_noise = self._process_noise.updated(state.velocity - last.velocity, interval_s, variance)
-        motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         self._odometry_noise = self._odometry_noise.updated(prior, motion, self._config)
