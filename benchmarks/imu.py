@@ -27,6 +27,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
@@ -120,7 +121,7 @@ def recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
     for source in arguments.sources:
         recorded = read(source, arguments.step)
         every = f", every {arguments.step}th scan" if arguments.step > 1 else ""
-        yield replace(recorded, name=recorded.name + every)
+        yield replace(recorded, name=recorded.name + every, imu=open_recording(source).imu)
     for case in arguments.cases:
         for seed in arguments.seeds:
             yield simulate(case, arguments.sensor, arguments.scans, seed)

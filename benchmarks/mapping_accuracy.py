@@ -95,7 +95,7 @@ def read(source: Path, step: int = 1) -> Recorded:
     truth = recording.ground_truth
     if truth is None:
         raise InputError(f"{source}: has no ground truth to measure against")
-    return Recorded(recording.name, list(in_order(recording.scans(step=step))), truth, recording.imu)
+    return Recorded(recording.name, list(in_order(recording.scans(step=step))), truth)
 
 
 def simulate(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None) -> Recorded:

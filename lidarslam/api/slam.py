@@ -10,7 +10,7 @@ from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +28,7 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.pipeline import Pipeline, map_error
 from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.loop_closing import GraphOutcome, begin_graph, loops_so_far
 from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
@@ -36,9 +36,7 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.session import draw_report, open_odometry, require_no_trajectory
 from lidarslam.storage.directory import RunDirectory
 
-if TYPE_CHECKING:  # GTSAM takes a while to load
-    pass
-
+logger = logging.getLogger(__name__)
 
 A = TypeVar("A", bound=FloatArray | None)
 
@@ -50,9 +48,6 @@ def _read_only(array: A) -> A:
     copy = array.copy()
     copy.flags.writeable = False
     return copy
-
-
-logger = logging.getLogger(__name__)
 
 
 class Slam:
@@ -121,7 +116,6 @@ class Slam:
                 estimate = self._pipeline.register(scan, started, self._log.add)
             return replace(
                 estimate,
-                is_final=self._graph is None,
                 T_world_lidar=_read_only(estimate.T_world_lidar),
                 T_odom_lidar=_read_only(estimate.T_odom_lidar),
                 covariance=_read_only(estimate.covariance),
@@ -208,7 +202,7 @@ class Slam:
                 self._pipeline.close()
             except Exception as error:
                 if self._failure is None:
-                    raise _map_error(error) from error
+                    raise map_error(error) from error
             finally:
                 self._odometry.close()
                 if self._graph is not None:
@@ -255,7 +249,7 @@ class Slam:
         except Exception as error:
             known, self._failure = self._failure, self._failure or error
             if known is None:
-                raise _map_error(error) from error
+                raise map_error(error) from error
 
     @contextmanager
     def _entered(self) -> Iterator[None]:
@@ -283,9 +277,3 @@ class Slam:
                 f"an earlier scan was broken off ({reason}), and no more can be registered; trajectory(), map() and"
                 " save() give what came before it"
             )
-
-
-def _map_error(error: Exception) -> LidarSlamError:
-    if isinstance(error, LidarSlamError):
-        return error
-    return LidarSlamError(f"building the map failed: {type(error).__name__}: {error}")

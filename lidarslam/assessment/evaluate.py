@@ -21,7 +21,7 @@ from lidarslam.assessment.inputs import (
 )
 from lidarslam.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import replacing
+from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
@@ -233,7 +233,7 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, c
         try:
             write_ply(partial, vertices)
         except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+            raise cannot_write(path, error) from error
 
 
 def write_evo_files(folder: Path, name: str, metrics: TrajectoryMetrics) -> list[Path]:
@@ -282,7 +282,7 @@ def _write_arrays(path: Path, info: dict[str, str], arrays: dict[str, FloatArray
                 np.save(content, values, allow_pickle=False)
                 archive.writestr(f"{name}.npy", content.getvalue())
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise cannot_write(path, error) from error
 
 
 def _statistics(errors: FloatArray) -> dict[str, float]:

@@ -16,8 +16,7 @@ from lidarslam.compare.metrics import measure
 from lidarslam.compare.plan import CompareRequest, PlannedRecording, make_plan
 from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison, format_result
-from lidarslam.core.errors import OutputError
-from lidarslam.core.files import only_writer
+from lidarslam.core.files import cannot_write, only_writer
 from lidarslam.core.tasks import Where, open_tasks
 from lidarslam.core.text import count
 from lidarslam.datasets.fetched import fetch, url_of
@@ -97,7 +96,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
     try:
         request.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{request.out}: cannot be written ({error.strerror or error})") from error
+        raise cannot_write(request.out, error) from error
     turns, directory = _Turns(request, narrator, command), RunDirectory(request.out)
     sequences: list[SequenceComparison] = []
     with only_writer(request.out):

@@ -24,7 +24,6 @@ from lidarslam.run.request import describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY, RunDirectory
 from lidarslam.storage.finished_run import read_summary
-from lidarslam.viewer.run_report import with_run
 
 # In addition to a run's own files: how its process ended, and its standard error.
 PROCESS, LOG = "process.json", "process.log"
@@ -115,6 +114,8 @@ def finished_before(run: MethodRun) -> MethodResult | None:
 
 def _collect(run: MethodRun, result: MethodResult) -> MethodResult:
     """The result with the content of its run directory; a damaged one counts as a failure."""
+    from lidarslam.viewer.run_report import with_run  # loads the pictures
+
     result = replace(result, settings=dump_yaml(run.request.config))
     result = result if run.peer is None else replace(result, times_cover="registration")
     if result.status not in (*WHOLE, "stopped"):

@@ -1,4 +1,4 @@
-"""A sequence of poses in time, and its text files; the only file that knows a quaternion's order.
+"""A sequence of poses in time, and its text files.
 
 TUM: `stamp tx ty tz qx qy qz qw`, one pose per line, `#` comments. KITTI: twelve numbers per line, the first three rows
 of the pose matrix, no stamps.

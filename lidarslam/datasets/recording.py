@@ -31,6 +31,10 @@ class SeveralTopicsError(InputError):
         self.topics = tuple(topics)
 
 
+# Of the points of KITTI, and of the .bin files of others.
+KITTI_FIELDS = ("x", "y", "z", "intensity")
+
+
 @dataclass(frozen=True)
 class PointField:
     """One field of the points as stored, such as `intensity`, `float32`."""

@@ -15,7 +15,7 @@ from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.imu_samples import summarise
-from lidarslam.datasets.recording import ImuSummary, PointField, RecordingInfo, Topic
+from lidarslam.datasets.recording import KITTI_FIELDS, ImuSummary, PointField, RecordingInfo, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 logger = logging.getLogger(__name__)
@@ -172,7 +172,7 @@ class FileRecording(StoredRecording):
         return iter(wanted)
 
     def _fields(self, item: int) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(name, "float32") for name in ("x", "y", "z", "intensity"))
+        return tuple(PointField(name, "float32") for name in KITTI_FIELDS)
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
         return float(self.stamps[-1])

@@ -96,7 +96,7 @@ class ScanEstimate:
     # points_read, points_dropped: valid points of the raw scan, and invalid ones that were left out
     points_read: int
     points_dropped: int
-    # in the LiDAR frame at the stamp, deskewed, within the map's range, one a voxel; none before the scan is in the map
+    # in the LiDAR frame at the stamp, deskewed, within the map's range, one per voxel; none before they are deskewed
     points: Annotated[FloatArray, Shape(None, 3)] = field(default_factory=lambda: np.empty((0, 3)))
 
     @property

@@ -39,7 +39,7 @@ _SCANS_BEHIND = 8
 _GRAPH_CALLS_BEHIND = 64
 
 Take = Callable[[ScanEstimate, float], None]
-"""Called with a scan that is in the map, and the milliseconds from its arrival to its pose."""
+"""Called with a scan that is deskewed, and the milliseconds from its arrival to its pose."""
 
 
 class Checkpointer(Protocol):
@@ -140,12 +140,18 @@ class Pipeline(Stateful):
             scan: the next one.
             started: reading of `time.perf_counter` when it arrived.
             take: called on the thread of the map.
+
+        Raises:
+            LidarSlamError: building the map of earlier scans failed.
         """
         odometry = self._estimate(scan, _ms_since(started))
         estimate = self._localise(odometry, None)
         self._follow(lambda: estimate)
         total_ms = _ms_since(started)
-        self._map_worker.submit(lambda: take(self._build(odometry, estimate), total_ms))
+        try:
+            self._map_worker.submit(lambda: take(self._build(odometry, estimate), total_ms))
+        except Exception as error:  # of an earlier scan
+            raise map_error(error) from error
         return estimate
 
     def settle(self) -> None:
@@ -198,7 +204,8 @@ class Pipeline(Stateful):
         """The pose of a scan; the odometry of the following one gives the motion after the stamp, where it is known."""
         if self._correction is not None:
             self._correction.before_scan()
-        return self._localiser.localise(odometry, following)
+        estimate = self._localiser.localise(odometry, following)
+        return replace(estimate, is_final=self._graph is None)
 
     def _build(self, odometry: ScanOdometry, estimate: ScanEstimate) -> ScanEstimate:
         """Deskew a scan, add the scan before to the map, and both to the graph."""
@@ -227,6 +234,13 @@ def _give(graph: KeyframeGraph, scan: GraphScan, cell_m: float | None) -> Surfel
     """Give the graph a scan; the local map of surfels, where there is one and loop closures change it."""
     graph.add(scan)
     return None if cell_m is None else graph.redrawn_local_map(cell_m)
+
+
+def map_error(error: Exception) -> LidarSlamError:
+    """The error for the user when the map cannot be built."""
+    if isinstance(error, LidarSlamError):
+        return error
+    return LidarSlamError(f"building the map failed: {type(error).__name__}: {error}")
 
 
 def _ms_since(started: float) -> float:

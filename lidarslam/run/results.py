@@ -59,9 +59,14 @@ class TrackedScans:
         error: InputError | KeyboardInterrupt | None = None,
     ) -> "TrackedScans":
         """All scans that were processed, unless another number was asked for; `error` ended them early."""
-        stopped = None if error is None else str(error) or "interrupted"
+        stopped = None if error is None else reason_of(error)
         asked = len(log) + faults.left_out if asked is None else asked
         return cls(log, asked, faults, built.views, built.slides.tests, stopped, isinstance(error, KeyboardInterrupt))
+
+
+def reason_of(error: InputError | KeyboardInterrupt) -> str:
+    """Why the scans ended early, in words."""
+    return str(error) or "interrupted"
 
 
 @dataclass(frozen=True, eq=False)

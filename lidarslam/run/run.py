@@ -60,6 +60,7 @@ def execute(
         session.request = request
         phase("reading the first scans")
         tracked = track(session, request, recording, chosen, progress, session.graph)
+        session.end_scans()
         return session.finish(tracked, describe_run(request), gnss)
 
 

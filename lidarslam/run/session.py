@@ -132,7 +132,7 @@ class RunSession:
         self.phase("writing the results")
 
     def finish(self, tracked: Tracked, described: dict[str, Any], gnss: "ProjectedTrack | None" = None) -> RunOutcome:
-        """Close the loops, draw the map, and write everything.
+        """Close the loops, draw the map, and write everything, after `end_scans`.
 
         Args:
             tracked: the scans.
@@ -142,7 +142,6 @@ class RunSession:
         Raises:
             OutputError: a file cannot be written.
         """
-        self.end_scans()
         request, unfinished = self.request, self.unfinished
         closed = close_loops(self.graph, tracked.global_map, self.log, self.viewer, gnss)
         outcome = write_results(

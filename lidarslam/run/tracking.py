@@ -30,7 +30,7 @@ from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.elevation import Elevation
 from lidarslam.run.inertial import open_inertial
 from lidarslam.run.request import RunRequest
-from lidarslam.run.results import Tracked, TrackedScans, unless_damaged
+from lidarslam.run.results import Tracked, TrackedScans, reason_of, unless_damaged
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.session import RunSession
 from lidarslam.viewer.viewer import Viewer
@@ -147,7 +147,7 @@ def _process(
                 session.take(estimate, 1e3 * (finished - before), pipeline.map)
                 progress(len(log), estimate)
     except (InputError, KeyboardInterrupt) as error:
-        log.warn(f"stopped after {count(len(log), 'scan')}: {str(error) or 'interrupted'}")
+        log.warn(f"stopped after {count(len(log), 'scan')}: {reason_of(error)}")
         return error.with_traceback(None)  # whose frames hold maps and scans
     return None
 
@@ -161,7 +161,7 @@ def _show_reference(viewer: Viewer, truth: Trajectory, first_stamp: float) -> No
 
 def _why_none(log: ScanLog, faults: Faults, error: InputError | None) -> Iterator[str]:
     if error is not None:
-        yield str(error) or "interrupted"
+        yield str(error)
     yield from faults.warnings()
     if len(log):
         invalid = count(log.points_dropped, "invalid point")

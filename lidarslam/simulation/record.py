@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.files import cannot_write
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import as_typed, command_line, count, joined, small_length
@@ -100,7 +101,7 @@ def new_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
                 out.rename(Path(workplace) / "earlier")
             folder.rename(out)
     except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+        raise cannot_write(out, error) from error
 
 
 def _refuse_to_replace(out: Path, overwrite: bool) -> None:

@@ -40,7 +40,7 @@ class About:
         """Of the run in a directory; None where none is unfinished; InputError where the file is damaged."""
         path = run / ABOUT
         try:
-            return read_json(path, TypeAdapter(About), any_path=True)
+            return read_json(path, _SHAPE, any_path=True)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError) as error:
@@ -72,6 +72,9 @@ class About:
             f"this merge did not finish; resume it with lidarslam merge {sources} --out {out} --resume"
             " and the options it was begun with"
         )
+
+
+_SHAPE = TypeAdapter(About)
 
 
 def require_whole(run: Path) -> None:

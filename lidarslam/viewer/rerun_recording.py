@@ -121,8 +121,11 @@ def log_map(
     """
     points = every_nth(points, count)
     height = levels(points[:, 2])
-    shades = np.interp(height, [0.0, 1.0], _DARK_TO_BRIGHT)[:, None] * np.array(colour or (0, 0, 0))
-    colours = viridis(height) if colour is None else shades.astype(np.uint8)
+    if colour is None:
+        colours = viridis(height)
+    else:
+        shades = np.interp(height, [0.0, 1.0], _DARK_TO_BRIGHT)[:, None] * np.array(colour)
+        colours = shades.astype(np.uint8)
     recording.log(entity, rr.Points3D(points, colors=colours, radii=MAP_RADIUS), static=static)
 
 

@@ -153,8 +153,7 @@ def reconstruct(cloud: PointCloud, cell_m: float) -> Mesh:
 
     extent = float(np.ptp(cloud.points, axis=0).max()) * 1.1
     depth = int(np.clip(math.ceil(math.log2(max(extent / cell_m, 2.0))), 4, _DEEPEST))
-    given = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
-    given.normals = o3d.utility.Vector3dVector(cloud.normals)
+    given = cloud.to_open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(given, depth=depth, n_threads=1)
     distance, nearest = cKDTree(cloud.points).query(np.asarray(surface.vertices))

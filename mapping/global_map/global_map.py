@@ -2,7 +2,6 @@
 
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,6 @@ from lidarslam.mapping.global_map.voxels import (
 )
 from lidarslam.mapping.surfels.hash_kernels import EMPTY
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
-
-if TYPE_CHECKING:
-    pass
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000

@@ -184,11 +184,6 @@ class RelaxSchedule(Stateful):
     def __init__(self) -> None:
         self._waiting, self._keyframes = [], 0
 
-    @property
-    def waiting(self) -> Sequence[LoopClosure]:
-        """Closures that the poses are not optimised with yet."""
-        return self._waiting
-
     def is_due(self, found: Sequence[LoopClosure], poses: Sequence[FloatArray]) -> bool:
         """Whether to optimise now: a closure contradicts the poses (4, 4) of all keyframes, which are enough by now.
 

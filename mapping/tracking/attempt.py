@@ -90,10 +90,11 @@ class Attempt:
     def is_reachable(self, tracked_s: float | None, turn_is_measured: bool, motion_is_measured: bool) -> bool:
         """Whether the sensor can have moved here since the time at which it was tracked; anywhere if it never was."""
         since_s = np.inf if tracked_s is None else self.prediction.stamp - tracked_s
-        speed, turn, reach_s = float(np.linalg.norm(self.prediction.velocity[3:])), _MORE_TURN_RAD_S, _REACH_S
-        speed += _MORE_SPEED_M_S
         if motion_is_measured:
             speed, turn, reach_s = _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S
+        else:
+            speed = float(np.linalg.norm(self.prediction.velocity[3:])) + _MORE_SPEED_M_S
+            turn, reach_s = _MORE_TURN_RAD_S, _REACH_S
         if since_s > reach_s:
             return True
         angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))

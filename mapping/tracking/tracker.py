@@ -153,8 +153,8 @@ class Tracker(Stateful):
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
         # A young map that is not added to would stay one; and in one that ends, as at the next flight of stairs, scans
         # fit ever worse.
-        is_confirmed = self._odometry_noise.confirms(replace(prior, caution=_WEAK_CAUTION), motion, self._config)
-        fits = attempt.status is Status.OK or attempt.local_map.is_young or is_confirmed
+        fits = attempt.status is Status.OK or attempt.local_map.is_young
+        fits = fits or self._odometry_noise.confirms(replace(prior, caution=_WEAK_CAUTION), motion, self._config)
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
             state=state,
@@ -220,8 +220,9 @@ class Tracker(Stateful):
             other = matcher.register(alone, self._begins_coarse(matcher.scan, alone))
             other = self._or_turning(matcher, inertial, alone, other)
             # Where odometry and last motion agree, another pose is that of a similar place, as the next flight.
-            is_similar = not prediction.contradicted and self._contradicts(prior, other, matcher.last)
-            best = other if other.quality > best.quality and not is_similar else best
+            if other.quality > best.quality:
+                is_similar = not prediction.contradicted and self._contradicts(prior, other, matcher.last)
+                best = best if is_similar else other
             is_poor = has_odometry and best.status is not Status.OK
         if (is_poor or not self._state.velocity_known) and not self._budget.is_spent:
             rotations = prediction.T_world_lidar, matcher.last.T_world_lidar

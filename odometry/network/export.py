@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lidarslam.core.errors import OutputError
+from lidarslam.core.files import cannot_write
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.network.checkpoint import Checkpoint, network_of
@@ -71,7 +71,7 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
             for name in names:
                 (folder / name).replace(out / name)
     except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+        raise cannot_write(out, error) from error
     return [out / name for name in names]
 
 

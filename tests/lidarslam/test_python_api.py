@@ -310,6 +310,14 @@ def test_an_error_in_the_background_is_raised_once(slam: Slam, room_scans: list[
     assert len(slam.trajectory()) == 3
 
 
+def test_an_error_of_earlier_scans_in_the_background_is_raised_by_a_later_one(
+    slam: Slam, room_scans: list[Scan]
+) -> None:
+    slam._pipeline.map.thin = None  # type: ignore[assignment]
+    with pytest.raises(LidarSlamError, match="building the map failed: TypeError"):
+        register(slam, room_scans)
+
+
 def test_closed_is_closed(room_scans: list[Scan], tmp_path: Path) -> None:
     before = threading.active_count()
     with Slam(GRAPH) as slam:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import read_array
+from lidarslam.datasets.recording import KITTI_FIELDS
 
 # No sweep is larger; reading more would fill the memory.
 _LARGEST_BYTES = 1 << 31
@@ -21,7 +22,6 @@ _LARGEST_BYTES = 1 << 31
 _MOST_SCANS = 10**9
 
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
-KITTI_FIELDS = ("x", "y", "z", "intensity")
 TableReader = Callable[[Path], NDArray[np.void]]
 # Fields of the float32 numbers of a .bin point, by their number; in the order of preference.
 _BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}

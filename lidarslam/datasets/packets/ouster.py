@@ -67,9 +67,8 @@ class OusterRecording(PacketRecording):
 
         return XYZLut(self.sensor, use_extrinsics=False)
 
-    def _read(self, item: Any, faults: Faults) -> Scan:  # noqa: ARG002
+    def _read(self, frame: Any, faults: Faults) -> Scan:  # noqa: ARG002
         """The scan of one of the library's LidarFrames."""
-        frame = item
         valid = (frame.status & _VALID).astype(bool)
         ranges = frame.field("RANGE")
         points = self._directions(np.where(valid, ranges, 0))

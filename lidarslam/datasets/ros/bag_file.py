@@ -158,7 +158,7 @@ class BagFile:
         return counts
 
     def messages(self, topic: Topic, on_damage: Callable[[str], None] = lambda _: None) -> Iterator[BagMessage]:
-        """All messages of a topic in the order of recording, not decoded, up to damage, which is logged."""
+        """All messages of a topic in the order of recording, not decoded; of each file up to its damage."""
         if not self._has_index:
             yield from self._in_sequence(topic)
             return
