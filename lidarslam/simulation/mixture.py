@@ -18,17 +18,22 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 
 # Used in turn.
-MIXED_WORLDS = ("street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace")
+MIXED_WORLDS = (
+    "street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace", "corridor", "stairs", "crowd",
+)  # fmt: skip
 # How often each is drawn, relative to the others.
 SENSOR_WEIGHTS = {
     "vlp-16": 3.0, "hdl-32e": 1.0, "hdl-64e": 1.0, "hdl-64e-calibrated": 1.0, "os0-64": 1.0, "os1-64": 1.5,
-    "os1-128": 1.5, "xt32": 1.0, "livox": 1.0,
+    "os1-128": 1.5, "xt32": 1.0, "livox": 0.5, "mid-360": 0.5, "avia": 0.5,
 }  # fmt: skip
 _CARRIER_WEIGHTS = {
     "car": 1.5, "handheld": 1.5, "legged": 1.0, "tracked": 1.0, "tracked-harsh": 1.0, "drone": 1.0,
 }  # fmt: skip
 # Worlds with roads, in which a car is at speed from the first scan on.
 _ROADS = frozenset({"street", "park", "fields", "terrace"})
+# Worlds without room for vehicles.
+_NARROW = frozenset({"corridor", "stairs"})
+_ON_FOOT = ("handheld", "legged", "drone")
 _FAST_WEIGHT = 3.0
 _FAST_MPS = (5.0, 30.0)
 _MOUNT_WEIGHTS = {"upright": 0.7, "upside-down": 0.15, "tilted": 0.15}
@@ -96,6 +101,8 @@ def ingredients_of(number: int, seed: int) -> Ingredients:
 def _draw(rng: np.random.Generator, number: int) -> Ingredients:
     world = MIXED_WORLDS[number % len(MIXED_WORLDS)]
     carriers = _CARRIER_WEIGHTS | ({"car-fast": _FAST_WEIGHT} if world in _ROADS else {})
+    if world in _NARROW:
+        carriers = {name: carriers[name] for name in _ON_FOOT}
     sensor, carrier, mount = (_pick(rng, weights) for weights in (SENSOR_WEIGHTS, carriers, _MOUNT_WEIGHTS))
     return Ingredients(world, sensor, carrier, mount, float(rng.uniform(*_FAST_MPS)) if carrier == "car-fast" else None)
 

@@ -67,7 +67,7 @@ RECORDED_SHARE = 0.3
 # Draws the simulated recordings.
 _SIMULATION_SEED = 0
 # To be raised whenever preparation, or the simulation, gives other results than before.
-_KIND = Kind("a recording prepared for training", version=3)
+_KIND = Kind("a recording prepared for training", version=4)
 
 Counter = Callable[[int], None]
 """Called with the number of scans that were prepared since the last call."""

@@ -86,6 +86,8 @@ class Devices:
 
 # Steps between lines of the log, and between validations.
 LOG_EVERY, VALIDATE_EVERY = 50, 500
+# Validations of a training, at most.
+_MOST_VALIDATIONS = 10
 # Largest norm of the gradient; longer ones are clipped.
 _MOST_GRADIENT = 1.0
 # Rotation and translation errors that count the same when validations are compared: a degree and five centimetres.
@@ -155,11 +157,13 @@ class TrainingLoop:
         """
         config, progress = self._config, self._progress
         surfaces, birds = config.geometric is not None, config.network.name == "correlation"
-        pairs = Pairs(recordings.learned, config.seed, surfaces, birds, recordings.weights)
+        device = self._devices.device
+        pairs = Pairs(recordings.learned, config.seed, surfaces, birds, recordings.weights, device=device)
         if progress.best is None:
             self._validate(recordings)
         self._clock = time.perf_counter()
         todo = range(progress.step, config.steps)
+        validate_every = max(VALIDATE_EVERY, -(-config.steps // _MOST_VALIDATIONS))
         drawn = prefetch(pairs.batch(step, config.batch, self._devices.process) for step in todo)
         with contextlib.closing(cast(Any, drawn)) as batches:
             for step, batch in zip(todo, batches, strict=True):
@@ -169,7 +173,7 @@ class TrainingLoop:
                 is_last = progress.step == config.steps
                 if is_last or not progress.step % LOG_EVERY:
                     self._report()
-                if is_last or not progress.step % VALIDATE_EVERY:
+                if is_last or not progress.step % validate_every:
                     self._validate(recordings)
                     self._save()
         self._save()
@@ -183,12 +187,13 @@ class TrainingLoop:
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate(step, config)
         self._optimizer.zero_grad()
-        losses: dict[str, Tensor] = self._module(batch.to(self._devices.device), generator)
+        losses: dict[str, Tensor] = self._module(batch, generator)
         losses["total"].backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self._module.parameters(), _MOST_GRADIENT)
         self._optimizer.step()
-        for name, value in losses.items():
-            progress.sums[name] = progress.sums.get(name, 0.0) + float(value.detach())
+        values = torch.stack(list(losses.values())).tolist()  # one transfer from the device
+        for name, value in zip(losses, values, strict=True):
+            progress.sums[name] = progress.sums.get(name, 0.0) + value
         progress.counted += 1
         progress.step += 1
 

@@ -15,18 +15,18 @@ Floats = NDArray[np.float32]
 
 CELLS = 96
 """Cells along x and along y, the sensor between the two in the middle."""
-CELL_M = 0.5
+CELL_M = 1.0
 CHANNELS = 8
 """Values of a cell."""
 MOST_CELLS = 18
-"""Largest shift that is looked for, in cells along each axis: 9 m."""
+"""Largest shift that is looked for, in cells along each axis: 18 m."""
 SHIFTS = 2 * MOST_CELLS + 1
 """Shifts along x and along y, in cells, that are scored."""
 
-# Points farther away are left out: the largest shifts would wrap them around the border.
-_REACH_M = 20.0
-# Range at which a point counts once for the density; a surface twice as far away returns a quarter as many.
-_DENSITY_M = 10.0
+REACH_M = 40.0 * CELL_M
+"""Points farther away are left out: the largest shifts would wrap them around the border."""
+DENSITY_M = 10.0
+"""Range at which a point counts once for the density; a surface twice as far away returns a quarter as many."""
 
 
 def bird_eye(points: Floats, normals: Floats, heading: float) -> Floats:
@@ -48,7 +48,7 @@ def _accumulate(points: Floats, normals: Floats, c: float, s: float, grid: Float
     for i in range(points.shape[1]):
         px, py, z = points[0, i], points[1, i], points[2, i]
         squared = px * px + py * py
-        if squared == 0.0 or squared > _REACH_M * _REACH_M:
+        if squared == 0.0 or squared > REACH_M * REACH_M:
             continue
         column = math.floor((c * px - s * py) / CELL_M) + CELLS // 2
         row = math.floor((s * px + c * py) / CELL_M) + CELLS // 2
@@ -56,7 +56,7 @@ def _accumulate(points: Floats, normals: Floats, c: float, s: float, grid: Float
         if cell[0] == 0.0:
             cell[6], cell[7] = z, z
         cell[0] += 1.0
-        cell[1] += (squared + z * z) / (_DENSITY_M * _DENSITY_M)
+        cell[1] += (squared + z * z) / (DENSITY_M * DENSITY_M)
         u, v = normals[0, i], normals[1, i]
         x, y = c * u - s * v, s * u + c * v
         # Twice the azimuth of a normal: a wall is the same from both sides.

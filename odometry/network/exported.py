@@ -44,8 +44,6 @@ def describe(network: NetworkConfig, images: ImageConfig) -> dict[str, Any]:
 def read_description(content: dict[str, Any]) -> tuple[NetworkConfig, ImageConfig]:
     """The network and the size of its images, as `describe` wrote them.
 
-    Other keys, which were settings once, have had no values but today's constants.
-
     Raises:
         ValueError: it is no such description.
     """

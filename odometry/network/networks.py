@@ -34,6 +34,7 @@ class PairImages:
     # turn between the two; None for networks that do not look from above
     bird_previous: Tensor | None = None
     bird_current: Tensor | None = None
+    scale: Tensor | None = None  # (B,) of the scene in these grids, as in `training.pairs`; None: its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +82,9 @@ INPUT_CHANNELS = 9
 # Channels of the three stages of the column encoder, and of the bird's-eye encoder; features that are correlated.
 _WIDTHS = (16, 24, 32)
 _BIRD_WIDTH, _BIRD_FEATURES = 16, 8
-# Bounds of the standard deviations. Peaks of columns of 2 degrees and of cells of half a metre are known to a part of
+# Bounds of the standard deviations. Peaks of columns of 2 degrees and of cells of a metre are known to a part of
 # them at best: while a sensor turns, both sweeps are bent, and the peak with them.
-_LEAST_TURN, _LEAST_SHIFT_M, _LARGEST_SIGMA = 0.01, 0.1, 20.0
+_LEAST_TURN, _LEAST_SHIFT_M, _LARGEST_SIGMA = 0.01, 0.2, 20.0
 # A peak is the mean over this many turns or shifts to either side of the highest.
 _PEAK = 2
 # Standard deviations of the directions that are not estimated: roll and pitch, radians, and z, metres.
@@ -273,6 +274,9 @@ class CorrelationNetwork(nn.Module):
         turn_scores = self.turn_scores(*columns.chunk(2))
         shift_scores = self.shift_scores(*cells.chunk(2))
         angle, shift, log_sigma = self.peaks(turn_scores, shift_scores)
+        if pairs.scale is not None:
+            shift = shift / pairs.scale[:, None]
+            log_sigma = log_sigma - pairs.scale[:, None].log() * log_sigma.new_tensor([0.0, 0.0, 0.0, 1.0, 1.0, 0.0])
         translation = torch.cat([shift, torch.zeros_like(shift[:, :1])], dim=1)
         T_prev_curr = make_transform(turn_about_z(angle), translation)
         return PairEstimate(T_prev_curr, log_sigma, turn_scores, shift_scores)

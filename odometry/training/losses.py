@@ -135,7 +135,7 @@ _GEOMETRIC_POINTS = 1024
 _ROTATION = math.radians(1.0)
 _TRANSLATION_M = 0.05
 # Two columns and two cells: within these an error is that of the right peak.
-_NEAR_ROTATION, _NEAR_TRANSLATION_M = math.radians(4.0), 1.0
+_NEAR_ROTATION, _NEAR_TRANSLATION_M = math.radians(4.0), 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,13 +157,13 @@ def objective(estimate: PairEstimate, batch: PairBatch, config: TrainingConfig, 
     total, alignment, confidence, turn, shift, planes, normals = (zero,) * 7
     if config.alignment_weight:
         error = motion_error(estimate.T_prev_curr, batch.T_prev_curr)
-        is_near = _is_near(error) if estimate.turn_scores.shape[1] else torch.ones_like(batch.valid)
+        is_near = _is_near(error, _scale(batch)) if estimate.turn_scores.shape[1] else torch.ones_like(batch.valid)
         alignment = _mean_of_valid(_distance(error), batch.valid & is_near)
         confidence = _mean_of_valid(_negative_log_likelihood(error, estimate.log_sigma), batch.valid)
         if estimate.turn_scores.shape[1]:
             turn = _mean_of_valid(_turn_loss(estimate.turn_scores, batch.T_prev_curr), batch.valid)
         if estimate.shift_scores.shape[1]:
-            cells = batch.T_prev_curr[:, :2, 3] / bird_eye.CELL_M  # (B, 2) along x, along y
+            cells = batch.T_prev_curr[:, :2, 3] * _scale(batch)[:, None] / bird_eye.CELL_M  # (B, 2) along x, along y
             in_reach = cells.abs().amax(1) < bird_eye.MOST_CELLS - 1
             shift = _mean_of_valid(_shift_loss(estimate.shift_scores, cells), batch.valid & in_reach)
         total = total + config.alignment_weight * (0.3 * alignment + 0.1 * confidence + turn + shift)
@@ -180,6 +180,11 @@ def motion_error(T_prev_curr: Tensor, target: Tensor) -> Tensor:
     return log(T_prev_curr @ inverse(target))
 
 
+def _scale(batch: PairBatch) -> Tensor:
+    """(B,) of the scenes in the bird's-eye grids."""
+    return torch.ones_like(batch.T_prev_curr[:, 0, 0]) if batch.scale is None else batch.scale
+
+
 def _distance(error: Tensor) -> Tensor:
     """(B,) rotation and translation, each in its unit, squared when small and linear when large."""
     rotation = error[:, :3].norm(dim=1) / _ROTATION
@@ -189,10 +194,10 @@ def _distance(error: Tensor) -> Tensor:
     ).sum(dim=1)
 
 
-def _is_near(error: Tensor) -> Tensor:
+def _is_near(error: Tensor, scale: Tensor) -> Tensor:
     """(B,) whether the right peak was found; the position of a wrong one has no useful gradient."""
     rotation, translation = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
-    near: Tensor = (rotation < _NEAR_ROTATION) & (translation < _NEAR_TRANSLATION_M)
+    near: Tensor = (rotation < _NEAR_ROTATION) & (translation * scale < _NEAR_TRANSLATION_M)
     return near
 
 

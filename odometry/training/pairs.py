@@ -6,14 +6,15 @@ Pairs are augmented: turned, mirrored, scaled, thinned and made noisy; the motio
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Generator, Tensor
+from torch.nn import functional
 
-from lidarslam.odometry.images.bird_eye import bird_eye
-from lidarslam.odometry.network.networks import PairImages
+from lidarslam.odometry.images.bird_eye import CELL_M, CELLS, DENSITY_M, MOST_CELLS, REACH_M
+from lidarslam.odometry.network.networks import PairImages, has_normal
 from lidarslam.odometry.network.torch_geometry import inverse, log, make_transform, skew, turn_about_z
 from lidarslam.odometry.training.preparation import PreparedRecording
 
@@ -26,7 +27,7 @@ _PANES = 6
 class Augmentation(NamedTuple):
     """Random changes of pairs; probabilities unless said otherwise."""
 
-    max_gap: int = 10  # steps from one scan of a pair to the other, 1 to this many, small ones more often
+    max_gap: int = 10  # steps from one scan of a pair to the other, 1 to this many
     reverse: float = 0.5  # the later scan comes first
     heading: float = 1.0  # both scans are turned about z by the same angle, any
     roll: float = 0.8  # the current scan is turned about z by whole columns
@@ -38,9 +39,12 @@ class Augmentation(NamedTuple):
     drop_points: float = 0.2  # up to this part of the points, of each scan separately
     hide_sector: float = 0.2  # up to a quarter of the turn is emptied in one scan
     range_noise_m: float = 0.02  # greatest standard deviation of noise on the ranges
+    normal_noise: float = 0.3  # and on the components of normals, of each scan separately
+    drop_normals: float = 0.3  # up to this part of the normals, likewise
     wet_ground: float = 0.15  # level ground beyond 5 to 30 m does not return
     glass: float = 0.15  # several rectangles of one scan do not return
     bird_turn_deg: float = 0.7  # standard deviation of the error of the turn with which scans are seen from above
+    fine: float = 0.75  # seen from above twice as large, unless the translation would leave the grid
 
 
 AUGMENTATION = Augmentation()
@@ -83,15 +87,27 @@ def augmented(batch: PairBatch, config: Augmentation, generator: Generator) -> P
     return replace(batch, previous=previous, current=current)
 
 
+def _uniform(generator: Generator, *shape: int) -> Tensor:
+    return torch.rand(shape, generator=generator, device=generator.device)
+
+
+def _normal(generator: Generator, *shape: int) -> Tensor:
+    return torch.randn(shape, generator=generator, device=generator.device)
+
+
+def _columns(generator: Generator, width: int, size: int) -> Tensor:
+    return torch.randint(width, (size,), generator=generator, device=generator.device)
+
+
 def _turned(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
     """Both scans turned about z by whole columns, the current one by some more."""
     size, width = len(batch.previous), batch.previous.shape[-1]
-    both = torch.randint(width, (size,), generator=generator)
-    both = torch.where(torch.rand(size, generator=generator) < config.heading, both, 0)
-    more = torch.randn(size, generator=generator) * (config.roll_deg * width / 360.0)
-    anywhere = torch.rand(size, generator=generator) < config.any_roll
-    more = torch.where(anywhere, torch.randint(width, (size,), generator=generator).float(), more.round())
-    more = torch.where(torch.rand(size, generator=generator) < config.roll, more, 0.0).long()
+    both = _columns(generator, width, size)
+    both = torch.where(_uniform(generator, size) < config.heading, both, 0)
+    more = _normal(generator, size) * (config.roll_deg * width / 360.0)
+    anywhere = _uniform(generator, size) < config.any_roll
+    more = torch.where(anywhere, _columns(generator, width, size).float(), more.round())
+    more = torch.where(_uniform(generator, size) < config.roll, more, 0.0).long()
     T = _turns(both, width) @ batch.T_prev_curr @ _turns(both + more, width).mT
     return batch.changed(lambda images: _rotated(images, both), lambda images: _rotated(images, both + more), T)
 
@@ -107,8 +123,8 @@ def _turns(columns: Tensor, width: int) -> Tensor:
 
 
 def _mirrored(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
-    chosen = torch.rand(len(batch.previous), generator=generator) < config.mirror
-    M = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0]))
+    chosen = _uniform(generator, len(batch.previous)) < config.mirror
+    M = torch.diag(batch.T_prev_curr.new_tensor([1.0, -1.0, 1.0, 1.0]))
 
     def one(images: Tensor) -> Tensor:
         flipped = torch.cat([mirror(images[:, :3]), mirror(images[:, 3:])], dim=1)
@@ -118,9 +134,9 @@ def _mirrored(batch: PairBatch, config: Augmentation, generator: Generator) -> P
 
 
 def _scaled(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
-    exponent = 2.0 * torch.rand(len(batch.previous), generator=generator) - 1.0
+    exponent = 2.0 * _uniform(generator, len(batch.previous)) - 1.0
     scale = (1.0 + config.scale) ** exponent
-    factors = torch.ones(len(scale), 6, 1, 1)
+    factors = scale.new_ones(len(scale), 6, 1, 1)
     factors[:, :3, 0, 0] = scale[:, None]
     T = batch.T_prev_curr.clone()
     T[:, :3, 3] *= scale[:, None]
@@ -131,28 +147,38 @@ def _worn(images: Tensor, config: Augmentation, generator: Generator) -> Tensor:
     """Scans of a worse sensor: noise, missing points, beams and directions."""
     size, _, height, width = images.shape
 
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(size, *shape, generator=generator)
+    uniform = partial(_uniform, generator, size)
 
     kept = uniform(height, width) >= config.drop_points * uniform(1, 1)
     beams = uniform(height, 1) >= 0.5 * uniform(1, 1) * (uniform(1, 1) < config.drop_beams)
     hidden = 0.25 * uniform(1, 1) * (uniform(1, 1) < config.hide_sector)
-    sector = (torch.arange(width) / width + uniform(1, 1)).remainder(1.0) >= hidden
+    sector = (torch.arange(width, device=images.device) / width + uniform(1, 1)).remainder(1.0) >= hidden
     sparse = _missing_returns(images, config, uniform)
     points = images[:, :3]
-    noise = config.range_noise_m * uniform(1, 1, 1) * torch.randn(size, 1, height, width, generator=generator)
+    noise = config.range_noise_m * uniform(1, 1, 1) * _normal(generator, size, 1, height, width)
     ranges = points.square().sum(1, keepdim=True).sqrt()
     noisy = points * (1.0 + noise / ranges.clamp(min=1.0))
-    return torch.cat([noisy, images[:, 3:]], dim=1) * (kept & beams & sector & sparse)[:, None]
+    normals = _worn_normals(images[:, 3:], config, generator)
+    return torch.cat([noisy, normals], dim=1) * (kept & beams & sector & sparse)[:, None]
+
+
+def _worn_normals(normals: Tensor, config: Augmentation, generator: Generator) -> Tensor:
+    """Normals (B, 3, H, W) as of rougher surfaces: some tilted at random, some missing."""
+    size, _, height, width = normals.shape
+    uniform = partial(_uniform, generator, size)
+    noise = config.normal_noise * uniform(1, 1, 1).square() * _normal(generator, *normals.shape)
+    kept = uniform(height, width) >= config.drop_normals * uniform(1, 1).square()
+    return functional.normalize(normals + noise, dim=1) * (has_normal(normals, 1) & kept)[:, None]
 
 
 def _missing_returns(images: Tensor, config: Augmentation, uniform: Callable[..., Tensor]) -> Tensor:
     """(B, H, W) which points return: wet ground reflects the beam away beyond some range, glass lets it through."""
-    size, _, height, width = images.shape
+    height, width = images.shape[2:]
     ranges = images[:, :3].square().sum(1).sqrt()
     wet = (uniform(1, 1) < config.wet_ground) & (images[:, 5].abs() > _LEVEL) & (ranges > 5.0 + 25.0 * uniform(1, 1))
-    row, column = torch.arange(height)[:, None] / height, torch.arange(width) / width
-    pane = torch.zeros(size, height, width, dtype=torch.bool)
+    row = torch.arange(height, device=images.device)[:, None] / height
+    column = torch.arange(width, device=images.device) / width
+    pane = torch.zeros_like(wet)
     for _ in range(_PANES):
         across = (column - uniform(1, 1)).remainder(1.0) < 0.05 * uniform(1, 1)
         pane |= across & ((row - uniform(1, 1)).remainder(1.0) < 0.6 * uniform(1, 1))
@@ -220,6 +246,7 @@ class Pairs:
         birds: whether the network looks from above.
         weights: how often each recording is drawn, relative to the others; None: equally often.
         augmentation: how pairs are changed.
+        device: where they are changed.
     """
 
     def __init__(
@@ -230,6 +257,7 @@ class Pairs:
         birds: bool = True,
         weights: Sequence[float] | None = None,
         augmentation: Augmentation = AUGMENTATION,
+        device: torch.device = torch.device("cpu"),  # noqa: B008
     ) -> None:
         if not recordings:
             raise ValueError("training needs a recording or more, got none")
@@ -239,11 +267,14 @@ class Pairs:
         self._birds = birds
         self._weights = torch.tensor([1.0] * len(recordings) if weights is None else weights, dtype=torch.float64)
         self._augmentation = augmentation
+        self._device = device
 
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
-        """The pairs of one step."""
-        generator = torch.Generator().manual_seed((self._seed * _STREAM**2 + step * _STREAM + process) % _SEEDS)
-        pairs = augmented(stack([self._draw(generator) for _ in range(size)]), self._augmentation, generator)
+        """The pairs of one step, on the device."""
+        seed = (self._seed * _STREAM**2 + step * _STREAM + process) % _SEEDS
+        choice, generator = torch.Generator().manual_seed(seed), torch.Generator(self._device).manual_seed(seed)
+        drawn = stack([self._draw(choice) for _ in range(size)]).to(self._device)
+        pairs = augmented(drawn, self._augmentation, generator)
         return self._seen_from_above(pairs, generator) if self._birds else pairs
 
     def _draw(self, generator: Generator) -> PairBatch:
@@ -258,27 +289,53 @@ class Pairs:
         """The pairs with bird's-eye grids; the turn between the scans is known to within an error."""
         size = len(batch.previous)
         turns = torch.atan2(batch.T_prev_curr[:, 1, 0], batch.T_prev_curr[:, 0, 0])
-        errors = torch.randn(size, generator=generator) * math.radians(self._augmentation.bird_turn_deg)
+        errors = _normal(generator, size) * math.radians(self._augmentation.bird_turn_deg)
+        fits = 2.0 * batch.T_prev_curr[:, :2, 3].abs().amax(1) < (MOST_CELLS - 1) * CELL_M
+        scale = 1.0 + (fits & (_uniform(generator, size) < self._augmentation.fine)).to(turns)
         return replace(
             batch,
-            bird_previous=birds(batch.previous, torch.zeros(size)),
-            bird_current=birds(batch.current, turns + errors),
+            bird_previous=birds(batch.previous, torch.zeros_like(turns), scale),
+            bird_current=birds(batch.current, turns + errors, scale),
+            scale=scale,
         )
 
 
 def _gap(generator: Generator, most: int) -> int:
-    """Steps from 1 to the most, each as likely as all up to twice as many together: small ones are common."""
-    exponent = float(torch.rand((), generator=generator, dtype=torch.float64))
-    return min(int((most + 1.0) ** exponent), most)
+    return int(torch.randint(1, most + 1, (), generator=generator))
 
 
-def birds(images: Tensor, headings: Tensor) -> Tensor:
-    """Bird's-eye grids (B, CHANNELS, CELLS, CELLS) of points and normals (B, 6, H, W), turned by headings (B,)."""
+def birds(images: Tensor, headings: Tensor, scale: Tensor | None = None) -> Tensor:
+    """Bird's-eye grids (B, CHANNELS, CELLS, CELLS) of points and normals (B, 6, H, W), turned by headings (B,).
+
+    As `images.bird_eye.bird_eye`, for a batch on any device; scale (B,) enlarges the scenes in the plane.
+    """
+    x, y, z, u, v, _ = images.flatten(2).unbind(1)  # (B, N)
+    c, s = headings.cos()[:, None], headings.sin()[:, None]
+    size_m = CELL_M / (torch.ones_like(c) if scale is None else scale[:, None])
+    squared = x * x + y * y
+    column = ((c * x - s * y) / size_m).floor() + CELLS // 2
+    row = ((s * x + c * y) / size_m).floor() + CELLS // 2
+    is_shown = (squared > 0.0) & (squared <= (REACH_M * size_m / CELL_M).square())
+    cells = CELLS * CELLS
+    index = torch.where(is_shown, row * CELLS + column, cells).long()  # the last for all others
+    one, other = c * u - s * v, s * u + c * v
+    density = (squared + z * z) / DENSITY_M**2
+    parts = [torch.ones_like(x), density, u * u + v * v, one * one - other * other, 2.0 * one * other, z]
+    sums = x.new_zeros(len(x), len(parts), cells + 1)
+    sums.scatter_add_(2, index[:, None].expand(-1, len(parts), -1), torch.stack(parts, dim=1))
+    low, high = (
+        x.new_zeros(len(x), cells + 1).scatter_reduce_(1, index, z, reduction, include_self=False)
+        for reduction in ("amin", "amax")
+    )
+    count, density, upright, along, across, height = sums.unbind(1)
+    amount = upright.log1p()
+    facing = amount / upright.clamp(min=1e-6)
+    mean = height / count.clamp(min=1.0)
     grids = [
-        bird_eye(image[:3].numpy(), image[3:].numpy(), float(heading))
-        for image, heading in zip(images, headings, strict=True)
-    ]
-    return torch.from_numpy(np.stack(grids))
+        0.5 * count.log1p(), 0.5 * density.log1p(), amount, facing * along, facing * across,
+        (0.4 * mean).tanh(), (0.4 * high).tanh(), (high - low).tanh(),
+    ]  # fmt: skip
+    return torch.stack(grids, dim=1)[..., :cells].reshape(len(x), -1, CELLS, CELLS)
 
 
 def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces: bool = True) -> PairBatch:

@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from lidarslam.odometry.images.bird_eye import CELL_M, CELLS, CHANNELS, bird_eye
+from lidarslam.odometry.training.pairs import birds
 
 MIDDLE = CELLS // 2
 
@@ -51,7 +53,7 @@ def test_a_displacement_by_whole_cells_shifts_the_grid(rng):
 
 def test_walls_differ_from_ground_and_are_the_same_from_both_sides():
     def cell(normal: tuple[float, float, float]):
-        return bird_eye(*image([(5.1, 5.1, 0.0)], [normal]), 0.0)[:, MIDDLE + 10, MIDDLE + 10]
+        return bird_eye(*image([(5.1, 5.1, 0.0)], [normal]), 0.0)[:, MIDDLE + 5, MIDDLE + 5]
 
     ground, wall, behind, across = (cell(n) for n in ((0, 0, 1), (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
     assert ground[2] == 0.0
@@ -59,3 +61,19 @@ def test_walls_differ_from_ground_and_are_the_same_from_both_sides():
     assert wall[2] > 0.5
     np.testing.assert_allclose(wall[3], -across[3])
     assert wall[3] > 0.5
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_grids_of_a_batch_are_those_of_each_scan(rng, scale):
+    points = rng.normal(scale=15.0, size=(3, 3, 16, 90)).astype(np.float32)
+    normals = rng.normal(size=points.shape).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points[..., ::5], normals[..., ::3] = 0.0, 0.0
+    headings = (0.0, 1.1, -2.7)
+    images = torch.from_numpy(np.concatenate([points, normals], axis=1))
+    grids = birds(images, torch.tensor(headings), torch.full((3,), scale)).numpy()
+    for one, (cloud, directions, heading) in zip(grids, zip(points, normals, headings, strict=True), strict=True):
+        alone = bird_eye(cloud * np.float32([[[scale]], [[scale]], [[1.0]]]), directions, heading)
+        np.testing.assert_allclose(one[[0, 2, 3, 4, 5, 6, 7]], alone[[0, 2, 3, 4, 5, 6, 7]], atol=1e-5)
+        if scale == 1.0:
+            np.testing.assert_allclose(one[1], alone[1], atol=1e-5)  # the density is that of the scene as it is

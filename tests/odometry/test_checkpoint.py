@@ -12,7 +12,6 @@ from safetensors.torch import save_file
 
 from lidarslam.core.errors import InputError
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
-from lidarslam.odometry.network import checkpoint as module
 from lidarslam.odometry.network.checkpoint import (
     Checkpoint,
     Kind,
@@ -23,7 +22,6 @@ from lidarslam.odometry.network.checkpoint import (
     write_tensor_file,
 )
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.network.shipped import default_weights
 
 IMAGES = ImageConfig(rows=16, columns=96)
 
@@ -117,9 +115,3 @@ def test_weights_that_do_not_fit_are_told(trained: Checkpoint, file: Path) -> No
         load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.full((32,), torch.nan)})))
     with pytest.raises(InputError, match=r"Unexpected key.*surplus"):
         load_checkpoint(saved(lambda w: w.update({"surplus": torch.zeros(1)})))
-
-
-def test_the_shipped_weights_load_with_keys_that_were_settings_once() -> None:
-    _, content = module.read_tensor_file(default_weights(), module.WEIGHTS)
-    assert "normals" in content["images"]
-    assert load_checkpoint(default_weights()).images == ImageConfig()

@@ -81,7 +81,7 @@ def test_the_draw_of_a_number_does_not_change():
     first = [tuple(vars(ingredients_of(number, SEED)).values()) for number in range(3)]
     assert first == [
         ("street", "os1-64", "handheld", "upright", None),
-        ("office", "xt32", "legged", "upside-down", None),
+        ("office", "livox", "legged", "upside-down", None),
         ("tunnel", "vlp-16", "handheld", "upright", None),
     ]
 
