@@ -28,7 +28,8 @@ class LearnedConfig(BaseModel):
     threads: int = Field(1, ge=1, le=256, description="of the network; mapping works beside it")
     alignment: bool = Field(True, description="false: the network's motion as it is, for ablations")
     when: Literal["needed", "always"] = Field(
-        "always", description="needed: only at scans whose motion the mapping does not predict well enough by itself"
+        "needed",
+        description="needed: with a mapping, only at scans whose motion it does not predict well enough by itself",
     )
 
 
