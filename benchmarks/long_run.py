@@ -50,6 +50,7 @@ from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
@@ -140,7 +141,7 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         graph = begin_graph(config, file=unfinished.files.submaps)
         assert graph is not None
         stack.callback(graph.close)
-        log, odometry = ScanLog(), make_odometry(config.odometry)
+        log, odometry = ScanLog(), where_needed(make_odometry(config.odometry), config)
         stack.callback(odometry.close)
         checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
         store = TileStore(options.out, unfinished.files.tiles)

@@ -37,6 +37,7 @@ from lidarslam.odometry.config import KissConfig, OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import in_order
 from lidarslam.simulation.motion import CARRIERS, mount_pose
@@ -156,7 +157,7 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
 
 def pipeline_results(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> list[ScanEstimate]:
     """Take a recording through the pipeline of `lidarslam run`."""
-    odometry = make_odometry(config.odometry, prior)
+    odometry = where_needed(make_odometry(config.odometry, prior), config)
     try:
         return list(Pipeline(odometry, make_localiser(config), config.global_map).run(recorded.scans))
     finally:

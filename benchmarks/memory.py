@@ -40,6 +40,7 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline import threads
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
@@ -150,7 +151,7 @@ def watch(case: Case, every: int) -> list[Row]:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
         unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
         log, localiser = ScanLog(), make_localiser(case.config)
-        odometry = make_odometry(case.config.odometry, case.prior)
+        odometry = where_needed(make_odometry(case.config.odometry, case.prior), case.config)
         graph = begin_graph(case.config, file=unfinished.files.submaps)
         checkpoints = Checkpoints(unfinished, case.config.checkpoints, odometry, log, graph)
         pipeline = Pipeline(odometry, localiser, case.config.global_map, graph, checkpoints)

@@ -10,11 +10,12 @@ from typing import Annotated
 
 import numpy as np
 
+from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Shape, State, Stateful
 from lidarslam.core.tracking import Status
-from lidarslam.odometry.interface import Motion, SkippingOdometry
+from lidarslam.odometry.interface import Motion, Odometry, SkippingOdometry
 from lidarslam.pipeline.estimates import ScanEstimate
 
 # Scans in a row that have to be ok before one does without the odometry.
@@ -114,3 +115,10 @@ class OdometryGate(Stateful):
             self._error_m = max(_FADING * self._error_m, error_m)
             self._ok += 1
         self._velocity = motion / interval_s
+
+
+def where_needed(odometry: Odometry, config: Config) -> Odometry:
+    """The odometry, asked only where it is needed if it can be skipped and the configuration says so."""
+    if config.odometry.learned.when == "always" or not config.mapping.enabled:
+        return odometry
+    return OdometryGate(odometry) if isinstance(odometry, SkippingOdometry) else odometry

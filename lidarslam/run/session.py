@@ -13,13 +13,13 @@ from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.global_map.drawing import DrawnMap
-from lidarslam.odometry.interface import Odometry, SkippingOdometry
+from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.map_building import MapBuilder
-from lidarslam.pipeline.odometry_gate import OdometryGate
+from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest
@@ -268,7 +268,4 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
     if config.mapping.method not in MAPPINGS.built_in:
         MAPPINGS.load(config.mapping.method, Callable)  # so that nothing is written if it cannot be
-    odometry = make_odometry(config.odometry, None if prior is None else read_tum(prior))
-    if config.odometry.learned.when == "always" or not config.mapping.enabled:
-        return odometry
-    return OdometryGate(odometry) if isinstance(odometry, SkippingOdometry) else odometry
+    return where_needed(make_odometry(config.odometry, None if prior is None else read_tum(prior)), config)
