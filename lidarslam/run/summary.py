@@ -129,6 +129,7 @@ class WrittenMap:
 
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
+_WALKING_MPS = 1.5
 
 
 @dataclass(frozen=True)
@@ -309,11 +310,17 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 
 
 def _unconstrained_m(log: ScanLog) -> float:
-    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends."""
+    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
+
+    A degraded first motion counts as a walking speed at least: amid people who walk along, it appears to be none.
+    """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)
-    return float(np.linalg.norm(moved * open_axes, axis=1).sum())
+    lengths_m = np.linalg.norm(moved * open_axes, axis=1)
+    if log.statuses[1:2] == [Status.DEGRADED]:
+        lengths_m[0] = max(lengths_m[0], _WALKING_MPS * (log.stamps[1] - log.stamps[0]))
+    return float(lengths_m.sum())
 
 
 def _warnings(
@@ -339,8 +346,8 @@ def _warnings(
     length_m = log.trajectory.length_m
     if is_unconstrained(unconstrained_m, length_m):
         yield (
-            f"{unconstrained_m:.1f} m of the way of {length_m:.1f} m lie along directions that hardly any surface"
-            " constrains: the length is uncertain, as in an even corridor"
+            f"the length of {length_m:.1f} m is uncertain by {unconstrained_m:.1f} m, along directions that hardly any"
+            " surface constrains, as in a featureless corridor or at a start amid people who walk along"
         )
     is_tracked = np.array([status is Status.OK for status in log.statuses])
     if (wrong := time_scale_warning(time_scale(log.trajectory, log.turn_rates, is_tracked))) is not None:

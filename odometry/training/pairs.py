@@ -257,7 +257,7 @@ class Pairs:
         birds: bool = True,
         weights: Sequence[float] | None = None,
         augmentation: Augmentation = AUGMENTATION,
-        device: torch.device = torch.device("cpu"),  # noqa: B008
+        device: torch.device | str = "cpu",
     ) -> None:
         if not recordings:
             raise ValueError("training needs a recording or more, got none")
@@ -267,7 +267,7 @@ class Pairs:
         self._birds = birds
         self._weights = torch.tensor([1.0] * len(recordings) if weights is None else weights, dtype=torch.float64)
         self._augmentation = augmentation
-        self._device = device
+        self._device = torch.device(device)
 
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
         """The pairs of one step, on the device."""
@@ -279,7 +279,8 @@ class Pairs:
 
     def _draw(self, generator: Generator) -> PairBatch:
         recording = self._recordings[int(torch.multinomial(self._weights, 1, generator=generator))]
-        gap = _gap(generator, min(self._augmentation.max_gap, len(recording) - 1))
+        most = min(self._augmentation.max_gap, len(recording) - 1)
+        gap = int(torch.randint(1, most + 1, (), generator=generator))
         first = int(torch.randint(len(recording) - gap, (), generator=generator))
         pair = pair_of(recording, first, first + gap, self._surfaces)
         is_reversed = float(torch.rand((), generator=generator)) < self._augmentation.reverse
@@ -298,10 +299,6 @@ class Pairs:
             bird_current=birds(batch.current, turns + errors, scale),
             scale=scale,
         )
-
-
-def _gap(generator: Generator, most: int) -> int:
-    return int(torch.randint(1, most + 1, (), generator=generator))
 
 
 def birds(images: Tensor, headings: Tensor, scale: Tensor | None = None) -> Tensor:

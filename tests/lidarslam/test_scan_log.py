@@ -95,4 +95,16 @@ def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_su
     summary = summarise(corridor_log(open_scans), WrittenMap(0, None, 0), skipped=0)
     assert summary.to_json()["unconstrained_m"] == pytest.approx(open_scans, abs=1e-9)
     assert summary.went_astray == unknown
-    assert any("the length is uncertain" in warning for warning in summary.warnings) == unknown
+    assert any("is uncertain by" in warning for warning in summary.warnings) == unknown
+
+
+@pytest.mark.parametrize(("interval_s", "status", "unknown"), [
+    (0.5, Status.DEGRADED, True), (0.5, Status.OK, False), (0.05, Status.DEGRADED, False),
+])  # fmt: skip
+def test_the_length_is_unknown_where_the_first_motion_of_a_slow_recording_is_degraded(
+    interval_s: float, status: Status, unknown: bool
+) -> None:
+    log = ScanLog()
+    for scan in range(8):
+        log.add(result(interval_s * scan, status=status if scan == 1 else Status.OK))
+    assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
