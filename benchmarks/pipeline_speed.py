@@ -97,7 +97,7 @@ def _measure(name: str, scans: Sequence[Scan], source: Scans, options: argparse.
     points = int(np.mean([len(scan) for scan in scans]))
     print(f"\n{name}: {len(scans)} scans of {points:,} points, {options.rounds} rounds\n")
     print_header(
-        ["method", "wall, ms a scan", "median", "p99", "CPU, ms a scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"]
+        ["method", "wall, ms per scan", "median", "p99", "CPU, ms per scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"]
     )
     counted = len(scans) - options.warm_up
     for method in runs:
