@@ -16,6 +16,7 @@ TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
 NONE = Augmentation(
     max_gap=1, reverse=0.0, roll=0.0, roll_deg=0.0, any_roll=0.0, mirror=0.0, scale=0.0, drop_beams=0.0,
     drop_points=0.0, hide_sector=0.0, range_noise_m=0.0, wet_ground=0.0, glass=0.0,
+    normal_noise=0.0, drop_normals=0.0, fine=0.0,
 )  # fmt: skip
 WORN = {"drop_beams": 1.0, "drop_points": 0.5, "hide_sector": 1.0, "range_noise_m": 0.05}
 
@@ -213,3 +214,26 @@ def test_noise_is_along_the_rays_and_of_the_size_asked_for(recording):
     spread = (after.norm(dim=1) - ranges)[ranges > 1.0].view(-1).std()
     # A standard deviation that is drawn evenly up to s makes s / sqrt(3) in all.
     assert float(spread) == pytest.approx(0.05 / math.sqrt(3.0), rel=0.2)
+
+
+def test_worn_normals_are_unit_tilted_and_fewer(recording):
+    several = stack([pair_of(recording, 0, 1, surfaces=False)] * 16)
+    worn = augmented(several, only(heading=0.0, normal_noise=0.3, drop_normals=0.5), torch.Generator().manual_seed(3))
+    torch.testing.assert_close(worn.previous[:, :3], several.previous[:, :3])
+    before, after = several.previous[:, 3:], worn.previous[:, 3:]
+    lengths = after.norm(dim=1)
+    kept = lengths > 0.0
+    torch.testing.assert_close(lengths[kept], torch.ones_like(lengths[kept]))
+    assert 0.5 < float(kept.sum() / (before.norm(dim=1) > 0.0).sum()) < 1.0
+    assert 0.8 < float((before * after).sum(1)[kept].mean()) < 1.0
+
+
+@pytest.mark.parametrize(("along_m", "scale"), [(8.0, 2.0), (9.0, 1.0)])
+def test_scenes_are_enlarged_if_the_translation_stays_within_the_grid(small_room, along_m, scale):
+    recording = small_room.recording(2, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
+    T = torch.eye(4).repeat(1, 1, 1)
+    T[:, 0, 3] = along_m
+    pairs = Pairs([replace(recording, T_prev_curr=T)], seed=1, surfaces=False, augmentation=only(fine=1.0, heading=0.0))
+    batch = pairs.batch(0, 4)
+    assert batch.scale is not None
+    assert batch.scale.tolist() == [scale] * 4
