@@ -312,14 +312,16 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 def _unconstrained_m(log: ScanLog) -> float:
     """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
 
-    A degraded first motion counts as a walking speed at least: amid people who walk along, it appears to be none.
+    A degraded first motion counts with what it lacks of a walking speed: amid people who walk along, it appears to be
+    none.
     """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)
     lengths_m = np.linalg.norm(moved * open_axes, axis=1)
     if log.statuses[1:2] == [Status.DEGRADED]:
-        lengths_m[0] = max(lengths_m[0], _WALKING_MPS * (log.stamps[1] - log.stamps[0]))
+        walked_m = _WALKING_MPS * (log.stamps[1] - log.stamps[0])
+        lengths_m[0] = max(lengths_m[0], walked_m - np.linalg.norm(moved[0]))
     return float(lengths_m.sum())
 
 
