@@ -3,10 +3,11 @@
 import math
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
 from lidarslam.core.plugins import PlugPoint
+from lidarslam.core.settings import Settings
 
 MappingName = Literal["surfels", "loam", "off"]
 MAPPINGS = PlugPoint("mapping", get_args(MappingName))
@@ -18,11 +19,7 @@ BudgetMs = Annotated[float, Field(ge=1.0, le=1e6)] | Literal["auto"] | None
 """Milliseconds that a scan may take; auto: half of the time between scans; None: not bounded."""
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class TrackingConfig(_Settings):
+class TrackingConfig(Settings):
     """Inlier ratios that a registered scan needs; see `mapping.tracking.fit`."""
 
     degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio below which a scan is degraded")
@@ -34,7 +31,7 @@ class TrackingConfig(_Settings):
         return self
 
 
-class MappingConfig(_Settings):
+class MappingConfig(Settings):
     """Scan-to-map registration."""
 
     method: Annotated[str, BeforeValidator(MAPPINGS.check)] = Field(
@@ -94,7 +91,7 @@ class MappingConfig(_Settings):
 # The global map, keyframes, loop closures.
 
 
-class GlobalMapConfig(_Settings):
+class GlobalMapConfig(Settings):
     """The merged map of a run."""
 
     voxel_size_m: float | None = Field(
@@ -126,7 +123,7 @@ class GlobalMapConfig(_Settings):
         return self
 
 
-class KeyframeConfig(_Settings):
+class KeyframeConfig(Settings):
     """When a scan becomes a keyframe; see `mapping.pose_graph.keyframes`."""
 
     distance_m: float | None = Field(
@@ -135,7 +132,7 @@ class KeyframeConfig(_Settings):
     turn_deg: float = Field(25.0, ge=1.0, le=180.0, description="turn from one to the next")
 
 
-class LoopConfig(_Settings):
+class LoopConfig(Settings):
     """Loop detection and verification; see `mapping.loops.detection`."""
 
     max_range_m: float = Field(60.0, ge=1.0, le=10_000.0, description="farther points of a keyframe are left out")
@@ -156,7 +153,7 @@ class LoopConfig(_Settings):
         return math.radians(0.02 * self.drift_percent), 0.01 * self.drift_percent
 
 
-class PoseGraphConfig(_Settings):
+class PoseGraphConfig(Settings):
     """Keyframes, loop closures and their optimisation; see `mapping.pose_graph.slam_graph`."""
 
     enabled: bool = Field(False, description="build a pose graph, close loops, and correct trajectory and map")

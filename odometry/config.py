@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Annotated, Literal, Self, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.limits import require_range_left
 from lidarslam.core.plugins import PlugPoint
+from lidarslam.core.settings import Settings
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
 ODOMETRIES = PlugPoint("odometry", get_args(OdometryName))
@@ -16,10 +17,8 @@ Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 Metres = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
-class LearnedConfig(BaseModel):
+class LearnedConfig(Settings):
     """The learned odometry; see `odometry.methods.learned`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     weights: Path | None = Field(
         None, description="file of `lidarslam train` or folder of `lidarslam export`; null: the shipped network"
@@ -33,10 +32,8 @@ class LearnedConfig(BaseModel):
     )
 
 
-class KissConfig(BaseModel):
+class KissConfig(Settings):
     """KISS-ICP; the defaults are its own."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="points farther away are left out")
     min_range_m: float = Field(0.0, ge=0.0, le=1000.0, description="points nearer are left out")
@@ -56,10 +53,8 @@ class KissConfig(BaseModel):
         return self
 
 
-class OdometryConfig(BaseModel):
+class OdometryConfig(Settings):
     """The scan-to-scan odometry."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     method: Annotated[str, BeforeValidator(ODOMETRIES.check)] = Field(
         "learned",
@@ -103,18 +98,14 @@ class OdometryConfig(BaseModel):
         return make_transform(R, self.imu_position_m)
 
 
-class ImageConfig(BaseModel):
+class ImageConfig(Settings):
     """Size of the network's range images; columns go round once, rows span the sensor's elevations."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     rows: int = Field(16, ge=16, le=256, multiple_of=4, description="of elevation")
     columns: int = Field(720, ge=64, le=4096, multiple_of=4, description="of azimuth")
 
 
-class NetworkConfig(BaseModel):
+class NetworkConfig(Settings):
     """The network that compares two scans."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: NetworkName = Field("correlation", description="correlation (default), or delora, the paper's")

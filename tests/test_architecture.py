@@ -44,6 +44,7 @@ CORE_EXCEPTIONS = {
     "lidarslam.core.compiled": {"numba"},
     "lidarslam.core.tasks": {"ray"},
     "lidarslam.core.json_text": {"pydantic"},
+    "lidarslam.core.settings": {"pydantic"},
 }
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {

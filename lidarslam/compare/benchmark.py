@@ -6,13 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from lidarslam.compare.methods import Method, parse_method
 from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import require_no_link
+from lidarslam.core.settings import Settings
 from lidarslam.core.tasks import open_tasks
 from lidarslam.datasets.fetched import fetched, is_url
 from lidarslam.datasets.published.evalio import located
@@ -22,11 +23,7 @@ from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, re
 from lidarslam.storage.comparison_folder import RECORDINGS
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class BenchmarkMethod(_Model):
+class BenchmarkMethod(Settings):
     """A method under a name of its own, with settings of its own."""
 
     name: str
@@ -34,7 +31,7 @@ class BenchmarkMethod(_Model):
     set: tuple[str, ...] = Field((), description="settings, key.path=value")
 
 
-class Published(_Model):
+class Published(Settings):
     """A row of a published table; a value for each column, null where none was published."""
 
     method: str
@@ -42,7 +39,7 @@ class Published(_Model):
     source: str
 
 
-class BenchmarkTable(_Model):
+class BenchmarkTable(Settings):
     """Means over groups of recordings; a column for each group and quantity, the quantities side by side."""
 
     title: str
@@ -78,7 +75,7 @@ class BenchmarkTable(_Model):
         )
 
 
-class Benchmark(_Model):
+class Benchmark(Settings):
     """The whole file; paths are relative to the data's folder."""
 
     title: str

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from lidarslam.compare.method_process import MethodRun
 from lidarslam.compare.method_run import PROCESS
@@ -15,6 +15,7 @@ from lidarslam.compare.supervised import Limits
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import require_no_link
+from lidarslam.core.settings import Settings
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.core.text import require_name, safe_name
 from lidarslam.datasets.recording import Recording
@@ -27,10 +28,8 @@ from lidarslam.storage import directory as files
 from lidarslam.storage.comparison_folder import COMPARISON, RESERVED
 
 
-class Simulated(BaseModel):
+class Simulated(Settings):
     """A recording that is simulated when it is not there; names as in `lidarslam simulate`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     world: str = "office"
     sensor: str = "vlp-16"

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any, TypeGuard, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.config.yaml_text import YamlError, bounds_text, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.settings import Settings
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from lidarslam.odometry.config import OdometryConfig
@@ -37,20 +38,16 @@ _SHORT.maxlong = 40
 M = TypeVar("M", bound=BaseModel)
 
 
-class ViewerConfig(BaseModel):
+class ViewerConfig(Settings):
     """Contents of the Rerun recording; no effect on the results."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scan_points: int = Field(20_000, ge=1, le=10**7, description="points of a scan that are shown")
     map_points: int = Field(200_000, ge=1, le=10**8, description="points of the map that are shown")
     map_every: int = Field(20, ge=1, le=10**6, description="scans between two views of the growing map")
 
 
-class CheckpointConfig(BaseModel):
+class CheckpointConfig(Settings):
     """Saving for --resume; no effect on the results."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     interval_s: float = Field(
         10.0, ge=0.0, le=1e6, description="least time between checkpoints; they take 2 % of it at most"
@@ -58,10 +55,8 @@ class CheckpointConfig(BaseModel):
     every_scans: int | None = Field(None, ge=1, le=10**6, description="instead, scans between checkpoints")
 
 
-class Config(BaseModel):
+class Config(Settings):
     """Everything that determines the results of a run."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()

@@ -2,7 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from lidarslam.core.settings import Settings
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 TimeReference = Literal["auto", "relative", "absolute", "azimuth", "none"]
@@ -13,10 +15,8 @@ RollPitchYaw = tuple[_Angle, _Angle, _Angle]
 Mounting = Literal["auto"] | MountingName | RollPitchYaw
 
 
-class ReaderConfig(BaseModel):
+class ReaderConfig(Settings):
     """Settings of the readers; every reader takes the ones that concern it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: Name | None = Field(None, description="name of the reader; null: the one that recognises the source")
     topic: Name | None = Field(None, description="point cloud topic of a bag; null: the only one there is")

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
-
 from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, load_model
+from lidarslam.core.settings import Settings
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 
@@ -20,10 +19,8 @@ LOSSES = {
 }
 
 
-class TrainConfig(BaseModel):
+class TrainConfig(Settings):
     """Everything that determines the results of a training."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     training: TrainingConfig = TrainingConfig()
     reader: ReaderConfig = ReaderConfig()

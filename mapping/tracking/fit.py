@@ -84,7 +84,7 @@ class Fit:
             overlap=len(distances) / points,
             residual_m=residual_m,
             inlier_ratio=float(ratios.min() if len(ratios) else inlier.mean()),
-            support=_least_ratio(*information),
+            support=directional_support(*information),
             evidence=evidence,
             weakest=weakest,
         )
@@ -133,19 +133,11 @@ class Fit:
 NO_FIT = Fit(0, 0.0, None, None)
 
 
-def directional_support(normals: FloatArray, distances: FloatArray) -> float:
+def directional_support(information: FloatArray, supported: FloatArray, share: float) -> float:
     """The least inlier ratio over all directions of translation, points weighted by their constraint on it.
 
-    The smallest generalised eigenvalue of the sums of `n n^T` over the points, with and without inlier weights.
-
-    Args:
-        normals: (N, 3) unit, of the surfaces.
-        distances: (N,) of the points from them, in units at which a point has half the weight.
+    The smallest generalised eigenvalue of the sums (3, 3) of `translation_information`, whose mean weight is the share.
     """
-    return _least_ratio(*translation_information(normals, distances))
-
-
-def _least_ratio(information: FloatArray, supported: FloatArray, share: float) -> float:
     ridge = _RIDGE * float(np.trace(information)) * np.eye(3)
     # The ridge is supported as well as the whole.
     root = np.linalg.cholesky(information + ridge)

@@ -2,17 +2,16 @@
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from lidarslam.core.settings import Settings
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 
 Teacher = Literal["alignment", "map"]
 
 
-class LossConfig(BaseModel):
+class LossConfig(Settings):
     """The geometric losses of the paper; see `odometry.training.losses`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     point_to_plane: bool = Field(True, description="distances of points from planes")
     plane_to_plane: bool = Field(True, description="differences of normals")
@@ -25,10 +24,8 @@ class LossConfig(BaseModel):
         return self
 
 
-class TrainingConfig(BaseModel):
+class TrainingConfig(Settings):
     """Training of a network; see `odometry.training.training`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     network: NetworkConfig = NetworkConfig()
     images: ImageConfig = ImageConfig()
@@ -52,10 +49,8 @@ class TrainingConfig(BaseModel):
         return self
 
 
-class SimulatedConfig(BaseModel):
+class SimulatedConfig(Settings):
     """Recordings simulated for the training, of worlds, sensors and carriers drawn at random."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     recordings: int = Field(0, ge=0, le=10**6, description="how many")
     scans: int = Field(60, ge=2, le=10**5, description="of each")

@@ -8,7 +8,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.attempts import measure_fit
-from lidarslam.mapping.tracking.fit import Fit, directional_support
+from lidarslam.mapping.tracking.fit import Fit, directional_support, translation_information
 
 CONFIG = TrackingConfig()
 HALF = np.array([7.0, 5.0, 2.0])
@@ -118,25 +118,29 @@ def street_normals(rng: np.random.Generator, along: int) -> FloatArray:
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
+def support_of(normals: FloatArray, distances: FloatArray) -> float:
+    return directional_support(*translation_information(normals, distances))
+
+
 def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supported(rng):
     """One point in twelve shows the slide: the inlier ratio of all hardly changes, the support does."""
     normals = street_normals(rng, along=270)
     held, slid = (np.abs(normals @ [distance, 0.0, 0.0]) for distance in (0.05, 3.0))
-    assert directional_support(normals, held) > 0.99
-    assert directional_support(normals, slid) < 0.2
+    assert support_of(normals, held) > 0.99
+    assert support_of(normals, slid) < 0.2
     assert np.mean(slid < 1.0) > 0.9
 
 
 def test_a_direction_that_nothing_constrains_is_supported_as_the_rest_is(rng):
     """In an even tunnel nothing shows a slide; that is a matter of degeneracy, not of the fit."""
     normals = street_normals(rng, along=0)
-    assert directional_support(normals, np.full(len(normals), 0.1)) > 0.98
+    assert support_of(normals, np.full(len(normals), 0.1)) > 0.98
 
 
 def test_support_is_the_same_in_any_frame(rng):
     normals, distances = street_normals(rng, along=270), rng.uniform(0.0, 2.0, 3_270)
     turned = normals @ exp([0.3, -0.2, 1.0, 0.0, 0.0, 0.0])[:3, :3].T
-    assert directional_support(turned, distances) == pytest.approx(directional_support(normals, distances))
+    assert support_of(turned, distances) == pytest.approx(support_of(normals, distances))
 
 
 @pytest.mark.parametrize(("support", "status"), [(0.7, Status.OK), (0.45, Status.DEGRADED), (0.2, Status.LOST)])
