@@ -38,11 +38,10 @@ from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.odometry.config import OdometryConfig
-from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.pipeline.localisation import ScanToMap
-from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.run.session import open_odometry
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.storage.finished_run import load_map
@@ -91,7 +90,7 @@ class Outcome:
 
     def add(self, localiser: MapLocaliser, scans: list[Scan], config: Config, truth: FloatArray | None) -> None:
         """Localise a recording; truth (N, 4, 4) in the map's frame, None where the map is of another place."""
-        with closing(where_needed(make_odometry(config.odometry), config)) as odometry:
+        with closing(open_odometry(config, None)) as odometry:
             pipeline = Pipeline(odometry, ScanToMap(localiser), config.global_map)
             results = list(pipeline.run(scans))
         self.recordings += 1

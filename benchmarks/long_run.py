@@ -48,14 +48,13 @@ from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig
-from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.session import open_odometry
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import Spinning
 from lidarslam.storage.directory import RunDirectory
@@ -141,7 +140,7 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         graph = begin_graph(config, file=unfinished.files.submaps)
         assert graph is not None
         stack.callback(graph.close)
-        log, odometry = ScanLog(), where_needed(make_odometry(config.odometry), config)
+        log, odometry = ScanLog(), open_odometry(config, None)
         stack.callback(odometry.close)
         checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
         store = TileStore(options.out, unfinished.files.tiles)

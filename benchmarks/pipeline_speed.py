@@ -36,12 +36,11 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import in_order, prefetch
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
+from lidarslam.run.session import open_odometry
 
 _KISS = "KISS-ICP's own loop"
 _FEW = 8
@@ -124,7 +123,7 @@ def _run_source(method: str, source: Scans, warm_up: int) -> Times:
 
 def _run_ours(method: str, scans: Iterable[Scan], warm_up: int) -> Times:
     config = load_config(None, parse_method(method).settings)
-    odometry, graph = where_needed(make_odometry(config.odometry), config), begin_graph(config)
+    odometry, graph = open_odometry(config, None), begin_graph(config)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
     clock, results = _clock(), []
     for result in pipeline.run(scans):

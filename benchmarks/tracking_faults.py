@@ -44,11 +44,10 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.moved_points import seen_through
-from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.run.session import open_odometry
 from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor
@@ -157,7 +156,7 @@ def _featureless(kind: str, seed: int) -> Case:
 
 def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
     """A recording through the pipeline: the results, and the points (M, 3) of the map."""
-    odometry = where_needed(make_odometry(config.odometry), config)
+    odometry = open_odometry(config, None)
     try:
         pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
         results = list(pipeline.run(case.recorded.scans))

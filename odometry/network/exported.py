@@ -21,7 +21,8 @@ from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationS
 DESCRIPTION = "network.json"
 COLUMNS, TURNS, BIRD, PEAKS, PAIR = "columns.onnx", "turns.onnx", "bird.onnx", "peaks.onnx", "pair.onnx"
 
-_HEADER = {"kind": "a network exported by lidarslam", "version": 1}
+# To be raised whenever graphs of before mean something else: 2, cells of a metre.
+_HEADER = {"kind": "a network exported by lidarslam", "version": 2}
 _FATAL_ERRORS_ONLY = 4
 # Limits of a graph: seconds for one pair of scans, which take milliseconds, and memory for all, which is below 100 MB.
 _MOST_S, _MOST_BYTES = 60.0, 1 << 30

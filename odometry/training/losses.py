@@ -157,13 +157,14 @@ def objective(estimate: PairEstimate, batch: PairBatch, config: TrainingConfig, 
     total, alignment, confidence, turn, shift, planes, normals = (zero,) * 7
     if config.alignment_weight:
         error = motion_error(estimate.T_prev_curr, batch.T_prev_curr)
-        is_near = _is_near(error, _scale(batch)) if estimate.turn_scores.shape[1] else torch.ones_like(batch.valid)
+        scale = _scale(batch)
+        is_near = _is_near(error, scale) if estimate.turn_scores.shape[1] else torch.ones_like(batch.valid)
         alignment = _mean_of_valid(_distance(error), batch.valid & is_near)
         confidence = _mean_of_valid(_negative_log_likelihood(error, estimate.log_sigma), batch.valid)
         if estimate.turn_scores.shape[1]:
             turn = _mean_of_valid(_turn_loss(estimate.turn_scores, batch.T_prev_curr), batch.valid)
         if estimate.shift_scores.shape[1]:
-            cells = batch.T_prev_curr[:, :2, 3] * _scale(batch)[:, None] / bird_eye.CELL_M  # (B, 2) along x, along y
+            cells = batch.T_prev_curr[:, :2, 3] * scale[:, None] / bird_eye.CELL_M  # (B, 2) along x, along y
             in_reach = cells.abs().amax(1) < bird_eye.MOST_CELLS - 1
             shift = _mean_of_valid(_shift_loss(estimate.shift_scores, cells), batch.valid & in_reach)
         total = total + config.alignment_weight * (0.3 * alignment + 0.1 * confidence + turn + shift)

@@ -124,3 +124,10 @@ def test_a_tensor_of_gigabytes_is_refused(tmp_path: Path) -> None:
     exported_with(tmp_path, [*ones, product, fill, answer], count=np.array([1_000, 1_000, 1_000, 1]))
     with pytest.raises(InputError, match=r"columns\.onnx: cannot be used"):
         onnx_search(read_exported(tmp_path), 1).describe(*a_scan(1))
+
+
+def test_graphs_of_another_cell_size_are_refused(tmp_path: Path) -> None:
+    described = (shipped_folder() / DESCRIPTION).read_text()
+    (tmp_path / DESCRIPTION).write_text(described.replace('"version": 2', '"version": 1'))
+    with pytest.raises(InputError, match=r"another version.*lidarslam export"):
+        read_exported(tmp_path)
