@@ -45,7 +45,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MappingConfig, MappingName
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.registration.sampled_scan import Sampler
-from lidarslam.mapping.tracking import attempts
+from lidarslam.mapping.tracking import scan_matcher
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.threads import in_order
 
@@ -53,8 +53,8 @@ _METHODS: tuple[MappingName, ...] = ("surfels", "loam")
 # Stage -> what is timed for it: the object that holds the function, and its name there.
 _STAGES: dict[str, tuple[Any, str]] = {
     "thin": (Sampler, "sample"),
-    "registration": (attempts, "register"),
-    "fit": (attempts, "measure_fit"),
+    "registration": (scan_matcher, "register"),
+    "fit": (scan_matcher, "measure_fit"),
     "map update": (Mapper, "_insert"),
     "rest": (Mapper, "process"),
 }

@@ -27,7 +27,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.registration.registration import register
-from lidarslam.mapping.tracking import attempts
+from lidarslam.mapping.tracking import scan_matcher
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.recorder import Simulation
 
@@ -61,7 +61,7 @@ def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Ite
 
         mapper = Mapper(MappingConfig(budget_ms=budget_ms or None), clock=time.thread_time)
         results, ms = [], []
-        with patch.object(attempts, "register", timed):
+        with patch.object(scan_matcher, "register", timed):
             for scan in faulty.scans:
                 started = time.thread_time()
                 results.append(mapper.process(scan, Prior()))

@@ -17,7 +17,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
-from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
+from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, Tracked

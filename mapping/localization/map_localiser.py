@@ -17,12 +17,11 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
 from lidarslam.mapping.localization.local_mapping import LocalMapping
 from lidarslam.mapping.localization.place_search import Place, PlaceSearch, Search
-from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
+from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.sampling import SurfelSampler
 from lidarslam.mapping.tracking.fit import Fit
-from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
+from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
@@ -101,7 +100,7 @@ class MapLocaliser(Stateful):
 
     def _track(self, scan: SampledScan, prior: Prior, tracker: Tracker, last: MotionState) -> MappedScan:
         """Predict, register, judge."""
-        prediction = tracker.predict(scan, prior, last)
+        prediction = tracker.tracking.predict(scan, prior, last, self._config)
         if scan.is_sparse:
             return self._lose(tracker, prediction, None, f"only {len(scan)} points within range")
         surfel_map = self._regions_for(scan).around(prediction.T_world_lidar[:3, 3])
@@ -113,7 +112,7 @@ class MapLocaliser(Stateful):
             reason = f"only {100.0 * attempt.fit.overlap:.0f} % of the scan is near surfaces of the map"
             return self._lose(tracker, attempt.prediction, attempt.fit, reason)
         mapped = tracker.accept(attempt, scan, prior, prediction, last)
-        if self._pending is not None and not tracker.is_unconfirmed:
+        if self._pending is not None and not tracker.tracking.is_unconfirmed:
             self._confirm(*self._pending)
         return replace(mapped, added=False)
 
@@ -143,12 +142,11 @@ class MapLocaliser(Stateful):
 
     def _lose(self, tracker: Tracker, prediction: Prediction, fit: Fit | None, reason: str) -> MappedScan:
         """A scan that is not registered stays at its prediction; after many a local map of its own begins."""
-        T_map_lidar, velocity = prediction.T_world_lidar, prediction.velocity
-        if tracker.loses(has_points=fit is not None):
+        lost = tracker.lose(prediction, reason, fit)
+        if fit is not None and tracker.gives_up:
             self._tracker = None
-            self._local = LocalMapping(self._config, T_map_lidar, self._count + 1)
-        lost = MotionState(prediction.stamp, T_map_lidar, FADING * velocity, LOST_MOTION)
-        return MappedScan(lost, T_map_lidar, False, Status.LOST, reason, fit, is_connected=False)
+            self._local = LocalMapping(self._config, prediction.T_world_lidar, self._count + 1)
+        return lost
 
     def _look(self, scan: SampledScan, own: MappedScan) -> MappedScan:
         """Search for the place of the latest scans, if a search is due."""

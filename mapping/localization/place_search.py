@@ -15,10 +15,10 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempts import measure_fit
 from lidarslam.mapping.tracking.birds_eye_map import levelling
 from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.scan_matcher import measure_fit
 from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
 
 # Places around a supposed one that are tried: distance, in cells, and turn.

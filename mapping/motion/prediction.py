@@ -138,20 +138,13 @@ class OdometryNoise:
         variance = max(1.0, self.variance + _ODOMETRY_SMOOTHING * (squared / 6.0 - self.variance))
         return OdometryNoise(variance, self.agreed + 1 if squared < _GATE * self.variance else 0)
 
-    def rejects(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
-        """Whether a registered motion (4, 4) fails the gate of an odometry that was consistent so far."""
-        return self.is_proven(prior) and not self._agrees(prior, T_prev_curr, config)
-
-    def confirms(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
-        """Whether a registered motion (4, 4) passes that gate."""
-        return self.is_proven(prior) and self._agrees(prior, T_prev_curr, config)
+    def agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool | None:
+        """Whether a registered motion (4, 4) passes the gate of a proven odometry; None where there is none."""
+        return _squared_error(prior, T_prev_curr, config) <= _GATE * self.variance if self.is_proven(prior) else None
 
     def is_proven(self, prior: Prior) -> bool:
         """Whether there is an odometry, which was consistent so far."""
         return prior.T_prev_curr is not None and self.agreed >= _PROVEN_AFTER
-
-    def _agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
-        return _squared_error(prior, T_prev_curr, config) <= _GATE * self.variance
 
 
 def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> float:
@@ -191,6 +184,12 @@ class Prediction:
         """Standard deviation of the position along a direction (3,) of the world, metres."""
         along = self.T_world_lidar[:3, :3].T @ direction
         return float(np.sqrt(along @ self.covariance[3:6, 3:6] @ along))
+
+    def displaced(self, away: FloatArray) -> "Prediction":
+        """The prediction displaced by a vector (3,) of the world."""
+        T_world_lidar = self.T_world_lidar.copy()
+        T_world_lidar[:3, 3] += away
+        return replace(self, T_world_lidar=T_world_lidar)
 
     def held_along(self, direction: FloatArray) -> "Prediction":
         """The prediction with its translation and velocity along a direction (3,) of the world held."""

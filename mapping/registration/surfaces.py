@@ -56,22 +56,10 @@ class Matcher(ABC):
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
 
-    def first_correspondences(self) -> Correspondences:
-        """One residual for each point that has a surface, the one across it."""
+    def correspondences(self, most: int = 3) -> Correspondences:
+        """A residual per row, in the order of the points; of each point at most so many, first the one across it."""
         found = self.surfaces
-        index = np.flatnonzero(found.counts)
-        return Correspondences(
-            index,
-            found.points.take(index, axis=0),
-            found.normals[index, 0],
-            found.thickness_m[index, 0],
-            found.tilt[index, 0],
-        )
-
-    def correspondences(self) -> Correspondences:
-        """A residual per row, in the order of the points."""
-        found = self.surfaces
-        index, _ = chosen = np.nonzero(np.arange(3) < found.counts[:, None])
+        index, _ = chosen = np.nonzero(np.arange(most) < found.counts[:, None])
         return Correspondences(
             index, found.points[index], found.normals[chosen], found.thickness_m[chosen], found.tilt[chosen]
         )

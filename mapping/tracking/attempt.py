@@ -87,7 +87,7 @@ class Attempt:
         sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
         return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
 
-    def is_reachable(self, tracked_s: float | None, turn_is_measured: bool, motion_is_measured: bool) -> bool:
+    def is_reachable(self, tracked_s: float | None, motion_is_measured: bool) -> bool:
         """Whether the sensor can have moved here since the time at which it was tracked; anywhere if it never was."""
         since_s = np.inf if tracked_s is None else self.prediction.stamp - tracked_s
         if motion_is_measured:
@@ -98,7 +98,7 @@ class Attempt:
         if since_s > reach_s:
             return True
         angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
-        most = _MEASURED_TURN if turn_is_measured else _LEAST_JUMP[0] + turn * since_s
+        most = _MEASURED_TURN if self.prediction.is_inertial else _LEAST_JUMP[0] + turn * since_s
         return bool(angle < most and distance_m < _LEAST_JUMP[3] + speed * since_s)
 
     def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:

@@ -19,7 +19,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
-from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
+from lidarslam.mapping.motion.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from lidarslam.mapping.motion.velocity_bias import velocity_error
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
@@ -122,7 +122,7 @@ class Mapper(Stateful):
         """Predict, register, judge, insert."""
         self._map = local_map = local_map.resized(scan.cell_m)
         # Predict the pose and the velocity from the last motion and the odometry.
-        prediction = self._tracker.predict(scan, prior, last)
+        prediction = self._tracker.tracking.predict(scan, prior, last, self._config)
         if scan.is_sparse:
             return self._lose(scan, prediction, local_map, None, _sparse_message(scan))
         # A velocity extrapolated over a gap in the stamps may lead anywhere.
@@ -163,11 +163,10 @@ class Mapper(Stateful):
 
     def _begin(self, scan: SampledScan, prior: Prior, last: MotionState) -> MappedScan:
         """The first scan makes the map."""
-        prediction = self._tracker.predict(scan, prior, last)
-        T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
+        prediction = self._tracker.tracking.predict(scan, prior, last, self._config)
         if scan.is_sparse:
-            lost = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
-            return MappedScan(lost, T_world_lidar, False, Status.LOST, _sparse_message(scan), is_connected=False)
+            return MappedScan.lost(prediction, _sparse_message(scan))
+        T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
         state = MotionState(scan.stamp, T_world_lidar, velocity, last.covariance, scan.seen_until_s)
         self._map = self._new_map(scan, state)
         self._first = scan if scan.sweep.times is not None and self._config.continuous_time else None
@@ -180,7 +179,7 @@ class Mapper(Stateful):
 
         Two sweeps that are bent equally fit one another and hide a common motion; that between their poses shows it.
         """
-        before = self._tracker.snapshot()
+        before = self._tracker.tracking
         mapped = self._track(scan, prior, last, local_map)
         for _ in range(_REDRAWS if scan.stamp > last.stamp else 0):
             motion = inverse(last.T_world_lidar) @ mapped.state.T_world_lidar
@@ -197,12 +196,13 @@ class Mapper(Stateful):
         self, scan: SampledScan, prediction: Prediction, local_map: LocalMap, fit: Fit | None, reason: str
     ) -> MappedScan:
         """A scan without a registration stays at its prediction, out of the map; after many a new map begins."""
-        T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
-        if self._tracker.lose(local_map, has_points=fit is not None):
-            self._map = self._new_map(scan, MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION))
-            reason += "; a new map begins here"
-        lost = MotionState(scan.stamp, T_world_lidar, FADING * velocity, LOST_MOTION)
-        return MappedScan(lost, T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)
+        lost = self._tracker.lose(prediction, reason, fit)
+        if fit is not None and self._tracker.gives_up:
+            self._tracker.archive(local_map)
+            moving = MotionState(scan.stamp, prediction.T_world_lidar, prediction.velocity, LOST_MOTION)
+            self._map = self._new_map(scan, moving)
+            lost = replace(lost, message=f"{reason}; a new map begins here")
+        return lost
 
     def _new_map(self, scan: SampledScan, state: MotionState) -> LocalMap:
         """A map of one scan."""

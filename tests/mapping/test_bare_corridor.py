@@ -13,9 +13,9 @@ from lidarslam.mapping.registration.registration import register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.stability import constraining_points
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempts import ScanMatcher, measure_fit
 from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.scan_matcher import ScanMatcher, measure_fit
 
 CELL = 0.1
 NOISE_M = 0.008

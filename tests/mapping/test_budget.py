@@ -12,7 +12,7 @@ from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.tracking import attempts, start_poses
+from lidarslam.mapping.tracking import scan_matcher, start_poses
 from lidarslam.mapping.tracking.budget import Budget, Steps
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -131,8 +131,8 @@ def simulation() -> Simulation:
 def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     """A registration and the score of a start pose take time, all else none."""
     clock = FakeClock()
-    monkeypatch.setattr(attempts, "register", clock.passes(REGISTRATION_MS, attempts.register))
-    monkeypatch.setattr(attempts, "with_mean_velocity", lambda registration, *_: registration)
+    monkeypatch.setattr(scan_matcher, "register", clock.passes(REGISTRATION_MS, scan_matcher.register))
+    monkeypatch.setattr(scan_matcher, "with_mean_velocity", lambda registration, *_: registration)
     for name in ("start_score", "_information"):
         monkeypatch.setattr(start_poses, name, clock.passes(SCORE_MS, getattr(start_poses, name)))
     return clock

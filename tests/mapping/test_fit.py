@@ -7,8 +7,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempts import measure_fit
 from lidarslam.mapping.tracking.fit import Fit, directional_support, translation_information
+from lidarslam.mapping.tracking.scan_matcher import measure_fit
 
 CONFIG = TrackingConfig()
 HALF = np.array([7.0, 5.0, 2.0])

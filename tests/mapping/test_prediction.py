@@ -201,15 +201,12 @@ def test_the_noise_of_an_odometry_follows_its_errors():
 def test_an_odometry_confirms_and_rejects_motions_once_it_was_consistent_for_long():
     prior, near, far = measured(MOVED, covariance=isotropic(0.01)), MOVED, MOVED @ exp([0.0] * 5 + [0.8])
     prior, noise = replace(prior, caution=2.0), OdometryNoise()
-    assert not noise.confirms(prior, near, CONFIG)
-    assert not noise.rejects(prior, far, CONFIG)
+    assert noise.agrees(prior, near, CONFIG) is None
     for _ in range(10):
         noise = noise.updated(prior, near, CONFIG)
-    assert noise.confirms(prior, near, CONFIG)
-    assert not noise.rejects(prior, near, CONFIG)
-    assert noise.rejects(prior, far, CONFIG)
-    assert not noise.confirms(prior, far, CONFIG)
-    assert not noise.confirms(measured(), near, CONFIG)
+    assert noise.agrees(prior, near, CONFIG) is True
+    assert noise.agrees(prior, far, CONFIG) is False
+    assert noise.agrees(measured(), near, CONFIG) is None
 
 
 def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_not_change():

@@ -9,8 +9,8 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempts import ScanMatcher
 from lidarslam.mapping.tracking.budget import Budget
+from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 
 CELL_M, SPACING_M = 0.05, 0.2
 HERE = np.eye(4)

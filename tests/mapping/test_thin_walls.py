@@ -39,7 +39,7 @@ def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float
 def first_matches(local_map: SurfelMap, points: FloatArray, side: int) -> Correspondences:
     matcher = local_map.matcher(Sweep(points))
     matcher.match(points, make_transform(np.eye(3), SENSORS[side]))
-    return matcher.first_correspondences()
+    return matcher.correspondences(1)
 
 
 def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int) -> tuple[float, FloatArray]:

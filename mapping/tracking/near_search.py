@@ -1,0 +1,223 @@
+"""Search for a scan's pose near its prediction: one strategy after another, each for what the others miss."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarslam.core.geometry import inverse
+from lidarslam.core.tracking import Status
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import (
+    LARGEST_PROCESS_NOISE,
+    UNKNOWN_VELOCITY,
+    Prediction,
+    Prior,
+    ProcessNoise,
+    predict,
+)
+from lidarslam.mapping.surfels.stability import constraining_points
+from lidarslam.mapping.tracking.attempt import Attempt
+from lidarslam.mapping.tracking.budget import Steps
+from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
+from lidarslam.mapping.tracking.start_poses import SCORED_POINTS, best_supported, best_velocity, positions_around
+from lidarslam.mapping.tracking.tracking_state import TrackingState
+
+# Factors by which the quality of a result with any acceleration, and of one from elsewhere, must be better.
+_BETTER, _CLEARLY_BETTER = 1.05, 1.1
+# A scan constrains its weakest direction poorly below this support or evidence: a fifth of the scans on stairs, in
+# offices, streets and crowds none. There an odometry counts with at most this many times its own standard deviations,
+# after motions of fewer cells than this: after longer ones it may itself be off by a step.
+_WEAK_SUPPORT, _WEAK_EVIDENCE, WEAK_CAUTION, _WEAK_CELLS = 0.65, 40.0, 2.0, 2.0
+# Where even less constrains it, as in a corridor, only the prediction does: evidence in units of the least.
+_LEAST_CONSTRAINT = 2.0
+# Changes of the yaw rate tried on a scan that fits poorly, rad/s: from full speed one way to full speed the other.
+_YAW_RATES = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
+# Displacements tried where the velocity is unknown: the speed of a car, at most the median range, and their spacing in
+# cells, within reach of the coarse cells.
+_FASTEST_M_S = 50.0
+_DISPLACED_CELLS = 3.0
+# Most points that constrain directions that few others do, by which a displacement is chosen.
+_MOST_CONSTRAINING = 600
+# Displacements tried along the least constrained direction, and the largest that is taken, cells.
+_ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
+# Distance of another optimum, cells.
+_APART_CELLS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class NearSearch:
+    """Registers a scan near its prediction."""
+
+    matcher: ScanMatcher
+    state: TrackingState  # before the scan
+    prior: Prior
+    prediction: Prediction  # from the last motion and the prior
+
+    def best(self) -> Attempt:
+        """The best attempt of all strategies, each of which takes the best so far and returns that or a better one."""
+        best = self.at_prediction()
+        for strategy in (
+            self._held_by_odometry,
+            self._with_any_acceleration,
+            self._without_odometry,
+            self._at_any_speed,
+            self._from_odometry,
+            self._along_weakest,
+        ):
+            if self.matcher.budget.is_spent:
+                break
+            best = strategy(best)
+        return best
+
+    def at_prediction(self) -> Attempt:
+        """The attempt from the prediction alone."""
+        return self.matcher.register(self.prediction, self.state.begins_coarse(self.matcher.scan, self.prediction))
+
+    def contradicts(self, attempt: Attempt, caution: float = WEAK_CAUTION) -> bool:
+        """Whether an attempt contradicts an odometry that was consistent so far, as the next step of stairs does."""
+        motion = inverse(self.matcher.last.T_world_lidar) @ attempt.T_world_lidar
+        prior = replace(self.prior, caution=caution)
+        return self.state.odometry_noise.agrees(prior, motion, self.matcher.config) is False
+
+    def _predict(self, prior: Prior, process_noise: ProcessNoise | None = None) -> Prediction:
+        return self.state.predict(self.matcher.scan, prior, self.matcher.last, self.matcher.config, process_noise)
+
+    def _held_by_odometry(self, near: Attempt) -> Attempt:
+        """Where the scan constrains a direction poorly: held closer to the odometry's motion.
+
+        Errors of an odometry are correlated in time, but so are those of the few surfaces that constrain the scan.
+        """
+        prior, fit = self.prior, near.fit
+        if prior.covariance is None or prior.T_prev_curr is None or prior.inertial is not None:
+            return near
+        moved_m = float(np.linalg.norm(prior.T_prev_curr[:3, 3]))
+        is_weak = (fit.support or 0.0) < _WEAK_SUPPORT or (fit.evidence or 0.0) < _WEAK_EVIDENCE
+        is_weak &= fit.constraint >= _LEAST_CONSTRAINT
+        if not is_weak or moved_m > _WEAK_CELLS * self.matcher.scan.cell_m:
+            return near
+        held = self.matcher.register(self._predict(replace(prior, caution=WEAK_CAUTION)), coarse_first=False)
+        return replace(held, prediction=near.prediction) if _BETTER * held.quality > near.quality else near
+
+    def _with_any_acceleration(self, near: Attempt) -> Attempt:
+        """Where the scan fits poorly: from several yaw rates, patiently, with any acceleration.
+
+        An unexpected motion bends the sweep, which then fits halfway at a wrong pose and velocity.
+        """
+        if not self.state.fits_poorly(near.status, near.quality):
+            return near
+        matcher, prediction = self.matcher, self._predict(self.prior, LARGEST_PROCESS_NOISE)
+        keypoints, attempts = matcher.scan.keypoints, [matcher.attempt(prediction, prediction, patient=True)]
+        if matcher.config.continuous_time and keypoints.times is not None and not matcher.budget.is_spent:
+            up = prediction.T_world_lidar[:3, :3].T @ matcher.local_map.vertical()
+            velocities = prediction.velocity + np.outer(_YAW_RATES, np.concatenate([up, np.zeros(3)]))
+            velocity = best_velocity(keypoints, velocities, prediction.T_world_lidar, matcher.local_map)
+            if not (np.array_equal(velocity, prediction.velocity) or matcher.budget.is_spent):
+                attempts.append(matcher.attempt(prediction, replace(prediction, velocity=velocity), patient=True))
+        turning = max(attempts, key=lambda attempt: attempt.quality)
+        is_near = near.status is not Status.LOST and _apart_m(turning, near) < matcher.scan.cell_m  # the same optimum
+        is_better = (turning.is_reliable or is_near) and turning.quality > _BETTER * near.quality
+        return replace(turning, prediction=self.prediction) if is_better else near
+
+    def _without_odometry(self, near: Attempt) -> Attempt:
+        """Where the odometry is contradicted, or the scan fits poorly with it: by the last motion alone."""
+        if not self.state.velocity_known or not (self.prediction.contradicted or self._is_poor(near)):
+            return near
+        prior = self.prior.without_odometry()
+        alone = replace(self, prior=prior, prediction=self._predict(prior))
+        other = alone.at_prediction()
+        other = other if self.matcher.budget.is_spent else alone._with_any_acceleration(other)
+        # Where odometry and last motion agree, another pose is that of a similar place, as the next flight.
+        is_similar = not self.prediction.contradicted and self.contradicts(other)
+        return other if other.quality > near.quality and not is_similar else near
+
+    def _at_any_speed(self, near: Attempt) -> Attempt:
+        """Where the velocity is unknown or the odometry poor: displaced; ambiguous where another place fits as well."""
+        if self.state.velocity_known and not self._is_poor(near):
+            return near
+        displaced = self.matcher.budget.run(self._displaced())
+        if displaced is None:
+            return near
+        best, (others,) = near, displaced
+        for other in others:
+            if (other.is_reliable or not self.state.velocity_known) and other.quality > _CLEARLY_BETTER * best.quality:
+                best = other
+        is_settled = best.registration is None or self.state.velocity_known
+        return best if is_settled else replace(best, ambiguous=best.has_rivals(others))
+
+    def _displaced(self) -> Steps[list[Attempt]]:
+        """Attempts with status ok from displacements since the last scan in every horizontal direction.
+
+        A sensor at speed at the first scan, or with a wrong odometry, is out of reach of the predicted pose, and most
+        of a street fits there too. The rotations are the predicted and the last one.
+        """
+        scan, last, local_map = self.matcher.scan, self.matcher.last, self.matcher.local_map
+        interval_s = scan.stamp - last.stamp
+        if interval_s <= 0.0:
+            return []
+        radius_m, up = min(_FASTEST_M_S * interval_s, scan.range_m), local_map.vertical()
+        starts = []
+        for rotation in (self.prediction.T_world_lidar, last.T_world_lidar):
+            T = last.T_world_lidar.copy()
+            T[:3, :3] = rotation[:3, :3]
+            starts.append(positions_around(T, up, radius_m, _DISPLACED_CELLS * local_map.cell_m))
+        few = constraining_points(scan.sweep.points, scan.elevations, local_map.cell_m, _MOST_CONSTRAINING)
+        parts = self.matcher.some(SCORED_POINTS), scan.sweep.take(few)
+        points = np.concatenate([part.compensated(last.velocity) for part in parts])
+        attempts = []
+        best = yield from best_supported(points, np.concatenate(starts), local_map)
+        for start in {start.tobytes(): start for start in best}.values():
+            yield
+            velocity = body_velocity(inverse(last.T_world_lidar) @ start, interval_s)
+            moving = replace(last, velocity=velocity, covariance=UNKNOWN_VELOCITY)
+            prediction = predict(moving, scan.stamp, Prior(), ProcessNoise(), self.matcher.config, scan.seen_from_s)
+            attempts.append(self.matcher.attempt(prediction, prediction, patient=True))
+        return [attempt for attempt in attempts if attempt.status is Status.OK]
+
+    def _from_odometry(self, near: Attempt) -> Attempt:
+        """Where the prediction is uncertain along the weakest direction: from the odometry's motion.
+
+        Of several optima, as on stairs, the prediction's may be the next step's.
+        """
+        prior, prediction = self.prior, near.prediction
+        if prior.T_prev_curr is None or prediction.is_inertial or not near.fit.is_constrained:  # an IMU's is better
+            return near
+        if near.fit.weakest is None:
+            return near
+        direction, apart_m = np.array(near.fit.weakest), _APART_CELLS * self.matcher.local_map.cell_m
+        T_world_lidar = self.matcher.last.T_world_lidar @ prior.T_prev_curr
+        away_m = abs(float(direction @ (T_world_lidar - near.T_world_lidar)[:3, 3]))
+        if prediction.sigma_along(direction) < apart_m or away_m < apart_m:
+            return near
+        start = replace(prediction, T_world_lidar=T_world_lidar)
+        return _clearly_best(near, [self.matcher.attempt(prediction, start, coarse_first=False)])
+
+    def _along_weakest(self, near: Attempt) -> Attempt:
+        """Where the scan fits poorly: a few cells away along its weakest direction.
+
+        Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks the same.
+        """
+        if near.status is Status.OK or near.fit.weakest is None or not near.fit.is_constrained:
+            return near
+        others, cell_m = [], self.matcher.local_map.cell_m
+        for cells in _ALONG_CELLS:
+            if self.matcher.budget.is_spent:
+                break
+            start = replace(near.prediction, T_world_lidar=near.T_world_lidar)
+            start = start.displaced(cells * cell_m * np.array(near.fit.weakest))
+            others.append(self.matcher.attempt(near.prediction, start, coarse_first=False))
+        return _clearly_best(near, (other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m))
+
+    def _is_poor(self, near: Attempt) -> bool:
+        """Whether a scan fits poorly where an odometry measured its motion."""
+        return self.prior.T_prev_curr is not None and near.status is not Status.OK
+
+
+def _apart_m(one: Attempt, other: Attempt) -> float:
+    return float(np.linalg.norm(one.T_world_lidar[:3, 3] - other.T_world_lidar[:3, 3]))
+
+
+def _clearly_best(near: Attempt, others: Iterable[Attempt]) -> Attempt:
+    """An attempt, or the best of others where that is clearly better."""
+    best = max(others, key=lambda attempt: attempt.quality, default=near)
+    return best if best.quality > _CLEARLY_BETTER * near.quality else near
