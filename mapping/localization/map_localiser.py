@@ -18,8 +18,7 @@ from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
 from lidarslam.mapping.localization.local_mapping import LocalMapping
 from lidarslam.mapping.localization.place_search import Place, PlaceSearch, Search
 from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction, Prior
-from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.surfels.sampling import SurfelSampler
+from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
@@ -58,7 +57,7 @@ class MapLocaliser(Stateful):
     ) -> None:
         self._config = config
         self._map = fixed_map
-        self._sampler = SurfelSampler(config)
+        self._sampler = Sampler(config)
         self._search = PlaceSearch(fixed_map, config.max_range_m)
         self._local: LocalMapping | None = LocalMapping(config, None)
         self._guess = guess

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from lidarslam.core.geometry import FloatArray, inverse, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.loops.sparse_submap import LINE, SparseSubmap
-from lidarslam.mapping.registration.degeneracy import find_degeneracy
 from lidarslam.mapping.registration.gauss_newton import (
     NormalEquations,
+    find_degeneracy,
     gauss_newton,
     geman_mcclure,
     point_to_plane_jacobian,

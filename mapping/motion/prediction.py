@@ -29,6 +29,8 @@ _VELOCITY_INFLATION = 2.0
 _UNEVEN = 1.0 / 8.0
 # Smoothing of the odometry's normalised squared error, and its gate: chi square, six degrees of freedom, 1 in 10,000.
 _ODOMETRY_SMOOTHING, _GATE = 0.2, 27.9
+# Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
+_LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
 # Consistent motions in a row after which an odometry may reject a registration.
 _PROVEN_AFTER = 10
 
@@ -94,6 +96,29 @@ class MotionState:
             velocity=self.velocity + step[6:],
             covariance=0.5 * (covariance + covariance.T),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPose:
+    """A pose, and the information of its error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first."""
+
+    T_world_lidar: FloatArray  # (4, 4); arbitrary along directions that are not measured
+    information: FloatArray  # (6, 6), zero along directions that are not measured
+
+    @classmethod
+    def minimum(cls, T_world_lidar: FloatArray, hessian: FloatArray, gradient: FloatArray) -> "MeasuredPose":
+        """The minimum of a cost with Hessian (6, 6) and gradient (6,) at a pose (4, 4)."""
+        values, vectors = np.linalg.eigh(hessian * np.outer(_LARGEST_MEASURED, _LARGEST_MEASURED))
+        axes, values = vectors[:, values > 1.0], values[values > 1.0]
+        step = -_LARGEST_MEASURED * (axes @ ((axes.T @ (_LARGEST_MEASURED * gradient)) / values))
+        rows = axes / _LARGEST_MEASURED[:, None]
+        return cls(T_world_lidar @ exp(step), np.asarray((rows * values) @ rows.T, dtype=np.float64))
+
+    def without(self, direction: FloatArray) -> "MeasuredPose":
+        """The measurement, marginalised over a direction (6,) of the error."""
+        along = self.information @ direction
+        total = float(direction @ along)
+        return self if total <= 0.0 else replace(self, information=self.information - np.outer(along, along) / total)
 
 
 @dataclass(frozen=True)

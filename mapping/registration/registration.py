@@ -12,13 +12,12 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.core.tracking import Degeneracy
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
-from lidarslam.mapping.motion.measured_pose import MeasuredPose
-from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.registration.degeneracy import DEGENERATE_INFORMATION, degenerate_directions
+from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
+from lidarslam.mapping.registration.gauss_newton import DEGENERATE_INFORMATION, degenerate_directions
 from lidarslam.mapping.registration.large_surfaces import INFLATION, inflation_of_small
 from lidarslam.mapping.registration.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
-from lidarslam.mapping.registration.sampled_scan import MIN_CORRESPONDENCES
+from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 from lidarslam.mapping.registration.surfaces import Matcher, Surfaces
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.
@@ -198,7 +197,7 @@ class _System:
         """
         rows = np.empty((3 * len(points), COLUMNS))
         count, squared = linearise(points, times, np.ascontiguousarray(T_world_lidar), surfaces, inflation, rows)
-        if count < MIN_CORRESPONDENCES:
+        if count < MIN_POINTS:
             return None
         rows, total = rows[:count], np.zeros((13, 13))
         middle = count // 2  # the upper median, in half the time of NumPy's

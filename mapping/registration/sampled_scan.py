@@ -1,6 +1,5 @@
 """A thinned scan: points that are inserted into the map, and keypoints that are registered to it."""
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -11,15 +10,22 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan, squared_ranges
 from lidarslam.core.state import Shape, Stateful
-from lidarslam.core.thinning import central_per_cell
+from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
 
-# Least number of keypoints, and of their correspondences, for a pose.
-MIN_CORRESPONDENCES = MIN_POINTS
-# Spacing of the keypoints, in cells.
-_KEYPOINT_SPACING = 2.5
+# Least number of points for the scale of a scene, and of keypoints and their correspondences for a pose.
+MIN_POINTS = 60
+# Cells per median range, and bounds of their size. Where walls are closer than a few metres, the cells are the
+# smallest: steps and door frames are as large in a wider stairwell.
+_CELLS_PER_RANGE = 30.0
+_CELL_BOUNDS_M = (0.05, 1.0)
+_CLOSE_M = 3.0
+# The cell size changes when the smoothed median range has changed by this factor.
+_RANGE_CHANGE = 2.0
+_RANGE_SMOOTHING = 0.05
+# Spacing of the points that go into the map, and of the keypoints, in cells.
+MAP_SPACING, _KEYPOINT_SPACING = 0.5, 2.5
 # Instants that a sweep is divided into, of this many points at least; and the share of the view's height that those of
 # one instant span if they form a column. It is 0.6 to 0.9 of spinning sensors, 0.07 of a Mid-360.
 _INSTANTS, _LEAST_OF_INSTANT = 1000, 16
@@ -48,7 +54,7 @@ class SampledScan:
     @property
     def is_sparse(self) -> bool:
         """Whether there are too few keypoints for a registration: a covered sensor, or open country."""
-        return len(self.keypoints) < MIN_CORRESPONDENCES
+        return len(self.keypoints) < MIN_POINTS
 
     @cached_property
     def has_rings(self) -> bool:
@@ -73,8 +79,36 @@ class SampledScan:
         return gap_s < self.seen_from_s + self.seen_until_s
 
 
-class Sampler(Stateful, ABC):
-    """Thins scans by the scale of the scene, the smoothed median range."""
+class SceneScale(Stateful):
+    """Chooses the size of the map's cells, with hysteresis."""
+
+    range_m: float  # smoothed median range; 0 before the first scan with points
+    _cell_range_m: float
+
+    def __init__(self, config: MappingConfig) -> None:
+        self._config = config
+        self.range_m = 0.0
+        self._cell_range_m = 0.0  # median range of the present cell size
+
+    def update(self, squared: FloatArray) -> float:
+        """The cell size for the latest squared ranges (N,)."""
+        # Fewer points are a covered sensor, not another scene.
+        if np.count_nonzero(squared > self._config.min_range_m**2) >= MIN_POINTS:
+            median_m = float(np.sqrt(np.median(squared[:: max(1, len(squared) // 5000)])))
+            new = self.range_m == 0.0
+            self.range_m = median_m if new else self.range_m + _RANGE_SMOOTHING * (median_m - self.range_m)
+        if self._config.cell_m is not None:
+            return self._config.cell_m
+        low_m, high_m = self._cell_range_m / _RANGE_CHANGE, self._cell_range_m * _RANGE_CHANGE
+        if self.range_m > 0.0 and not low_m <= self.range_m <= high_m:
+            self._cell_range_m = self.range_m
+        if self._cell_range_m < _CLOSE_M:
+            return _CELL_BOUNDS_M[0]
+        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
+
+
+class Sampler(Stateful):
+    """Thins scans by the scale of the scene; for surfels, to a point in each half of a cell."""
 
     _scale: SceneScale
     _has_rings: bool | None  # of the first scan of enough points; None before
@@ -108,9 +142,14 @@ class Sampler(Stateful, ABC):
         """The edge of the map's finest cells for that of the scene."""
         return cell_m
 
-    @abstractmethod
-    def _choose(self, scan: Scan, has_rings: bool, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
+    def _choose(
+        self,
+        scan: Scan,
+        has_rings: bool,
+        cell_m: float,  # noqa: ARG002
+    ) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
         """Indices (N,) of the points for the map, and their kinds (N,), if there are several."""
+        return one_per_cell(scan.points, MAP_SPACING * cell_m), None
 
     def _keypoints(self, sweep: Sweep, cell_m: float) -> NDArray[np.intp]:
         """Indices (K,) of the points that are registered."""

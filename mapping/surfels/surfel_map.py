@@ -1,5 +1,6 @@
 """Local map of surfels in three sizes of cells, and the point-to-plane correspondences of a scan with it."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -10,11 +11,19 @@ from lidarslam.core.state import Shape
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.surfaces import Matcher, Surfaces
 from lidarslam.mapping.surfels.cell_kernels import write_views
+from lidarslam.mapping.surfels.correspondence_kernels import match_compact, match_planes
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
-from lidarslam.mapping.surfels.matching import SurfelMatcher
-from lidarslam.mapping.surfels.voxel_hash import require_reach
+from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 
+# Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
+_COMPACT = 0.5
+# Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
+# direction.
+_CERTAIN_TILT = 0.02
+# No cell has this key.
+_NOWHERE = -1
 # Cells beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.2
 # Scans between two removals of stray cells.
@@ -23,6 +32,47 @@ _TIDIED_AFTER = 500
 _ANY_HEIGHT_RAD = 0.2
 # A direction that few walls are parallel to.
 _UNEVEN = np.array([0.46, 0.29, 0.84])
+
+
+class SurfelMatcher(Matcher):
+    """Surfels of the cells that points lie in.
+
+    A point that has stayed in its cell keeps its surface: once an iteration moves by a small part of a cell, few are
+    looked up again. The grids must not change meanwhile.
+
+    Args:
+        grids: the finest first; each cell of one lies within a cell of the next.
+        count: N.
+        keeps_finest: whether planes of uncertain normals are kept. In a young map coarser ones are of a few strokes;
+            without an IMU, whose prediction they would contradict, they still hold a fast start.
+    """
+
+    def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
+        self._grids, self._certain_tilt = grids, np.inf if keeps_finest else _CERTAIN_TILT
+        self._cells = np.full(count, _NOWHERE, dtype=np.int64)
+        self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
+        self.surfaces = Surfaces.none(count)
+
+    def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
+        """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
+        points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
+        cells = point_keys(points, self._grids[0].cell_m)
+        unmatched = np.flatnonzero(cells != self._cells)
+        self._cells = cells
+        if not len(unmatched):
+            return
+        self.surfaces.counts[unmatched] = 0
+        sensor, finest = np.array(T[:3, 3]), None
+        for grid in self._grids:
+            rows = grid.find(points.take(unmatched, axis=0), sensor)
+            surfels = grid.refreshed(rows)
+            if finest is None:
+                finest = np.empty(len(points), dtype=np.int32), surfels
+                finest[0][unmatched] = rows
+            given = self._spread_m, self._certain_tilt, self.surfaces
+            unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, *given)]
+        assert finest is not None
+        match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
 
 
 class SurfelMap(LocalMap):

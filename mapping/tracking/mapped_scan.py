@@ -7,8 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
-from lidarslam.mapping.motion.measured_pose import MeasuredPose
-from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction
+from lidarslam.mapping.motion.prediction import LOST_MOTION, MeasuredPose, MotionState, Prediction
 from lidarslam.mapping.tracking.attempt import Attempt
 from lidarslam.mapping.tracking.fit import Fit
 

@@ -23,7 +23,6 @@ from lidarslam.mapping.motion.prediction import LOST_MOTION, UNKNOWN_VELOCITY, M
 from lidarslam.mapping.motion.velocity_bias import velocity_error
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
-from lidarslam.mapping.surfels.sampling import SurfelSampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import beyond_reach
 from lidarslam.mapping.tracking.budget import Budget
@@ -78,7 +77,7 @@ class Mapper(Stateful):
         self.kept_scans = kept_scans
         self._scans, self._map_since, self._recent = 0, 0, []
         self._budget = Budget(config.budget_ms, clock)
-        self._sampler = FeatureSampler(config) if config.method == "loam" else SurfelSampler(config)
+        self._sampler = FeatureSampler(config) if config.method == "loam" else Sampler(config)
         self._tracker = Tracker(config, self._budget)
         self._map = None
         self._last = None

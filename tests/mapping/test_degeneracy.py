@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.tracking import Degeneracy
-from lidarslam.mapping.registration.degeneracy import find_degeneracy
+from lidarslam.mapping.registration.gauss_newton import find_degeneracy
 
 Scene = tuple[FloatArray, FloatArray]
 

@@ -13,8 +13,7 @@ from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.elevation import ElevationBias, ElevationEstimator, PlacedPoints, combined, estimate_bias
 from lidarslam.mapping.motion.prediction import MotionState
-from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.surfels.sampling import SurfelSampler
+from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 EDGE_M, SCANS, STEP_M, NOISE_M = 0.8, 10, 1.5, 0.02
@@ -79,7 +78,7 @@ def registered(T: FloatArray, status: Status = Status.OK) -> MappedScan:
 
 @pytest.fixture(scope="module")
 def sampled(street: Any) -> list[SampledScan]:
-    sampler = SurfelSampler(MappingConfig())
+    sampler = Sampler(MappingConfig())
     return [
         sampler.sample(Scan(scan_at(street, number, T, TRUE_DEG), 0.1 * number)) for number, T in enumerate(poses())
     ]

@@ -16,10 +16,10 @@ from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.inertial import UNKNOWN_LEVER_M, Inertial
 from lidarslam.mapping.motion.deskew import move
-from lidarslam.mapping.motion.measured_pose import MeasuredPose
 from lidarslam.mapping.motion.prediction import (
     UNKNOWN_VELOCITY,
     GravityDirection,
+    MeasuredPose,
     MotionState,
     Prior,
     ProcessNoise,

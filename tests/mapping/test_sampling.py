@@ -6,8 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.registration.sampled_scan import SampledScan, has_rings
-from lidarslam.mapping.surfels.sampling import SurfelSampler
+from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler, has_rings
 from lidarslam.simulation.sensors import SENSORS
 
 
@@ -19,7 +18,7 @@ def shell(rng: np.random.Generator, radius_m: float, count: int = 20_000, stamp:
 
 
 def sample(scan: Scan, **settings: object) -> SampledScan:
-    return SurfelSampler(MappingConfig(**settings)).sample(scan)
+    return Sampler(MappingConfig(**settings)).sample(scan)
 
 
 def cells(points: FloatArray, cell_m: float) -> FloatArray:
@@ -90,7 +89,7 @@ def test_nothing_is_sampled_from_nothing():
 
 
 def test_an_empty_scan_does_not_decide_on_the_cells(rng):
-    sampler = SurfelSampler(MappingConfig())
+    sampler = Sampler(MappingConfig())
     sampler.sample(Scan(np.empty((0, 3)), 0.0))
     assert sampler.sample(shell(rng, 12.0)).cell_m == pytest.approx(0.4, rel=0.02)
 
@@ -101,12 +100,12 @@ def test_cells_are_a_share_of_the_median_range_within_bounds(rng, radius_m, cell
 
 
 def test_a_given_cell_stays_whatever_the_scene(rng):
-    sampler = SurfelSampler(MappingConfig(cell_m=0.33))
+    sampler = Sampler(MappingConfig(cell_m=0.33))
     assert {sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in (1.0, 40.0, 5.0)} == {0.33}
 
 
 def cell_sizes(rng: np.random.Generator, radii_m: list[float]) -> list[float]:
-    sampler = SurfelSampler(MappingConfig())
+    sampler = Sampler(MappingConfig())
     return [sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in radii_m]
 
 

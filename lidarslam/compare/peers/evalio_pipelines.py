@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lidarslam.compare.peers.interface import MAX_RANGE_M, Poses, Sweep
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.imu import ImuSamples
-from lidarslam.mapping.loam.rings import ring_order
+from lidarslam.mapping.loam.features import ring_order
 
 Parameters = Mapping[str, bool | int | float | str]
 
