@@ -35,8 +35,8 @@ class FeatureSampler(Sampler):
     def _spacing_m(self, cell_m: float) -> float:
         return cell_m if self._config.cell_m is not None else min(cell_m, _MOST_SPACING_M)
 
-    def _choose(self, scan: Scan, has_rings: bool, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
-        if has_rings:
+    def _choose(self, scan: Scan, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
+        if self._has_rings is not False:
             order, kinds = find_features(scan)
         else:  # the ends of strokes are no edges, and points that lie on no plane find none in the map
             order, kinds = np.arange(len(scan)), np.full(len(scan), PLANE, dtype=np.int8)

@@ -125,7 +125,7 @@ class Sampler(Stateful):
         if self._has_rings is None and len(scan) >= _INSTANTS:
             self._has_rings = has_rings(scan)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
-        kept, kinds = self._choose(scan, self._has_rings is not False, cell_m)
+        kept, kinds = self._choose(scan, cell_m)
         inside = squared.take(kept)
         is_within = (inside > near) & (inside < far)
         kept, kinds = kept[is_within], None if kinds is None else kinds[is_within]
@@ -142,12 +142,7 @@ class Sampler(Stateful):
         """The edge of the map's finest cells for that of the scene."""
         return cell_m
 
-    def _choose(
-        self,
-        scan: Scan,
-        has_rings: bool,
-        cell_m: float,  # noqa: ARG002
-    ) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
+    def _choose(self, scan: Scan, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
         """Indices (N,) of the points for the map, and their kinds (N,), if there are several."""
         return one_per_cell(scan.points, MAP_SPACING * cell_m), None
 
