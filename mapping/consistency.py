@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.state import TRANSFORM, Shape, Stateful
-from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 
 # Pixels of one degree.
 ROWS, COLUMNS = 180, 360
@@ -165,27 +165,18 @@ def write_planes(
                 count += 1
                 for i in range(3):
                     mean[i] += offset[i]
-                _add_products(offset, 1.0, products)
+                for entry in range(6):
+                    i, j = SYMMETRIC[entry]
+                    products[entry] += offset[i] * offset[j]
         for i in range(3):
             mean[i] /= count
             means[m, i] = centre[i] + mean[i]
         for entry in range(6):
-            covariance[entry] = products[entry] / count
-        _add_products(mean, -1.0, covariance)
+            i, j = SYMMETRIC[entry]
+            covariance[entry] = products[entry] / count - mean[i] * mean[j]
         write_eigenvalues(covariance, variances[m])
         write_eigenvector(covariance, variances[m, 0], normals[m])
         counts[m] = count
-
-
-@compiled_part
-def _add_products(v: FloatArray, sign: float, total: FloatArray) -> None:
-    """Add the six distinct products of the components of a vector (3,): xx, xy, xz, yy, yz, zz."""
-    total[0] += sign * v[0] * v[0]
-    total[1] += sign * v[0] * v[1]
-    total[2] += sign * v[0] * v[2]
-    total[3] += sign * v[1] * v[1]
-    total[4] += sign * v[1] * v[2]
-    total[5] += sign * v[2] * v[2]
 
 
 @compiled

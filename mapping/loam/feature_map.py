@@ -17,8 +17,6 @@ from lidarslam.mapping.surfels.voxel_hash import VoxelHash, point_keys
 
 # Correspondences are kept over a displacement of this share of a cell.
 _SAME_CELLS = 0.1
-# Voxels beyond the radius are dropped each time the sensor has moved by this share of it.
-_FORGET_AFTER = 0.2
 
 
 class VoxelGrid(Stateful):
@@ -114,23 +112,16 @@ class FeatureMatcher(Matcher):
 class FeatureMap(LocalMap):
     """Edges and planar points within a radius of the sensor."""
 
-    _radius_m: float
     _edges: list[VoxelGrid]
     _planes: list[VoxelGrid]
-    _centre: Annotated[FloatArray, Shape(3)] | None
 
     def __init__(self, cell_m: float, radius_m: float) -> None:
-        self.cell_m, self.scans = cell_m, 0
-        self._radius_m = radius_m
+        super().__init__(cell_m, radius_m)
         self._edges, self._planes = ([VoxelGrid(cell_m * level) for level in LEVELS] for _ in range(2))
-        self._centre = None
-
-    def __len__(self) -> int:
-        """See `LocalMap`."""
-        return sum(map(len, self._grids))
 
     @property
-    def _grids(self) -> list[VoxelGrid]:
+    def grids(self) -> list[VoxelGrid]:
+        """See `LocalMap`."""
         return [*self._edges, *self._planes]
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
@@ -139,27 +130,17 @@ class FeatureMap(LocalMap):
         for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
             for grid in grids:
                 grid.insert(chosen)
-        self._centre = sensor if self._centre is None else self._centre
-        if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
-            self._centre = sensor
-            for grid in self._grids:
-                grid.drop_beyond(sensor, self._radius_m)
-        self.scans += 1
+        self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
         """See `LocalMap`."""
         return FeatureMatcher(self._edges[level:], self._planes[level:], sweep)
 
-    def resized(self, cell_m: float) -> "FeatureMap":
+    def resample(self, other: "FeatureMap") -> None:
         """See `LocalMap`."""
-        if cell_m == self.cell_m:
-            return self
-        other = FeatureMap(cell_m, self._radius_m)
-        other._centre, other.scans = self._centre, self.scans
-        for grids, finest in ((other._edges, self._edges[0]), (other._planes, self._planes[0])):
+        for grids, finest in ((self._edges, other._edges[0]), (self._planes, other._planes[0])):
             for grid in grids:
                 grid.insert_means(finest)
-        return other
 
     def means(self) -> FloatArray:
         """See `LocalMap`."""

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.mapping.registration.local_map import vertical_of
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
@@ -16,8 +17,6 @@ _SAMPLES = 2000
 # Edge of a cell of the view from above, in surfel cells, and of the parts of the map that are drawn, in such cells,
 # with their overlap.
 _VIEW_SCALE, _VIEW_CELLS, _OVERLAP_CELLS = 4.0, 800, 30
-# Surfaces within this cosine of the z axis are floors or ceilings.
-_LEVEL_COSINE = 0.7
 
 
 class FixedMap:
@@ -32,7 +31,7 @@ class FixedMap:
         self._points = points
         self._normals = normals
         self._least_cell_m = _CELLS_PER_SPACING * _spacing_m(points)
-        self._up = _vertical(normals)
+        self._up = vertical_of(normals)
         self._views: tuple[float, list[BirdsEyeMap]] = (0.0, [])
 
     def __len__(self) -> int:
@@ -67,15 +66,6 @@ def _spacing_m(points: FloatArray) -> float:
     sample = points[:: max(1, len(points) // _SAMPLES)]
     distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2)
     return float(np.median(np.asarray(distances)[:, 1]))
-
-
-def _vertical(normals: FloatArray) -> FloatArray:
-    """Unit normal (3,) of floors and ceilings; the z axis when there are none."""
-    level = normals[np.abs(normals[:, 2]) > _LEVEL_COSINE]
-    if not len(level):
-        return np.array([0.0, 0.0, 1.0])
-    mean = (level * np.sign(level[:, 2:])).sum(axis=0)
-    return np.asarray(mean / np.linalg.norm(mean), dtype=np.float64)
 
 
 def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bool_]]:

@@ -4,6 +4,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.tracking import lever_scale
+from lidarslam.mapping.registration.gauss_newton import geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.surfaces import Surfaces
 
@@ -43,11 +44,10 @@ def inflation_of_small(
     world, normals = world[is_large], normals[is_large]
     residuals = np.einsum("ij,ij->i", world - surfaces.points[large], normals)
     variances = surfaces.thickness_m[large, 0] ** 2 + _RANGE_NOISE_M**2
-    kernel = 1.0 + residuals**2 / ((_SCALE_PER_MEDIAN * np.median(np.abs(residuals))) ** 2 + variances)
-    weights = 1.0 / (kernel**2 * variances)
-    inward = normals @ T_world_lidar[:3, :3]
+    scale_m = _SCALE_PER_MEDIAN * np.median(np.abs(residuals))
+    weights = geman_mcclure(residuals, scale_m**2 + variances, variances)
     scale = lever_scale(float(np.sqrt(np.mean(np.sum(points[large] ** 2, axis=1)))))
-    jacobian = np.column_stack([np.cross(points[large], inward), inward]) / scale
+    jacobian = point_to_plane_jacobian(points[large], normals @ T_world_lidar[:3, :3]) / scale
     hessian = (jacobian * weights[:, None]).T @ jacobian
     if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * float(weights @ surfaces.tilt[large, 0] ** 2):
         return None

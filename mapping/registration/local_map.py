@@ -1,12 +1,14 @@
 """The local map that scans are registered to: surfels, or LOAM's edges and planes."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Annotated, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.registration.surfaces import Correspondences, Matcher
@@ -17,6 +19,16 @@ LEVELS = (1, 2, 4)
 _YOUNG_SCANS = 5
 # Surfaces within this cosine of the z axis are floors or ceilings.
 _LEVEL_COSINE = 0.7
+# Cells beyond the radius are dropped each time the sensor has moved by this share of it.
+_FORGET_AFTER = 0.2
+
+
+class Grid(Protocol):
+    """Cells of one size."""
+
+    def __len__(self) -> int: ...
+    def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
+        """Drop the cells farther than `radius_m` from `centre` (3,)."""
 
 
 class LocalMap(Stateful, ABC):
@@ -24,10 +36,20 @@ class LocalMap(Stateful, ABC):
 
     cell_m: float  # edge of the finest cells
     scans: int  # number of inserted scans
+    _radius_m: float
+    _centre: Annotated[FloatArray, Shape(3)] | None
 
-    @abstractmethod
+    def __init__(self, cell_m: float, radius_m: float) -> None:
+        self.cell_m, self.scans, self._radius_m, self._centre = cell_m, 0, radius_m, None
+
     def __len__(self) -> int:
         """Number of cells of all resolutions."""
+        return sum(map(len, self.grids))
+
+    @property
+    @abstractmethod
+    def grids(self) -> Sequence[Grid]:
+        """Its cells of all resolutions."""
 
     @property
     def is_young(self) -> bool:
@@ -49,8 +71,17 @@ class LocalMap(Stateful, ABC):
         """
 
     @abstractmethod
-    def resized(self, cell_m: float) -> "LocalMap":
+    def resample(self, other: Self) -> None:
+        """Fill an empty map with what another one, of other cells, holds."""
+
+    def resized(self, cell_m: float) -> Self:
         """The map in cells of another size; the map itself for its own size."""
+        if cell_m == self.cell_m:
+            return self
+        other = type(self)(cell_m, self._radius_m)
+        other._centre, other.scans = self._centre, self.scans
+        other.resample(self)
+        return other
 
     @abstractmethod
     def means(self) -> FloatArray:
@@ -76,11 +107,16 @@ class LocalMap(Stateful, ABC):
 
     def vertical(self) -> FloatArray:
         """Unit normal (3,) of floors and ceilings near the sensor; the world's z axis when there are none."""
-        normals = self.level_normals()
-        normals = normals[np.abs(normals[:, 2]) > _LEVEL_COSINE]
-        mean = (normals * np.sign(normals[:, 2:])).sum(axis=0)
-        length = float(np.linalg.norm(mean))
-        return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
+        return vertical_of(self.level_normals())
+
+    def _count(self, sensor: FloatArray) -> None:
+        """Count a scan that was inserted, seen from a position (3,), and drop the cells that are too far by now."""
+        self._centre = sensor if self._centre is None else self._centre
+        if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
+            self._centre = sensor
+            for grid in self.grids:
+                grid.drop_beyond(sensor, self._radius_m)
+        self.scans += 1
 
     def goes_on(
         self, points: FloatArray, normals: FloatArray, sensor: FloatArray, cosine: float, thickness: float
@@ -97,3 +133,11 @@ class LocalMap(Stateful, ABC):
         coarse, spread_m = self.coarse_planes(points, sensor)
         is_thin = spread_m < thickness * self.cell_m * LEVELS[-1]
         return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > cosine))
+
+
+def vertical_of(normals: FloatArray) -> FloatArray:
+    """Mean unit normal (3,) of the floors and ceilings among surfaces with normals (M, 3); the z axis without any."""
+    normals = normals[np.abs(normals[:, 2]) > _LEVEL_COSINE]
+    mean = (normals * np.sign(normals[:, 2:])).sum(axis=0)
+    length = float(np.linalg.norm(mean))
+    return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)

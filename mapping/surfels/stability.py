@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import lever_scale
+from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
 from lidarslam.mapping.registration.surfaces import Surfaces
 from lidarslam.mapping.surfels.cell_kernels import write_views
 from lidarslam.mapping.surfels.correspondence_kernels import match_planes
@@ -44,7 +45,7 @@ def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: floa
         return planar
     on_planes, normals = points.take(planar, axis=0), surfaces.normals[planar, 0]
     lever_m = float(np.sqrt(np.einsum("ij,ij->i", on_planes, on_planes).mean()))
-    jacobian = np.column_stack([np.cross(on_planes, normals), normals]) / lever_scale(lever_m)
+    jacobian = point_to_plane_jacobian(on_planes, normals) / lever_scale(lever_m)
     information = jacobian.T @ jacobian / len(planar) + _RIDGE * np.eye(6)
     leverage = np.einsum("ij,ij->i", jacobian @ np.linalg.inv(information), jacobian)
     eligible = np.flatnonzero(leverage > _MANIFOLD * 6.0)

@@ -1,13 +1,12 @@
 """Local map of surfels in three sizes of cells, and the point-to-plane correspondences of a scan with it."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Shape
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -24,8 +23,6 @@ _COMPACT = 0.5
 _CERTAIN_TILT = 0.02
 # No cell has this key.
 _NOWHERE = -1
-# Cells beyond the radius are dropped each time the sensor has moved by this share of it.
-_FORGET_AFTER = 0.2
 # Scans between two removals of stray cells.
 _TIDIED_AFTER = 500
 # Spread of the elevations of points that were seen from many places.
@@ -82,16 +79,16 @@ class SurfelMap(LocalMap):
     compact object in the finest grid, along the axes of small extent.
     """
 
-    _radius_m: float
     _grids: list[SurfelGrid]
-    _centre: Annotated[FloatArray, Shape(3)] | None
 
     def __init__(self, cell_m: float, radius_m: float) -> None:
-        self.cell_m = cell_m
-        self.scans = 0
-        self._radius_m = radius_m
+        super().__init__(cell_m, radius_m)
         self._grids = [SurfelGrid(cell_m * level) for level in LEVELS]
-        self._centre = None
+
+    @property
+    def grids(self) -> list[SurfelGrid]:
+        """See `LocalMap`."""
+        return self._grids
 
     @classmethod
     def of_cloud(cls, points: FloatArray, normals: FloatArray, cell_m: float, radius_m: float) -> "SurfelMap":
@@ -110,10 +107,6 @@ class SurfelMap(LocalMap):
             surfel_map.insert_seen(points[side], elevations[side], normals[side])
         return surfel_map
 
-    def __len__(self) -> int:
-        """See `LocalMap`."""
-        return sum(len(grid) for grid in self._grids)
-
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
         """See `LocalMap`."""
         self.insert(points, scan.elevations, sensor)
@@ -129,13 +122,7 @@ class SurfelMap(LocalMap):
         views = np.empty((len(points), 3), dtype=np.float32)
         write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
         self.insert_seen(points, elevations, views)
-        if self._centre is None:
-            self._centre = sensor
-        if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
-            self._centre = sensor
-            for grid in self._grids:
-                grid.drop_beyond(sensor, self._radius_m)
-        self.scans += 1
+        self._count(sensor)
         if self.scans % _TIDIED_AFTER == 0:
             for grid in self._grids:
                 grid.tidy()
@@ -172,13 +159,8 @@ class SurfelMap(LocalMap):
         """See `LocalMap`."""
         return self._grids[1].means()
 
-    def resized(self, cell_m: float) -> "SurfelMap":
-        """See `LocalMap`; resampled from the finest cells."""
-        if cell_m == self.cell_m:
-            return self
-        other = SurfelMap(cell_m, self._radius_m)
-        other._centre, other.scans = self._centre, self.scans
-        samples = self._grids[0].samples()
-        for grid in other._grids:
+    def resample(self, other: "SurfelMap") -> None:
+        """See `LocalMap`; from the finest cells."""
+        samples = other.grids[0].samples()
+        for grid in self._grids:
             grid.insert_samples(*samples)
-        return other

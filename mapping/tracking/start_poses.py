@@ -60,7 +60,7 @@ def best_supported(points: FloatArray, starts: FloatArray, local_map: LocalMap) 
     distinct, inverse = np.unique(starts.reshape(-1, 16), axis=0, return_inverse=True)
     sums = []
     for start in distinct.reshape(-1, 4, 4):
-        sums.append(_information(points, start, local_map))
+        sums.append(translation_information(*_distances(points, start, local_map))[:2])
         yield
     information, supported = (np.array(parts)[inverse.reshape(-1)] for parts in zip(*sums, strict=True))
     mean = np.mean(information, axis=0)
@@ -80,12 +80,6 @@ def start_score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
     """Sum of the inlier weights of compensated points (N, 3) of the LiDAR frame at a pose (4, 4)."""
     _, distances = _distances(points, T_world_lidar, local_map)
     return float((1.0 / (1.0 + distances**2)).sum())
-
-
-def _information(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> tuple[FloatArray, FloatArray]:
-    """Sums (3, 3) of `n n^T` over the matched points, without and with inlier weights."""
-    information, supported, _ = translation_information(*_distances(points, T_world_lidar, local_map))
-    return information, supported
 
 
 def _distances(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> tuple[FloatArray, FloatArray]:

@@ -133,7 +133,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     clock = FakeClock()
     monkeypatch.setattr(scan_matcher, "register", clock.passes(REGISTRATION_MS, scan_matcher.register))
     monkeypatch.setattr(scan_matcher, "with_mean_velocity", lambda registration, *_: registration)
-    for name in ("start_score", "_information"):
+    for name in ("_distances",):
         monkeypatch.setattr(start_poses, name, clock.passes(SCORE_MS, getattr(start_poses, name)))
     return clock
 

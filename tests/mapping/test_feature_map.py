@@ -65,7 +65,7 @@ def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng):
     feature_map = map_of(points[:500], points[500:], radius_m=8.0)
     sensor = np.array([5.0, 0.0, 0.0])
     add(feature_map, NONE, NONE, sensor)
-    for grid in feature_map._grids:
+    for grid in feature_map.grids:
         assert len(grid) > 0
         assert np.linalg.norm(grid.means - sensor, axis=1).max() < 8.0
 
@@ -76,7 +76,7 @@ def test_a_map_of_other_cells_has_the_same_points(rng):
     resized = fine.resized(0.4)
     assert fine.resized(0.1) is fine
     assert resized.scans == fine.scans
-    for found, expected in zip(resized._grids, coarse._grids, strict=True):
+    for found, expected in zip(resized.grids, coarse._grids, strict=True):
         assert found._sums[:, 0].sum() == expected._sums[:, 0].sum()
         assert len(found) == pytest.approx(len(expected), rel=0.2)
 
@@ -86,7 +86,7 @@ def test_a_restored_map_goes_on(rng, through_disk):
     restored = FeatureMap(1.0, 1.0)
     restored.restore(through_disk(whole.state()))
     for _ in range(2):
-        for one, other in zip(whole._grids, restored._grids, strict=True):
+        for one, other in zip(whole.grids, restored._grids, strict=True):
             np.testing.assert_array_equal(one.means, other.means)
         more = rng.uniform(-5.0, 5.0, (3000, 3))
         for held in (whole, restored):

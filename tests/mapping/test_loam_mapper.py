@@ -52,7 +52,7 @@ def test_the_first_scan_makes_maps_of_edges_and_planes(mapper, ring_scans):
     np.testing.assert_array_equal(first.state.T_world_lidar, np.eye(4))
     assert (first.status, first.registered, first.added, first.fit) == (Status.OK, False, True, None)
     assert isinstance(mapper.local_map, FeatureMap)
-    assert min(len(grid) for grid in mapper.local_map._grids) > 10
+    assert min(len(grid) for grid in mapper.local_map.grids) > 10
 
 
 def test_poses_are_true_with_the_true_motion(mapper, ring_scans, room_truth):
