@@ -32,12 +32,6 @@ class KeptScan:
     cell_m: float  # size of cells that suits the scene
     range_m: float  # median range of the scene
 
-    @classmethod
-    def of(cls, scan: SampledScan, T_local_lidar: FloatArray, velocity: FloatArray) -> "KeptScan":
-        """Compensate a scan with its velocity (6,)."""
-        points, keypoints = scan.sweep.compensated(velocity), scan.keypoints.compensated(velocity)
-        return cls(T_local_lidar, points, keypoints, scan.cell_m, scan.range_m)
-
     def is_apart_from(self, other: "KeptScan") -> bool:
         """Whether the sensor has moved or turned since another scan."""
         motion = inverse(other.T_local_lidar) @ self.T_local_lidar
@@ -108,7 +102,9 @@ class LocalMapping:
         if mapped.status is not Status.LOST:
             self._lost = 0
             self._followed.append(number)
-            self.kept.add(KeptScan.of(scan, mapped.state.T_world_lidar, mapped.state.velocity))
+            T_local_lidar, velocity = mapped.state.T_world_lidar, mapped.state.velocity
+            points, keypoints = scan.sweep.compensated(velocity), scan.keypoints.compensated(velocity)
+            self.kept.add(KeptScan(T_local_lidar, points, keypoints, scan.cell_m, scan.range_m))
         elif mapped.fit is not None:
             self._lost += 1
             if self._lost >= GIVE_UP_AFTER:  # the local map restarts at a pose that is only predicted

@@ -16,7 +16,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
 from lidarslam.mapping.localization.local_mapping import LocalMapping
-from lidarslam.mapping.localization.place_search import Place, PlaceSearch, Search
+from lidarslam.mapping.localization.place_search import Found, Place, PlaceSearch
 from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.tracking.fit import Fit
@@ -35,7 +35,7 @@ _BACK_RANGES = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Localisation:
     """A place that was found and confirmed; scans are numbered from 0."""
 
     scan: int  # that was found
@@ -64,9 +64,9 @@ class MapLocaliser(Stateful):
         self._tracker: Tracker | None = None
         self._regions: Regions | None = None
         self._last: MotionState | None = None
-        self._pending: tuple[Found, FloatArray] | None = None  # unconfirmed, and its `T_map_local` (4, 4)
+        self._pending: tuple[Localisation, FloatArray] | None = None  # unconfirmed, and its `T_map_local` (4, 4)
         self._count = 0
-        self.found: list[Found] = []  # one for each time that it was found
+        self.found: list[Localisation] = []  # one for each time that it was found
         # Of every search without a place: the number of the scan, from 0, and the reason.
         self.refusals: list[tuple[int, str]] = []
         # Better poses than those returned, known by now, by the numbers of the scans; and which of these scans came
@@ -115,7 +115,7 @@ class MapLocaliser(Stateful):
             self._confirm(*self._pending)
         return replace(mapped, added=False)
 
-    def _confirm(self, pending: Found, T_map_local: FloatArray) -> None:
+    def _confirm(self, pending: Localisation, T_map_local: FloatArray) -> None:
         """Accept a place; the scans before the first one are placed too, as far as drift is small."""
         local = self._local
         if local is not None and not self.found:
@@ -152,13 +152,13 @@ class MapLocaliser(Stateful):
         found = self._searched(own)
         if found is None:
             return self._dead_reckoned(own, "the place is searched for")
-        if found.place is None:
-            self.refusals.append((self._count, found.reason))
-            logger.info("scan %d: not found: %s", self._count, found.reason)
-            return self._dead_reckoned(own, f"not found: {found.reason}")
-        return self._begin(scan, own, found.place)
+        if isinstance(found, str):
+            self.refusals.append((self._count, found))
+            logger.info("scan %d: not found: %s", self._count, found)
+            return self._dead_reckoned(own, f"not found: {found}")
+        return self._begin(scan, own, found)
 
-    def _searched(self, own: MappedScan) -> Search | None:
+    def _searched(self, own: MappedScan) -> Found | None:
         local = self._local
         assert local is not None
         if own.status is Status.LOST:
@@ -169,7 +169,7 @@ class MapLocaliser(Stateful):
                 local.T_map_local = self._search.guessed(local.kept, local.up, *self._guess)
             if local.T_map_local is not None:
                 nearby = self._search.around(local.kept, local.T_map_local @ own.state.T_world_lidar)
-                if nearby.place is not None:
+                if isinstance(nearby, Place):
                     return nearby
         if self._guess is None and local.searches_anywhere():
             return self._search.anywhere(local.kept, local.up)
@@ -180,7 +180,7 @@ class MapLocaliser(Stateful):
         local = self._local
         assert local is not None
         T_map_local = place.T_map_lidar @ inverse(own.state.T_world_lidar)
-        self._pending = Found(self._count, -1, place.fits), T_map_local
+        self._pending = Localisation(self._count, -1, place.fits), T_map_local
         self._tracker = Tracker(self._config)
         self._tracker.begin_at(scan.stamp, place.quality)
         covariance = own.state.covariance.copy()
@@ -196,10 +196,8 @@ class MapLocaliser(Stateful):
         """A scan at its pose in the local map, placed where that is supposed."""
         assert self._local is not None
         T_map_local = self._local.T_map_local
-        state = own.state
-        if T_map_local is not None:
-            state = replace(state, T_world_lidar=T_map_local @ state.T_world_lidar)
-        state = replace(state, covariance=LOST_MOTION)
+        T_map_lidar = own.state.T_world_lidar if T_map_local is None else T_map_local @ own.state.T_world_lidar
+        state = replace(own.state, T_world_lidar=T_map_lidar, covariance=LOST_MOTION)
         return MappedScan(state, state.T_world_lidar, False, Status.LOST, reason, None, is_connected=False)
 
     def _regions_for(self, scan: SampledScan) -> Regions:

@@ -5,6 +5,7 @@ Some scans that lie apart must fit at one place, and clearly better than at any 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.birds_eye_map import levelling
 from lidarslam.mapping.tracking.budget import complete
-from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.fit import NO_FIT, Fit
 from lidarslam.mapping.tracking.scan_matcher import measure_fit
 from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
 
@@ -44,6 +45,7 @@ _LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
 # 0.8 a wrong place in a row of equal houses was taken.
 _RIVAL = 0.6
 _SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
+_NO_SCAN = "no scan could be registered to the scans before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,33 +62,27 @@ class Place:
         return self.registration.T_world_lidar
 
     @property
-    def ratio(self) -> float:
-        """Mean inlier ratio."""
-        return float(np.mean([fit.inlier_ratio or 0.0 for fit in self.fits]))
-
-    @property
-    def share(self) -> float:
-        """Mean share of inliers among all points."""
-        return float(np.mean([fit.inlier_share for fit in self.fits]))
-
-    @property
-    def support(self) -> float:
-        """Mean directional support."""
-        return float(np.mean([fit.support or 0.0 for fit in self.fits]))
+    def means(self) -> tuple[float, float, float]:
+        """Over the scans, of the inlier ratio, of the share of inliers among all points, and of the support."""
+        fits = [(fit.inlier_ratio or 0.0, fit.inlier_share, fit.support or 0.0) for fit in self.fits]
+        ratio, share, support = (float(np.mean(values)) for values in zip(*fits, strict=True))
+        return ratio, share, support
 
     @property
     def quality(self) -> float:
         """Score among places."""
-        return self.share * self.support
+        _, share, support = self.means
+        return share * support
 
     def objection(self) -> str:
         """Why the scans do not fit; empty when they do."""
-        if self.share < _LEAST_SHARE:
-            return f"only {100.0 * self.share:.0f} % of the points lie on surfaces of the map"
-        if self.ratio < _LEAST_RATIO:
-            return f"only {100.0 * self.ratio:.0f} % of the points near surfaces of the map fit"
-        if self.support < _LEAST_SUPPORT:
-            return f"only {100.0 * self.support:.0f} % of the points that constrain one direction fit"
+        ratio, share, support = self.means
+        if share < _LEAST_SHARE:
+            return f"only {100.0 * share:.0f} % of the points lie on surfaces of the map"
+        if ratio < _LEAST_RATIO:
+            return f"only {100.0 * ratio:.0f} % of the points near surfaces of the map fit"
+        if support < _LEAST_SUPPORT:
+            return f"only {100.0 * support:.0f} % of the points that constrain one direction fit"
         return ""
 
     def is_at(self, other: "Place") -> bool:
@@ -96,12 +92,8 @@ class Place:
         return bool(near and rotation_angle(motion) < _SAME_RAD)
 
 
-@dataclass(frozen=True, eq=False)
-class Search:
-    """Result of a search: a place, or the reason for none."""
-
-    place: Place | None
-    reason: str = ""
+Found: TypeAlias = Place | str
+"""Result of a search: a place, or the reason for none."""
 
 
 class PlaceSearch:
@@ -117,11 +109,11 @@ class PlaceSearch:
         self._max_range_m = max_range_m
         self._regions: Regions | None = None
 
-    def anywhere(self, scans: KeptScans, up: FloatArray) -> Search:
+    def anywhere(self, scans: KeptScans, up: FloatArray) -> Found:
         """Search the whole map with the scans kept so far; `up` (3,) is the vertical of their local frame."""
         latest = scans.latest
         if latest is None:
-            return Search(None, "no scan could be registered to the scans before")
+            return _NO_SCAN
         cell_m, reach_m = self._map.cell_m(latest.cell_m), _RANGES * latest.range_m
         points = scans.points_around(reach_m)
         R_level_lidar = levelling(up) @ latest.T_local_lidar[:3, :3]
@@ -131,11 +123,11 @@ class PlaceSearch:
             starts.extend(complete(view.find(points, T, reach_m, _PLACES, _PEAKS)))
         return self.among(scans, starts)
 
-    def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Search:
+    def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Found:
         """The one of the places near poses (4, 4) of the latest scan where all scans fit, if no other fits as well."""
         kept = scans.chosen(_OTHERS)
         if not kept or not starts:
-            return Search(None, "there is nothing upright to search with")
+            return "there is nothing upright to search with"
         reach_m = self._reach_m(kept[0])
         cell_m = self._map.cell_m(kept[0].cell_m)
         if self._regions is None or self._regions.cell_m != cell_m:
@@ -148,7 +140,7 @@ class PlaceSearch:
         likely = [place.T_map_lidar for place in rough if place.quality > _LIKELY * rough[0].quality]
         places = self._places(kept[0], likely, _CHAINED, regions)
         if not places:
-            return Search(None, "no place in the map fits at all")
+            return "no place in the map fits at all"
         if not places[0].objection():
             places = [place for place in places if place.quality > _RIVAL * places[0].quality]
             places = [self._with_others(place, kept, regions) for place in places]
@@ -177,11 +169,11 @@ class PlaceSearch:
         T = make_transform(view.R_level_world.T @ R_level_local, np.zeros(3))
         return view.pose_at(yaw, np.array([x, y]), points, T, reach_m)
 
-    def around(self, scans: KeptScans, T_map_lidar: FloatArray) -> Search:
+    def around(self, scans: KeptScans, T_map_lidar: FloatArray) -> Found:
         """Search near a pose (4, 4) of the latest scan."""
         latest = scans.latest
         if latest is None:
-            return Search(None, "no scan could be registered to the scans before")
+            return _NO_SCAN
         cell_m = self._map.cell_m(latest.cell_m)
         reach_m = self._reach_m(latest)
         region = self._map.region(T_map_lidar[:3, 3], 1.5 * reach_m, cell_m)
@@ -200,7 +192,7 @@ class PlaceSearch:
             start = T_map_last @ motion
             found = self._register(scan, start, _CHAINED, regions)
             if found is None or _is_off(start, found.T_map_lidar, motion, regions.cell_m):
-                fits.append(Fit(0, 0.0, None, None))
+                fits.append(NO_FIT)
                 continue
             fits += found.fits
             last, T_map_last = scan, found.T_map_lidar
@@ -223,16 +215,16 @@ class PlaceSearch:
         return min(_RANGES * scan.range_m, self._max_range_m)
 
 
-def _decided(places: Sequence[Place]) -> Search:
+def _decided(places: Sequence[Place]) -> Found:
     """The first of places by descending quality, unless it does not fit, or a rival fits as well."""
     best = places[0]
     if objection := best.objection():
-        return Search(None, f"{objection}, at the best place")
+        return f"{objection}, at the best place"
     rivals = [place for place in places[1:] if place.quality > _RIVAL * best.quality]
     if rivals:
         apart_m = float(np.linalg.norm(rivals[0].T_map_lidar[:3, 3] - best.T_map_lidar[:3, 3]))
-        return Search(None, f"{len(rivals) + 1} places fit alike, two of them {apart_m:.1f} m apart")
-    return Search(best)
+        return f"{len(rivals) + 1} places fit alike, two of them {apart_m:.1f} m apart"
+    return best
 
 
 def _is_off(start: FloatArray, found: FloatArray, motion: FloatArray, cell_m: float) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from lidarslam.core.tracking import Degeneracy
+from lidarslam.core.tracking import Degeneracy, lever_scale
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
 from lidarslam.mapping.registration.gauss_newton import DEGENERATE_INFORMATION, degenerate_directions
@@ -62,7 +62,7 @@ class Registration:
     @property
     def degeneracy(self) -> Degeneracy:
         """The directions along which the prediction was kept."""
-        return self.solution.degeneracy
+        return self.solution.system.degeneracy
 
     @property
     def measured(self) -> MeasuredPose:
@@ -212,26 +212,26 @@ class _System:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """A Gauss-Newton step (12,), with the Hessian (12, 12) of the correspondences and the prior's information."""
+    """A Gauss-Newton step (12,), with the correspondences' normal equations and the prior's information (12, 12)."""
 
     step: FloatArray
-    hessian: FloatArray
-    gradient: FloatArray  # (12,) of the correspondences, before the step
+    system: _System  # of the correspondences, before the step
     prior: FloatArray
-    degeneracy: Degeneracy
 
     def covariance(self, share: float = 1.0) -> FloatArray:
         """(12, 12) with a share of the correspondences' information, none of it along degenerate directions."""
         observed = self._observed
-        return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
+        return np.asarray(
+            np.linalg.inv(share * observed.T @ self.system.hessian @ observed + self.prior), dtype=np.float64
+        )
 
     def measured(self, T_world_lidar: FloatArray, velocity_error: FloatArray) -> MeasuredPose:
         """The pose by the correspondences alone, from the pose (4, 4) and the velocity's error (6,) after the step.
 
         The velocity during the sweep is marginalised, with the uncertainty of its prediction.
         """
-        observed = self._observed
-        H, g = observed.T @ self.hessian @ observed, observed.T @ (self.gradient + self.hessian @ self.step)
+        observed, hessian = self._observed, self.system.hessian
+        H, g = observed.T @ hessian @ observed, observed.T @ (self.system.gradient + hessian @ self.step)
         known = np.linalg.inv(np.linalg.inv(self.prior)[6:, 6:])
         H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ velocity_error
         gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T
@@ -241,9 +241,8 @@ class _Solution:
     @property
     def _observed(self) -> FloatArray:
         """(12, 12) projector onto the directions that are not degenerate."""
-        scale = np.array([self.degeneracy.lever_m] * 3 + [1.0] * 3)
-        D = self.degeneracy.directions
-        return np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
+        scale, D = lever_scale(self.system.lever_m), self.system.degeneracy.directions
+        return np.asarray(np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale)), dtype=np.float64)
 
 
 def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
@@ -252,4 +251,4 @@ def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
     holding[:6, :6], holding[6:, 6:] = held, held * system.squared_time
     b = -(prior + holding) @ error - system.gradient
     step: FloatArray = np.asarray(np.linalg.solve(system.hessian + prior + holding, b), dtype=np.float64)
-    return _Solution(step, system.hessian, system.gradient, prior, system.degeneracy)
+    return _Solution(step, system, prior)
