@@ -133,9 +133,9 @@ def _run_ours(method: str, scans: Iterable[Scan], warm_up: int) -> Times:
     if pipeline.map.global_map is not None:
         pipeline.map.global_map.points()  # what waits to be merged is part of the work
     if graph is not None and pipeline.map.global_map is not None:
-        finished = FinishedGraph.of_recordings(graph, [len(results)], pipeline.map.global_map.voxel_size_m)
-        assert finished is not None
-        finished.outcome([0])
+        optimised = graph.finish()
+        assert optimised is not None
+        FinishedGraph(graph, optimised, pipeline.map.global_map.voxel_size_m).outcome([0])
         graph.close()
     odometry.close()
     counted = results[warm_up:]

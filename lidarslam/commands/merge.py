@@ -60,10 +60,9 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     say(format_merge(out, outcome))
     for line in outcome.stopped:
         note(line)
-    apart = [recording for recording in outcome.apart if recording.directory is not None]
-    for recording in apart:
-        note(f"{recording.directory}: not joined to the others, left out of the common map")
-    if outcome.stopped or apart:
+    for directory in outcome.apart:
+        note(f"{directory}: not joined to the others, left out of the common map")
+    if outcome.stopped or outcome.apart:
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.lost_scans or any(run is not None and run.summary.contradictions for run in outcome.runs):
         ctx.exit(EXIT_LOST)

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import partial
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
-from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import open_tasks
 from lidarslam.core.text import count
 from lidarslam.datasets.faults import Faults
@@ -28,7 +27,6 @@ from lidarslam.merge.parts import (
     closing_loops,
     earlier_parts,
     open_parts,
-    read_graph,
     remove_part,
     track_part,
 )
@@ -51,9 +49,6 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
     A damaged recording ends at the damage; an interruption ends the merge with the results so far. A
     recording that no loop joins to the others has a run of its own and is left out of the common map. A merge that was
     killed or interrupted can be resumed.
-
-    Raises:
-        LidarSlamError: a source, the configuration or the output directory is not usable.
     """
     started = time.perf_counter()
     request = replace(request, config=closing_loops(request.config))
@@ -110,18 +105,13 @@ def _on_common_voxels(config: Config, recordings: Sequence[Recording]) -> Config
     """One map has one voxel size: that of the first scan of all, unless it is configured."""
     if config.global_map.voxel_size_m is not None:
         return config
-    scans = (scan for recording in recordings for scan in _usable(recording) if len(scan))
-    first = next(scans, None)
-    if first is None:
-        return config
-    global_map = config.global_map.model_copy(update={"voxel_size_m": voxel_size_for(first.points)})
-    return config.model_copy(update={"global_map": global_map})
-
-
-def _usable(recording: Recording) -> Iterator[Scan]:
-    """Its scans, up to where it is damaged."""
-    with suppress(InputError):
-        yield from take_in(recording, range(len(recording)), Faults())
+    for recording in recordings:
+        with suppress(InputError):  # its scans up to where it is damaged
+            for scan in take_in(recording, range(len(recording)), Faults()):
+                if len(scan):
+                    global_map = config.global_map.model_copy(update={"voxel_size_m": voxel_size_for(scan.points)})
+                    return config.model_copy(update={"global_map": global_map})
+    return config
 
 
 def _track_all(request: MergeRequest, parts: Sequence[Part], graph: "SlamGraph", show: Show) -> None:
@@ -160,9 +150,8 @@ def _track_all(request: MergeRequest, parts: Sequence[Part], graph: "SlamGraph",
 
 def _add(graph: "SlamGraph", part: Part) -> None:
     """Give the graph the keyframes of a recording; those without any count as well."""
-    config = part.request.config
-    tracked = KeyframeGraph(config.pose_graph.keyframes)
-    if part.scans:
-        tracked = read_graph(part.saved(), config, part.checkpoint.submaps)
-    graph.add_recording(tracked)
-    tracked.close()
+    file = part.files.submaps if part.scans else None
+    with closing(KeyframeGraph(part.request.config.pose_graph.keyframes, file=file)) as tracked:
+        if part.scans:
+            tracked.restore(part.saved().part("graph"))
+        graph.add_recording(tracked)

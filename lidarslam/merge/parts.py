@@ -1,9 +1,8 @@
 """The recordings of a merge: each is tracked as a task of its own, and leaves its result in a run directory."""
 
-import contextlib
 import re
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, closing, suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, chdir, closing, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -66,12 +65,7 @@ def closing_loops(config: Config) -> Config:
 
 
 def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:
-    """The run of each recording; directories count from 1 and take the recordings' names, as file names allow.
-
-    Raises:
-        InputError: a recording cannot be read, or is named twice.
-        OutputError: the output is a recording, or holds an unfinished merge.
-    """
+    """The run of each recording; directories count from 1 and take the recordings' names, as file names allow."""
     if len(request.sources) < 2:
         raise InputError("expected two recordings or more; for the map of a single one use lidarslam run")
     parts: list[tuple[RunRequest, Recording]] = []
@@ -122,13 +116,6 @@ def read_part(saved: Saved) -> TrackedScans:
     return part
 
 
-def read_graph(saved: Saved, config: Config, submaps: Path) -> KeyframeGraph:
-    """Its graph; InputError where a file is damaged."""
-    graph = KeyframeGraph(config.pose_graph.keyframes, file=submaps)
-    graph.restore(saved.part("graph"))
-    return graph
-
-
 # A process whose node was lost may run for some more seconds.
 _PATIENCE_S = 60.0
 
@@ -156,22 +143,12 @@ class PartDone:
     interrupted: bool = False  # whether there are more scans
 
 
-@contextlib.contextmanager
-def _unseen(_name: str) -> Iterator[Progress]:
-    yield lambda _number, _total, _result: None
-
-
-def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
-    """Track a recording, from its last checkpoint where there is one; nothing is done where it was tracked before.
-
-    Raises:
-        LidarSlamError: the recording, the configuration or the directory is not usable, or the directory of the merge
-            is not that of another machine.
-    """
+def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number, _total, _result: None)) -> PartDone:
+    """Track a recording, from its last checkpoint where there is one; nothing is done where it was tracked before."""
     out = task.request.out
     with ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a machine without that folder has no file there either
-            stack.enter_context(contextlib.chdir(task.folder))
+        with suppress(OSError):  # a machine without that folder has no file there either
+            stack.enter_context(chdir(task.folder))
         if task.url is not None:
             fetch(task.url, task.request.source)
         if About.read(out.parent) is None:
@@ -191,33 +168,23 @@ def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
             earlier = read_part(read_state(unfinished.files.tracked))
             if not earlier.interrupted:
                 return PartDone(len(earlier.log))
-        with show(task.name) as progress:
-            return _track(task.request, recording, unfinished, progress, interruptions)
-
-
-def _track(
-    request: RunRequest,
-    recording: Recording,
-    unfinished: Unfinished,
-    progress: Progress,
-    interruptions: Interruptions,
-) -> PartDone:
-    """Track a recording, and leave the result."""
-    graph, files = _open_graph(request.config, unfinished), unfinished.files
-    with closing(graph), closing(open_odometry(request.config, None)) as odometry:
+        graph = stack.enter_context(closing(_open_graph(task.request.config, unfinished)))
+        odometry = stack.enter_context(closing(open_odometry(task.request.config, None)))
         try:
-            session = RunSession(request, RunDirectory(request.out), odometry, unfinished=unfinished)
-            scans = track(session, request, recording, range(len(recording)), progress, graph).scans
+            session = RunSession(task.request, RunDirectory(out), odometry, unfinished=unfinished)
+            with show(task.name) as progress:
+                scans = track(session, task.request, recording, range(len(recording)), progress, graph).scans
         except NoScanError as error:
             unfinished.end(stopped=False)
-            return PartDone(0, f"{request.source}: interrupted" if error.interrupted else str(error), error.interrupted)
+            missing = f"{task.request.source}: interrupted" if error.interrupted else str(error)
+            return PartDone(0, missing, error.interrupted)
         interruptions.protect_results()
         graph.end_recording()
         write_state(files.tracked, {"part": encode(TrackedScans, scans), "graph": graph.state()})
-    if not scans.interrupted:
-        for path in (files.state, files.tiles):  # the state is not resumed any more
-            path.unlink(missing_ok=True)
-    return PartDone(len(scans.log), interrupted=scans.interrupted)
+        if not scans.interrupted:
+            for path in (files.state, files.tiles):  # the state is not resumed any more
+                path.unlink(missing_ok=True)
+        return PartDone(len(scans.log), interrupted=scans.interrupted)
 
 
 def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:

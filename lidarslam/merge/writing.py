@@ -1,7 +1,7 @@
 """The results of a merge: the runs of the recordings, corrected by one graph, the common map, and summary.json."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -82,9 +82,9 @@ class MergeOutcome:
     stopped: tuple[str, ...]  # which recordings ended before their last scan, and why, a line each
 
     @property
-    def apart(self) -> tuple[MergedRecording, ...]:
-        """The recordings that are not in the common map."""
-        return tuple(recording for recording in self.summary.recordings if not recording.joined)
+    def apart(self) -> list[str]:
+        """The directories of the recordings that are not in the common map."""
+        return [one.directory for one in self.summary.recordings if not one.joined and one.directory is not None]
 
 
 @dataclass(eq=False)
@@ -102,23 +102,13 @@ class Part:
         return 0 if self.done is None else self.done.scans
 
     @property
-    def checkpoint(self) -> CheckpointFiles:
-        """The path of its task's result."""
+    def files(self) -> CheckpointFiles:
+        """The files that its task left."""
         return CheckpointFiles(self.request.out)
 
     def saved(self) -> Saved:
-        """That result, read again each time: those of all recordings need not fit into memory.
-
-        Raises:
-            InputError: the file is damaged.
-        """
-        return read_state(self.checkpoint.tracked)
-
-    def tracked(self) -> Tracked:
-        """The recording as it was tracked; its map is rebuilt from the graph."""
-        scans = read_part(self.saved())
-        truth = unless_damaged(lambda: self.recording.ground_truth, scans.log, "no metrics")
-        return Tracked(scans, recording=self.recording, truth=truth)
+        """The result of its task, read again each time: those of all recordings need not fit into memory."""
+        return read_state(self.files.tracked)
 
 
 def missing(parts: Sequence[Part]) -> list[str]:
@@ -130,31 +120,41 @@ def write_merge(
     request: MergeRequest, directory: RunDirectory, parts: Sequence[Part], graph: "SlamGraph", started: float
 ) -> MergeOutcome:
     """Optimise the graph, and write the runs and the common map."""
-    voxel_size_m = parts[0].request.config.global_map.voxel_size_m
-    scans = [part.scans for part in parts]
-    finished = (
-        None
-        if voxel_size_m is None
-        else FinishedGraph.of_recordings(graph, scans, voxel_size_m, request.config.global_map.most_points)
-    )
+    global_map = parts[0].request.config.global_map
+    result, voxel_size_m = graph.finish(), global_map.voxel_size_m
+    finished = None
+    if result is not None and voxel_size_m is not None:
+        finished = FinishedGraph(graph, result, voxel_size_m, global_map.most_points)
     joined = [] if finished is None else finished.joined
     runs = tuple(_write_run(part, finished, index, index in joined) for index, part in enumerate(parts))
     common = None if finished is None else finished.common()
     # First, because it identifies the other files.
     directory.write_text(files.CONFIG, dump_yaml(request.config, request.describe()))
     written, beyond = WrittenMap(0, voxel_size_m, 0), None
-    if common is not None:
+    if result is not None and common is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(common.keyframe_poses, common.edges))
-        views, begin = [], 0
-        for part in (parts[index] for index in joined):
-            if part.scans:
-                views.append(read_part(part.saved()).views.placed(common.T_world_lidar[begin : begin + part.scans]))
-            begin += part.scans
-        drawn = draw(common.global_map, PlacedViews.join(views), request.config.global_map, directory)
+        views = PlacedViews.join(
+            [
+                read_part(parts[index].saved()).views.placed(result.scan_poses(index)[: parts[index].scans])
+                for index in joined
+            ]
+        )
+        drawn = draw(common.global_map, views, request.config.global_map, directory)
         if drawn.failure is not None:
             raise drawn.failure
         written, beyond = write_map(directory, drawn, request.map_formats), drawn.warning
-    recordings = tuple(_entry(part, runs[index], index in joined) for index, part in enumerate(parts))
+    recordings = tuple(
+        MergedRecording(
+            name=part.recording.name,
+            directory=None if run is None else part.request.out.name,
+            source=str(resolved(part.request.source)),
+            scans=part.scans,
+            length_m=0.0 if run is None else run.summary.length_m,
+            lost_scans=0 if run is None else run.summary.lost_scans,
+            joined=index in joined,
+        )
+        for index, (part, run) in enumerate(zip(parts, runs, strict=True))
+    )
     summary = MergeSummary(
         recordings=recordings,
         elapsed_s=time.perf_counter() - started,
@@ -173,54 +173,46 @@ def write_merge(
 
 
 def _write_run(part: Part, finished: FinishedGraph | None, index: int, is_joined: bool) -> RunOutcome | None:
-    """The run of one recording, its poses as the graph corrected them."""
+    """The run of one recording, its poses as the graph corrected them; its map is rebuilt from the graph."""
     if not part.scans:
         return None
-    tracked = part.tracked()
+    scans, request = read_part(part.saved()), part.request
+    truth = unless_damaged(lambda: part.recording.ground_truth, scans.log, "no metrics")
     closed = None if finished is None else finished.outcome([index])
     if closed is not None:
-        tracked.scans.log.correct(closed.T_world_lidar)
+        scans.log.correct(closed.T_world_lidar[: len(scans.log)])
     if not is_joined:
-        tracked.scans.log.warn(_OF_ITS_OWN)
-    request = part.request
+        scans.log.warn(_OF_ITS_OWN)
+    tracked = Tracked(scans, recording=part.recording, truth=truth)
     return write_results(part.directory, request.config, describe_run(request), tracked, closed, request.map_formats)
 
 
-def _entry(part: Part, run: RunOutcome | None, is_joined: bool) -> MergedRecording:
-    return MergedRecording(
-        name=part.recording.name,
-        directory=None if run is None else part.request.out.name,
-        source=str(resolved(part.request.source)),
-        scans=part.scans,
-        length_m=0.0 if run is None else run.summary.length_m,
-        lost_scans=0 if run is None else run.summary.lost_scans,
-        joined=is_joined,
-    )
-
-
-def _warnings(recordings: Sequence[MergedRecording], runs: Sequence[RunOutcome | None]) -> list[str]:
+def _warnings(recordings: Sequence[MergedRecording], runs: Sequence[RunOutcome | None]) -> Iterator[str]:
     """Recordings that are not in the common map, and the warnings of runs."""
-    apart = [
-        f"{entry.directory}: left out of the common map, because no loop closure with the others was accepted."
-        f" Give recordings that share more of the way; the loops in {files.SUMMARY} say why each was rejected"
-        for entry in recordings
-        if not entry.joined and entry.directory is not None
-    ]
-    own = [
-        f"{entry.directory}: {warning}"
-        for entry, run in zip(recordings, runs, strict=True)
-        if run is not None
-        for warning in run.summary.warnings
-        if warning != _OF_ITS_OWN
-    ]
-    return [*apart, *own]
+    for entry in recordings:
+        if not entry.joined and entry.directory is not None:
+            yield (
+                f"{entry.directory}: left out of the common map, because no loop closure with the others was accepted."
+                " Give recordings that share more of the way;"
+                f" the loops in {files.SUMMARY} say why each was rejected"
+            )
+    for entry, run in zip(recordings, runs, strict=True):
+        for warning in () if run is None else run.summary.warnings:
+            if warning != _OF_ITS_OWN:
+                yield f"{entry.directory}: {warning}"
 
 
 def format_merge(out: Path, outcome: MergeOutcome) -> str:
     """A merge in a few lines: each recording, the loops between them, the common map, warnings, and the directory."""
     summary = outcome.summary
     lines = [_recording(recording, run) for recording, run in zip(summary.recordings, outcome.runs, strict=True)]
-    lines += [_joined(summary), format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
+    closed = [loop for loop in (() if summary.graph is None else summary.graph.loops) if loop.accepted]
+    between = sum(len(set(loop.recordings or ())) > 1 for loop in closed)
+    lines.append(
+        f"{sum(one.joined for one in summary.recordings)} of {len(summary.recordings)} recordings in one map;"
+        f" loops closed: {between} between recordings, {len(closed) - between} within"
+    )
+    lines += [format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
     if summary.lost_scans:
         lost = count(summary.lost_scans, "scan")
         lines.append(f"tracking was lost on {lost}; the summaries of the recordings say where")
@@ -237,14 +229,3 @@ def _recording(recording: MergedRecording, run: RunOutcome | None) -> str:
         parts.append(f"{recording.lost_scans:,} lost")
     parts.append("in the common frame" if recording.joined else "NOT JOINED")
     return ", ".join(parts)
-
-
-def _joined(summary: MergeSummary) -> str:
-    joined = sum(recording.joined for recording in summary.recordings)
-    loops = () if summary.graph is None else summary.graph.loops
-    closed = [loop for loop in loops if loop.accepted]
-    between = sum(len(set(loop.recordings or ())) > 1 for loop in closed)
-    return (
-        f"{joined} of {len(summary.recordings)} recordings in one map;"
-        f" loops closed: {between} between recordings, {len(closed) - between} within"
-    )

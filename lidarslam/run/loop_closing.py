@@ -76,10 +76,7 @@ def begin_graph(
 ) -> "SlamGraph | None":
     """A pose graph, when the configuration asks for one; its submaps are stored in the directory, or in the file.
 
-    Loop closures may be given or forbidden.
-
-    Raises:
-        ConfigError: it requires GNSS positions where none are used.
+    ConfigError where it requires GNSS positions and none are used.
     """
     if config.pose_graph.gnss and not takes_gnss:
         raise ConfigError("pose_graph.gnss is available in lidarslam run only; leave it out here")
@@ -98,10 +95,7 @@ def close_loops(
     viewer: Viewer,
     track: "ProjectedTrack | None" = None,
 ) -> GraphOutcome | None:
-    """Correct the log, and show it, once all scans are processed; None where there is nothing to correct.
-
-    A GNSS track, if it is given, constrains the graph.
-    """
+    """Correct the log, with a GNSS track if there is one, and show it; None where there is nothing to correct."""
     if graph is None or global_map is None:
         return None
     logger.info("optimising the pose graph")
@@ -147,64 +141,51 @@ def _corrected(
     graph: "SlamGraph", result: "Corrected | None", global_map: GlobalMap, log: ScanLog
 ) -> "GraphOutcome | None":
     """Correct the log of one recording."""
-    like = global_map.voxel_size_m, global_map.most_points
-    closed = None if result is None else FinishedGraph(graph, result, (len(log),), *like).outcome([0])
+    if result is None:
+        return None
+    closed = FinishedGraph(graph, result, global_map.voxel_size_m, global_map.most_points).outcome([0])
     if closed is not None:
-        log.correct(closed.T_world_lidar)
+        log.correct(closed.T_world_lidar[: len(log)])
     return closed
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedGraph:
-    """An optimised graph of one recording or more; maps are built on request."""
+    """An optimised graph of one recording or more; maps, with these voxels, are built on request."""
 
-    _graph: "SlamGraph"
-    _result: "Corrected"
-    _scans: tuple[int, ...]
-    # of the maps, see `GlobalMap`
-    _voxel_size_m: float
-    _most_points: int | None = None
-
-    @classmethod
-    def of_recordings(
-        cls, graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float, most_points: int | None = None
-    ) -> "FinishedGraph | None":
-        """Optimise recordings of these numbers of scans; None where no scan was registered."""
-        result = graph.finish()
-        return None if result is None else cls(graph, result, tuple(scans), voxel_size_m, most_points)
+    graph: "SlamGraph"
+    result: "Corrected"
+    voxel_size_m: float
+    most_points: int | None = None
 
     @property
     def joined(self) -> list[int]:
         """The recordings of the largest connected component, of several the first."""
-        mapped = np.unique(self._result.keyframe_recordings)
-        mapped = mapped[np.array(self._scans)[mapped] > 0]
-        if not len(mapped):
-            return []
-        frames, counts = np.unique(self._result.frames[mapped], return_counts=True)
-        return [int(recording) for recording in mapped[self._result.frames[mapped] == frames[counts.argmax()]]]
+        mapped = np.unique(self.result.keyframe_recordings)
+        frames, counts = np.unique(self.result.frames[mapped], return_counts=True)
+        return [int(recording) for recording in mapped[self.result.frames[mapped] == frames[counts.argmax()]]]
 
     def common(self) -> GraphOutcome | None:
         """The connected recordings, and why others are apart: the rejected loops between recordings."""
-        outcome = self.outcome(self.joined, numbered=True)
-        if outcome is None:
-            return None
+        joined = self.joined
+        outcome = self.outcome(joined, numbered=True)
         apart = [
             loop
-            for loop in self._loops(range(len(self._scans)), numbered=True)
-            if not (loop.accepted or self._are_in(self.joined, loop.closure)) and len(set(loop.recordings or ())) > 1
+            for loop in self._loops(range(len(self.result.first_scans)), numbered=True)
+            if not (loop.accepted or self._are_in(joined, loop.closure)) and len(set(loop.recordings or ())) > 1
         ]
-        return replace(outcome, loops=(*outcome.loops, *apart))
+        return None if outcome is None else replace(outcome, loops=(*outcome.loops, *apart))
 
     def outcome(self, recordings: Sequence[int], numbered: bool = False) -> GraphOutcome | None:
         """Some recordings, and the loops between them, on request with their numbers; None when none has a keyframe."""
-        result = self._result
+        result = self.result
         chosen = np.flatnonzero(np.isin(result.keyframe_recordings, recordings))
         if not len(chosen):
             return None
         row = {int(key): new for new, key in enumerate(chosen)}
         return GraphOutcome(
-            T_world_lidar=np.concatenate([self._scan_poses(recording) for recording in recordings]),
-            global_map=self._graph.draw_map(result, self._voxel_size_m, recordings, self._most_points),
+            T_world_lidar=np.concatenate([result.scan_poses(recording) for recording in recordings]),
+            global_map=self.graph.draw_map(result, self.voxel_size_m, recordings, self.most_points),
             keyframe_poses=result.keyframe_poses[chosen],
             edges=tuple(
                 replace(edge, first=row[edge.first], second=row[edge.second])
@@ -213,31 +194,27 @@ class FinishedGraph:
             ),
             loops=self._loops(recordings, numbered or len(recordings) > 1),
             largest_correction_m=max(self._correction_m(recording) for recording in recordings),
-            keyframe_ms=tuple(self._graph.keyframe_ms[k] for k in chosen),
+            keyframe_ms=tuple(self.graph.keyframe_ms[k] for k in chosen),
         )
-
-    def _scan_poses(self, recording: int) -> FloatArray:
-        begin = self._result.first_scans[recording]
-        return self._result.T_world_lidar[begin : begin + self._scans[recording]]
 
     def _correction_m(self, recording: int) -> float:
         """How far a recording's scans moved, its first keyframe held fixed."""
-        keys = np.flatnonzero(self._result.keyframe_recordings == recording)
-        after = self._scan_poses(recording)
-        if not len(keys) or not len(after):
+        keys = np.flatnonzero(self.result.keyframe_recordings == recording)
+        if not len(keys):
             return 0.0
-        begin, first = self._result.first_scans[recording], self._result.keyframe_scans[keys[0]]
-        before = np.array(self._graph.scan_poses[begin : begin + len(after)])
-        T_common_own = self._result.T_world_lidar[first] @ inverse(self._graph.scan_poses[first])
+        begin, first = self.result.first_scans[recording], self.result.keyframe_scans[keys[0]]
+        after = self.result.scan_poses(recording)
+        before = np.array(self.graph.scan_poses[begin : begin + len(after)])
+        T_common_own = self.result.T_world_lidar[first] @ inverse(self.graph.scan_poses[first])
         return float(np.linalg.norm(after[:, :3, 3] - (T_common_own @ before)[:, :3, 3], axis=1).max())
 
     def _are_in(self, recordings: Sequence[int], edge: RelativePose) -> bool:
-        of = self._result.keyframe_recordings
+        of = self.result.keyframe_recordings
         return bool(of[edge.first] in recordings and of[edge.second] in recordings)
 
     def _loops(self, recordings: Sequence[int], numbered: bool) -> tuple[LoopReport, ...]:
-        of = self._result.keyframe_recordings
-        scans = self._result.keyframe_scans - self._result.first_scans[of]
+        of = self.result.keyframe_recordings
+        scans = self.result.keyframe_scans - self.result.first_scans[of]
         return tuple(
             LoopReport(
                 closure,
@@ -245,6 +222,6 @@ class FinishedGraph:
                 (int(scans[closure.first]), int(scans[closure.second])),
                 (int(of[closure.first]) + 1, int(of[closure.second]) + 1) if numbered else None,
             )
-            for closure, inlier in zip(self._result.closures, self._result.inliers, strict=True)
+            for closure, inlier in zip(self.result.closures, self.result.inliers, strict=True)
             if self._are_in(recordings, closure)
         )

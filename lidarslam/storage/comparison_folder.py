@@ -38,8 +38,7 @@ _SHAPE = TypeAdapter(_Comparison)
 def run_directories(path: Path) -> list[Path]:
     """The run directories of a comparison of one recording, in its order; any other path itself.
 
-    Raises:
-        InputError: the comparison is of several recordings, has no run, or its file is damaged.
+    InputError where the comparison is of several recordings, has no run, or its file is damaged.
     """
     file = path / COMPARISON
     if not file.is_file() or (path / TRAJECTORY_TUM).is_file():
@@ -50,15 +49,12 @@ def run_directories(path: Path) -> list[Path]:
         if sequences is not None:
             names = ", ".join(str(path / sequence["sequence"]) for sequence in sequences)
             raise InputError(f"{path}: compares several recordings, in worlds of their own; name one of {names}")
-        runs = [_run(method["run"]) for method in content["methods"].values() if method["run"]]
+        places = [method["run"] for method in content["methods"].values() if method["run"]]
+        # A recording's name and a method's: a comparison names no runs elsewhere.
+        runs = [Path(*(require_name(part, "run") for part in place.split("/"))) for place in places]
     except (OSError, ValueError, KeyError, ConfigError) as error:
         raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
     if not runs:
         raise InputError(f"{path}: none of its methods came to a result")
     # Next to its methods' folders, or, of one of several recordings, in the same folder as these.
     return [path / run if (path / run).is_dir() else path.parent / run for run in runs]
-
-
-def _run(place: str) -> Path:
-    """A recording's name and a method's; a comparison names no runs elsewhere."""
-    return Path(*(require_name(part, "run") for part in place.split("/")))

@@ -40,7 +40,8 @@ def source_name(source: Path, sequence: str | None = None) -> str:
 
 def latest_run() -> Path | None:
     """The run in `runs` whose trajectory was written last; None without any. Running ones are left out."""
-    found = [path.parent for path in RUNS.glob(f"*/{TRAJECTORY_TUM}") if _standing(path.parent) != "at work"]
+    runs = (path.parent for path in RUNS.glob(f"*/{TRAJECTORY_TUM}"))
+    found = [run for run in runs if (about := _about(run)) is None or about.standing != "at work"]
     return max(found, key=lambda run: (run / TRAJECTORY_TUM).stat().st_mtime, default=None)
 
 
@@ -64,11 +65,6 @@ def _is_of(run: Path, source: Path, sequence: str | None) -> bool:
     reader = about.description.get("reader")
     same_sequence = not isinstance(reader, dict) or reader.get("sequence") == sequence
     return about.description.get("source") == str(resolved(source)) and same_sequence
-
-
-def _standing(run: Path) -> str | None:
-    about = _about(run)
-    return None if about is None else about.standing
 
 
 def _about(run: Path) -> About | None:

@@ -39,21 +39,9 @@ MAP_PNG = "map.png"
 TRAJECTORY_PNG = "trajectory.png"
 
 FILES = (
-    CONFIG,
-    TRAJECTORY_TUM,
-    TRAJECTORY_KITTI,
-    ODOMETRY_TUM,
-    MAP_PLY,
-    *MAPS.values(),
-    POSE_GRAPH,
-    SCANS_CSV,
-    SUMMARY,
-    METRICS,
-    RERUN,
-    REPORT,
-    MAP_PNG,
-    TRAJECTORY_PNG,
-)
+    CONFIG, TRAJECTORY_TUM, TRAJECTORY_KITTI, ODOMETRY_TUM, MAP_PLY, *MAPS.values(), POSE_GRAPH, SCANS_CSV, SUMMARY,
+    METRICS, RERUN, REPORT, MAP_PNG, TRAJECTORY_PNG,
+)  # fmt: skip
 
 # Columns of scans.csv: standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
 SIGMAS = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
@@ -93,9 +81,10 @@ class RunDirectory:
                 try:
                     yield directory
                 except BaseException:
-                    directory._discard_unless_run()
+                    if not _is_run(path):  # files that no config.yaml describes would obstruct the next attempt
+                        _remove(path, directory._written)
                     raise
-                directory._remove_stale()
+                _remove(path, directory._stale)
         except OSError as error:
             if error.errno not in _NO_ROOM:
                 raise
@@ -133,33 +122,13 @@ class RunDirectory:
             raise cannot_write(self.path / name, error) from error
 
     def write_json(self, name: str, value: dict[str, Any]) -> None:
-        """Write a JSON file.
-
-        Raises:
-            OutputError: it cannot be written.
-            ValueError: a number is not finite.
-        """
+        """Write a JSON file of finite numbers; OutputError where it cannot be written."""
         self.write_text(name, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-
-    def _remove_stale(self) -> None:
-        """Remove the remaining files of the earlier run."""
-        for name in self._stale:
-            _unlink(self.path, name)
-        _remove_empty(self.path)
-
-    def _discard_unless_run(self) -> None:
-        """Remove files that no config.yaml describes: they would obstruct the next attempt."""
-        if not _is_run(self.path):
-            for name in self._written:
-                _unlink(self.path, name)
-            _remove_empty(self.path)
 
 
 def remove_files(path: Path) -> None:
     """Remove all files of a run."""
-    for name in (*tile_names(path), *FILES):
-        _unlink(path, name)
-    _remove_empty(path)
+    _remove(path, (*tile_names(path), *FILES))
 
 
 def files_in(path: Path) -> list[str]:
@@ -176,16 +145,16 @@ def tile_names(path: Path) -> list[str]:
     return [*([MAP_INDEX] if (path / MAP_INDEX).exists() else []), *tiles]
 
 
-def _unlink(path: Path, name: str) -> None:
-    """Remove a file of a run, or the link in place of its folder; a folder in place of the file is not of the run."""
-    top = path / Path(name).parts[0]
-    file = top if top.is_symlink() else path / name
-    if file.is_symlink() or not file.is_dir():
-        file.unlink(missing_ok=True)
+def _remove(path: Path, names: Iterable[str]) -> None:
+    """Remove files of a run, or the links in place of their folders, and the folder of tiles that is empty then.
 
-
-def _remove_empty(path: Path) -> None:
-    """Remove the folder of a map's tiles, when it holds at most the remains of a killed process."""
+    A folder in place of a file is not of the run.
+    """
+    for name in names:
+        top = path / Path(name).parts[0]
+        file = top if top.is_symlink() else path / name
+        if file.is_symlink() or not file.is_dir():
+            file.unlink(missing_ok=True)
     folder = path / MAP_TILES
     if folder.is_dir() and not folder.is_symlink():
         remove_partial_files(folder)
@@ -210,13 +179,12 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
                 f"{path}: holds an unfinished run or merge; replace it with --overwrite, or resume a run with --resume"
             )
         return [*present, *([] if resume else [ABOUT])]
-    if not present or resume:
-        return present
-    listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
-    if not _is_run(path):
-        raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
-    if not overwrite:
-        raise OutputError(f"{path}: holds a run ({listed}); name another directory, or replace it with --overwrite")
+    if present and not resume:
+        listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
+        if not _is_run(path):
+            raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
+        if not overwrite:
+            raise OutputError(f"{path}: holds a run ({listed}); name another directory, or replace it with --overwrite")
     return present
 
 

@@ -24,7 +24,6 @@ from lidarslam.datasets.registry import choose_reader
 from lidarslam.datasets.unrecognised import absent
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.unfinished import require_whole
 
 _LISTED = 5
@@ -72,22 +71,14 @@ class FinishedRun:
 
 
 def shown_map(path: Path) -> PointCloud:
-    """The map of a run as it is drawn; that in which it was localised, if it has none and that one still exists.
-
-    Raises:
-        InputError: as `load_map`.
-    """
+    """The map of a run as it is drawn; that in which it was localised, if it has none and that one still exists."""
     cloud = load_map(path)
     other = localised_in(path)
     return load_map(other) if not len(cloud) and other is not None and other.exists() else cloud
 
 
 def localised_in(path: Path) -> Path | None:
-    """The map that a run was localised in; None for any other run, and for a file.
-
-    Raises:
-        InputError: its summary is damaged.
-    """
+    """The map that a run was localised in; None for any other run, and for a file."""
     about = read_summary(path).get("localisation") if path.is_dir() else None
     return None if about is None else Path(about["map"])
 
@@ -108,11 +99,7 @@ def load_run(path: Path) -> FinishedRun:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """The final poses of a run directory.
-
-    Raises:
-        InputError: there is no run, it did not finish, or its trajectory is damaged or cut off.
-    """
+    """The final poses of a run directory; InputError without a finished run, or where they are damaged or cut off."""
     require_whole(path)
     file = path / files.TRAJECTORY_TUM
     if not file.is_file():
@@ -127,11 +114,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def load_map(path: Path) -> PointCloud:
-    """The map of a run directory, or a .ply or .pcd file, with normals and attributes; empty when the run has none.
-
-    Raises:
-        InputError: there is no such file, or it cannot be read.
-    """
+    """The map of a run directory, or a .ply or .pcd file, with normals and attributes; empty when the run has none."""
     file = path / files.MAP_PLY if path.is_dir() else path
     if not path.exists():
         raise InputError(absent(path))
@@ -148,30 +131,21 @@ def load_map(path: Path) -> PointCloud:
         points = coordinates(table)
     except ValueError as error:
         raise InputError(f"{file}: not a readable point cloud: {error}") from None
-    normals = _normals(table)
+    known = next((names for names in _NORMALS if set(names) <= set(table.dtype.names or ())), None)
+    normals = np.tile([0.0, 0.0, 1.0], (len(table), 1))  # upright where there are none
+    if known is not None:
+        normals = np.column_stack([table[name].astype(np.float64) for name in known])
     usable = np.asarray(np.isfinite(np.hstack([points, normals])).all(axis=1))
     if not usable.any():
         raise InputError(f"{file}: not a readable point cloud; no point is finite")
-    return PointCloud(points[usable], normals[usable], _attributes(table).select(usable))
-
-
-def _normals(table: NDArray[np.void]) -> FloatArray:
-    """The normals (N, 3) of a cloud; upright where it has none."""
-    for names in _NORMALS:
-        if set(names) <= set(table.dtype.names or ()):
-            return np.column_stack([table[name].astype(np.float64) for name in names])
-    return np.tile([0.0, 0.0, 1.0], (len(table), 1))
-
-
-def _attributes(table: NDArray[np.void]) -> PointAttributes:
-    """The attributes of N points, as this program names them and others do."""
     names = scalar_fields(table)
-    return PointAttributes(
+    attributes = PointAttributes(
         intensity=read_intensities(table, names),
         rgb=read_colours(table, names),
         ring=table["ring"].astype(np.int32) if "ring" in names else None,
         time=table["time"].astype(np.float64) if "time" in names else None,
     )
+    return PointCloud(points[usable], normals[usable], attributes.select(usable))
 
 
 def _loops(path: Path, scans: int) -> NDArray[np.intp]:
@@ -183,11 +157,7 @@ def _loops(path: Path, scans: int) -> NDArray[np.intp]:
 
 
 def read_statuses(path: Path, poses: int) -> list[Status]:
-    """The status of each scan of a run; ok where no table has been kept.
-
-    Raises:
-        InputError: the table is damaged, or has not a row for each pose.
-    """
+    """The status of each scan of a run, ok where no table has been kept; InputError where that does not fit."""
     file = path / files.SCANS_CSV
     if not file.is_file():
         return [Status.OK] * poses
@@ -195,55 +165,41 @@ def read_statuses(path: Path, poses: int) -> list[Status]:
         with file.open(encoding="utf-8", newline="") as rows:
             statuses = [Status(row["status"]) for row in csv.DictReader(rows)]
     except (KeyError, ValueError, csv.Error) as error:  # not UTF-8 is a ValueError
-        raise _damaged(file, "a run's table", error) from error
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise InputError(f"{file}: not a run's table ({reason}); make the run again") from error
     if len(statuses) != poses:
         raise InputError(f"{file}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again")
     return statuses
 
 
-def _damaged(file: Path, kind: str, error: Exception) -> InputError:
-    reason = f"{error} is missing" if isinstance(error, KeyError) else error
-    return InputError(f"{file}: not {kind} ({reason}); make the run again")
-
-
-_keeping_others = with_config(ConfigDict(extra="allow"))
-_Positive = Annotated[float, Field(gt=0.0)]
-
-
-@_keeping_others
 class _Stretch(TypedDict):
     first: NonNegativeInt
     last: NonNegativeInt
 
 
-@_keeping_others
 class _LostStretch(_Stretch):
     reason: str
 
 
-@_keeping_others
 class _Loop(TypedDict):
     first_scan: int
     second_scan: int
     accepted: bool
 
 
-@_keeping_others
 class _PoseGraph(TypedDict):
     loops: list[_Loop]
 
 
-@_keeping_others
 class _Localisation(TypedDict):
     map: str
 
 
-@_keeping_others
 class _Recording(TypedDict):
     directory: str | None
 
 
-@_keeping_others
+@with_config(ConfigDict(extra="allow"))  # at all depths
 class _Summary(TypedDict, total=False):
     """The content that is read back, of any version; other keys are kept as they are."""
 
@@ -253,7 +209,7 @@ class _Summary(TypedDict, total=False):
     map_contradictions: list[_Stretch]
     length_m: float
     unconstrained_m: float
-    map_voxel_size_m: _Positive | None
+    map_voxel_size_m: Annotated[float, Field(gt=0.0)] | None
     map_entropy: float | None
     ms_per_scan: dict[str, dict[str, float | None]]
     pose_graph: _PoseGraph | None
@@ -275,7 +231,7 @@ def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
 
 def read_summary(path: Path) -> dict[str, Any]:
     """The content of a run's summary.json, empty when there is none; InputError where it is damaged."""
-    file = path / SUMMARY
+    file = path / files.SUMMARY
     if not file.is_file():
         return {}
     try:

@@ -25,11 +25,7 @@ _REMEDY = "begin again with --overwrite"
 
 
 def write_state(path: Path, state: State) -> None:
-    """Write the file; after a crash or power failure, either the earlier file or the whole new one exists.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write the file, or raise an OutputError; after a power failure, the earlier one or the whole new one exists."""
     arrays: list[NDArray[Any]] = []
     text = json.dumps(_encoded(state, arrays))
     members = {f"{_ARRAY}{number}": array for number, array in enumerate(arrays)}

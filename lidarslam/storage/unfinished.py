@@ -47,11 +47,7 @@ class About:
             raise InputError(f"{path}: is damaged ({error}); begin again with --overwrite") from error
 
     def write(self, run: Path) -> None:
-        """Write run.json, durably.
-
-        Raises:
-            OSError, OutputError: it cannot be written.
-        """
+        """Write run.json, durably; OutputError where it cannot be written."""
         with replacing(run / ABOUT, durable=True) as partial:
             try:
                 partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
@@ -60,16 +56,12 @@ class About:
 
     def remedy(self, run: Path) -> str:
         """The remedy, as the end of a sentence that begins with the directory."""
-        if "merge" not in self.description:
-            source = self.description.get("source", "SOURCE")
-            return (
-                f"this run did not finish; resume it with lidarslam run {source} --out {run} --resume"
-                " and the options it was begun with"
-            )
-        sources = " ".join(self.description["sources"])
-        out = run if self.description["merge"] == "all" else run.parent
+        kind, sources, out = "run", [self.description.get("source", "SOURCE")], run
+        if "merge" in self.description:
+            kind, sources = "merge", self.description["sources"]
+            out = run if self.description["merge"] == "all" else run.parent
         return (
-            f"this merge did not finish; resume it with lidarslam merge {sources} --out {out} --resume"
+            f"this {kind} did not finish; resume it with lidarslam {kind} {' '.join(sources)} --out {out} --resume"
             " and the options it was begun with"
         )
 
@@ -78,11 +70,7 @@ _SHAPE = TypeAdapter(About)
 
 
 def require_whole(run: Path) -> None:
-    """Refuse the results of a run that was killed or is running, unless they are still those of the run before.
-
-    Raises:
-        InputError: they are.
-    """
+    """Raise an InputError for results of a run that was killed or is running, unless they are of the run before."""
     about = About.read(run)
     if about is not None and about.standing == "at work":
         raise InputError(f"{run}: {about.remedy(run)}")
@@ -100,12 +88,8 @@ def _warn_of_earlier(run: Path) -> None:
     )
 
 
-def require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
-    """Refuse to resume a run that was begun with another description than is asked for.
-
-    Raises:
-        InputError: they differ.
-    """
+def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
+    """Refuse to resume a run that was begun with another description than is asked for."""
     old, new = _flat(was), _flat(asked)
     names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
     if names:
@@ -125,18 +109,13 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 class CheckpointFiles:
-    """The files of a run's checkpoint, there or not.
-
-    Attributes:
-        run, folder: the directory of the run, and in it that of the other files.
-        state, submaps, tiles: after the last scans; of the pose graph; of the global map.
-        tracked: a recording of a merge that was tracked.
-    """
+    """The files of a run's checkpoint, there or not."""
 
     def __init__(self, run: Path) -> None:
-        self.run, self.folder, self.state = run, run / UNFINISHED, run / STATE
-        self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"
-        self.tracked = self.folder / "tracked.npz"
+        self.run, self.folder = run, run / UNFINISHED
+        self.state = run / STATE  # after the last scans
+        self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"  # of graph and global map
+        self.tracked = self.folder / "tracked.npz"  # a recording of a merge that was tracked
 
     def require_own(self) -> None:
         """Before anything is resumed from them, or locked; InputError where their folder is a link."""
@@ -169,11 +148,7 @@ class CheckpointFiles:
 
 
 def remove_unfinished(run: Path) -> None:
-    """Remove a run, or a part of a merge, that was killed, and its directory when it is empty then.
-
-    Raises:
-        OutputError: it is running.
-    """
+    """Remove a run that was killed, and its directory when it is empty then; OutputError where it is running."""
     with only_writer(run):
         remove_partial_files(run)
         remove_files(run)
@@ -183,19 +158,12 @@ def remove_unfinished(run: Path) -> None:
 
 
 class Unfinished:
-    """The checkpoint of one run.
-
-    Attributes:
-        run: its directory.
-        about: the description of the run.
-        saved: the state to resume from, None to begin.
-        files: those of its checkpoint.
-    """
+    """The checkpoint of one run."""
 
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
         self.files = CheckpointFiles(run)
-        self.saved: Saved | None = None
+        self.saved: Saved | None = None  # the state to resume from, None to begin
         self._keeps_earlier = False  # whether the whole results of an earlier run are there
 
     @classmethod
@@ -211,20 +179,20 @@ class Unfinished:
             OutputError: the folder cannot be written.
         """
         run = directory.path
+        about = About(description)
         if resume:
             CheckpointFiles(run).require_own()
-        about = About.read(run) if resume else None
-        if resume and about is None:
-            raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
-        if about is not None:
-            require_same(run, about.description, description)
-        unfinished = cls(run, about or About(description), resume)
+            if (begun := About.read(run)) is None:
+                raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
+            _require_same(run, begun.description, description)
+            about = begun
+        unfinished = cls(run, about, resume)
         unfinished.files.make_folder()
         for folder in (run, unfinished.files.folder):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()
         unfinished._keeps_earlier = directory.has_earlier and _holds_results(run)
-        if about is None:
+        if not resume:
             unfinished.files.clear()
         elif unfinished.files.state.is_file():
             unfinished.saved = read_state(unfinished.files.state)

@@ -34,6 +34,10 @@ class Corrected:
         """(K,) the recording of each keyframe."""
         return recordings_of(self.keyframe_scans, self.first_scans)
 
+    def scan_poses(self, recording: int) -> FloatArray:
+        """(N, 4, 4) of the scans of a recording."""
+        return np.split(self.T_world_lidar, self.first_scans[1:])[recording]
+
 
 def recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDArray[np.intp]:
     """(N,) the recording of each scan (N,), given where recordings (R,) begin."""
@@ -65,39 +69,29 @@ def corrected_recordings(
 
 
 def corrected(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyframe_poses: FloatArray) -> FloatArray:
-    """All scans (M, 4, 4), the keyframes (N,) among them at their new poses (N, 4, 4).
+    """All scans (M, 4, 4), the increasing keyframes (N,) among them, one or more, at their new poses (N, 4, 4).
 
     A scan between two keyframes is interpolated between the pose that its motion since the one gives, and the pose
     that its motion up to the other gives, in proportion to the path, or to the scans where the sensor stood still.
     Both poses are near the scan, so there is no lever arm from the origin. Scans before the first keyframe keep their
     motion up to it, those after the last their motion since it.
-
-    Raises:
-        ValueError: there is no keyframe, or they do not increase.
     """
-    if not len(keyframe_scans) or (np.diff(keyframe_scans) <= 0).any():
-        raise ValueError(f"expected increasing keyframe_scans, one or more, got {keyframe_scans}")
     scans = np.arange(len(T_world_lidar))
     after = np.searchsorted(keyframe_scans, scans, side="right")
     left = np.clip(after - 1, 0, None)
     right = np.clip(after, None, len(keyframe_scans) - 1)
     motion_since = inverse(T_world_lidar[keyframe_scans[left]]) @ T_world_lidar
     motion_until = inverse(T_world_lidar[keyframe_scans[right]]) @ T_world_lidar
-    share = _shares(T_world_lidar[:, :3, 3], scans, keyframe_scans[left], keyframe_scans[right])
+    # The fraction of the path between the keyframes before and after it that each scan has covered.
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T_world_lidar[:, :3, 3], axis=0), axis=1))])
+    before, after = keyframe_scans[left], keyframe_scans[right]
+    still = path[after] - path[before] < _STILL_M
+    behind = np.where(still, scans - before, path - path[before])
+    whole = np.where(still, after - before, path[after] - path[before])
+    share = np.clip(behind / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0)
     moved = interpolate(keyframe_poses[left] @ motion_since, keyframe_poses[right] @ motion_until, share)
     moved[keyframe_scans] = keyframe_poses
     return moved
-
-
-def _shares(
-    positions: FloatArray, scans: NDArray[np.intp], left: NDArray[np.intp], right: NDArray[np.intp]
-) -> FloatArray:
-    """(M,) the fraction of the path between the keyframes before and after it that each scan has covered."""
-    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-    still = path[right] - path[left] < _STILL_M
-    behind = np.where(still, scans - left, path - path[left])
-    whole = np.where(still, right - left, path[right] - path[left])
-    return np.asarray(np.clip(behind / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0), dtype=np.float64)
 
 
 def format_g2o(poses: FloatArray, edges: Sequence[RelativePose]) -> str:

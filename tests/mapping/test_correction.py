@@ -81,9 +81,3 @@ def test_a_turn_that_was_missed_is_made_up_for_evenly():
     np.testing.assert_allclose(from_first[2], to_second[2], atol=1e-12)
     np.testing.assert_allclose(from_first[1], to_second[1] / 3.0, atol=1e-12)
     assert np.linalg.norm(from_first[2, :3]) == pytest.approx(0.5 * np.linalg.norm(log(poses[1])[:3]))
-
-
-@pytest.mark.parametrize("keyframes", [[], [3, 3], [5, 3]])
-def test_keyframes_must_increase(trajectory, keyframes):
-    with pytest.raises(ValueError, match="keyframe"):
-        corrected(trajectory, np.array(keyframes, dtype=np.intp), np.tile(np.eye(4), (len(keyframes), 1, 1)))
