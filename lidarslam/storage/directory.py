@@ -67,11 +67,8 @@ class RunDirectory:
         """Make and lock the directory for the duration of a run.
 
         The files of an earlier run stay until the new ones replace them; the rest is removed when the block ends
-        without an error. A directory made here is removed again when nothing was written to it.
-
-        Raises:
-            OutputError: the directory holds a run, finished or not, and neither `overwrite` nor `resume` is given;
-                holds files with these names that are not a run's; is in use; or cannot be written.
+        without an error. A directory made here is removed again when nothing was written to it. OutputError where it
+        holds a run without `overwrite` or `resume`, or files that are not a run's, is in use, or cannot be written.
         """
         is_new = not path.exists()
         directory = cls(path, _earlier_run(path, overwrite, resume))

@@ -169,14 +169,10 @@ class Unfinished:
     @classmethod
     @contextlib.contextmanager
     def claim(cls, directory: RunDirectory, description: dict[str, Any], resume: bool) -> Iterator["Unfinished"]:
-        """Begin or resume a run in a directory that is locked.
+        """Begin or resume a run in a locked directory; InputError where there is nothing to resume, or another run.
 
         When the block fails, the folder is removed if there is nothing to resume; not if it marks results that are
         partly this run's and partly an earlier one's.
-
-        Raises:
-            InputError: there is nothing to resume, it is damaged, or it is another run.
-            OutputError: the folder cannot be written.
         """
         run = directory.path
         about = About(description)

@@ -54,11 +54,8 @@ def without_outliers(
 ) -> PointCloud:
     """The cloud without floaters, by Open3D.
 
-    Args:
-        cloud: the map.
-        sigmas: (k, s), to leave out points whose mean distance to k neighbours exceeds the mean of all points by more
-            than s standard deviations.
-        radius: (k, r), to leave out points with fewer than k neighbours within r metres.
+    Left out are points whose mean distance to k neighbours exceeds the mean of all by more than s standard deviations,
+    for `sigmas` (k, s), and points with fewer than k neighbours within r metres, for `radius` (k, r).
     """
     if sigmas is not None:
         cloud = _chosen(cloud, cloud.to_open3d().remove_statistical_outlier(*sigmas)[1])
@@ -143,11 +140,8 @@ class Mesh:
 def reconstruct(cloud: PointCloud, cell_m: float) -> Mesh:
     """The surface through the points of a map with normals (M. Kazhdan and H. Hoppe, ToG 2013).
 
-    Vertices without a point within the edge of a cell are removed.
-
-    Args:
-        cloud: the map.
-        cell_m: edge of the octree's finest cells; larger in a map of more than 2^12 of them.
+    The octree's finest cells have an edge of `cell_m`, larger in a map of more than 2^12 of them. Vertices without a
+    point within it are removed.
     """
     import open3d as o3d
 

@@ -54,19 +54,11 @@ class Georeference:
 
 
 def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArray, scale: float) -> Georeference:
-    """Robust rigid alignment of a trajectory with a GNSS track.
+    """Robust rigid alignment of a trajectory with a GNSS track, whose positions are projected (N, 3) at a scale.
 
     Minimises Cauchy's loss of the distances between the antenna on the trajectory and its measured positions. The tilt
-    of the world has a weak prior, as positions on a straight line do not determine the rotation about it.
-
-    Args:
-        trajectory: the poses of the LiDAR.
-        track: stamps, accuracies and the antenna's place.
-        projected: (N, 3) the track's positions in the map projection.
-        scale: of the projection at this place.
-
-    Raises:
-        TooFewPositionsError: fewer than five are within the time of the trajectory.
+    of the world has a weak prior, as positions on a straight line do not determine the rotation about it. A
+    TooFewPositionsError is raised where fewer than five are within the time of the trajectory.
     """
     within = track.is_within(trajectory, projected)
     if within.sum() < _FEWEST:

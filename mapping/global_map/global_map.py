@@ -50,16 +50,11 @@ def means_points(means: VoxelMeans) -> FloatArray:
 
 
 class GlobalMap(Stateful):
-    """Accumulates scans into voxels.
+    """Accumulates scans into voxels, at most `most_points` of them in memory.
 
     New points wait in a list and are merged into the sorted main table when there are as many as half of it, so that
     sorting is cheap per scan, and memory stays within a small factor of the number of voxels. When the table has more
     voxels than it may, those of tiles that were not visited since it was merged before go to disk.
-
-    Args:
-        voxel_size_m: edge of a voxel.
-        most_points: number of voxels in memory; None: any.
-        store: where others lie; None: in a temporary file.
     """
 
     voxel_size_m: float
@@ -127,12 +122,7 @@ class GlobalMap(Stateful):
         return self._mean_points(self._voxels(min_hits))
 
     def cloud(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> PointCloud:
-        """The map, its normals estimated from the nearest points and turned towards the sensor.
-
-        Args:
-            min_hits: as in `points`.
-            left_out: (M,) which of `points` are left out.
-        """
+        """The map, but for some of `points` (M,); normals are estimated from the nearest, and face the sensor."""
         voxels = self._voxels(min_hits, left_out)
         points = self._mean_points(voxels)
         normals = estimate_normals(points) if len(points) <= _MANY_POINTS else self._normals_by_tiles(voxels)
@@ -219,10 +209,7 @@ class GlobalMap(Stateful):
 
 
 def voxel_size_for(points: FloatArray) -> float:
-    """A voxel size that suits the scene: 1/50 of the median range of a scan's points (N, 3), from 5 to 25 cm.
-
-    A street with a median range of 10 m is mapped at 20 cm, an office of 3 m at 6 cm.
-    """
+    """A voxel size that suits the scene: 1/50 of the median range of a scan's points (N, 3), from 5 to 25 cm."""
     if not len(points):
         return 0.1
     median_range = float(np.median(np.linalg.norm(points, axis=1)))

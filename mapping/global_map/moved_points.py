@@ -81,9 +81,6 @@ class Views(Stateful):
     """Range images of every k-th scan in the map, at most 512 and 6 MB of them.
 
     k doubles when there would be more, and as long as it is less than 4, when there would be more than 64.
-
-    Args:
-        every: k at first.
     """
 
     _every: int
@@ -100,12 +97,7 @@ class Views(Stateful):
         return len(self._images)
 
     def add(self, points: FloatArray, number: int) -> None:
-        """Offer the next scan that belongs in the map; one in k becomes an image.
-
-        Args:
-            points: (N, 3) in the LiDAR frame at the scan's stamp, compensated.
-            number: of the scan in its recording, for its final pose.
-        """
+        """Offer the next scan that belongs in the map, by its number in the recording; one in k becomes an image."""
         if not len(points):
             return
         self._offered += 1
@@ -137,8 +129,7 @@ def seen_through(
 ) -> NDArray[np.bool_]:
     """(M,) which points (M, 3) of a map, in the world, are dynamic: at least `least_through` images see through them.
 
-    An image with gaps between its beams counts half. Where more than 64 images see a point, 64 of them vote, from the
-    whole time.
+    An image with gaps between its beams counts half. Where more than 64 images see a point, 64 of them vote.
     """
     moved = np.zeros(len(points), dtype=np.bool_)
     reach_m = max(_LEAST_REACH_M, _PIXEL_OF_VOXEL * voxel_size_m * _COLUMNS / TWO_PI)
@@ -193,17 +184,7 @@ def judge(
     least_through: int,
     moved: NDArray[np.bool_],
 ) -> None:
-    """Classify the points (M, 3): dynamic or static.
-
-    Args:
-        points: in the world.
-        T_lidar_world: (V, 4, 4) of the views.
-        images, grids: (V, rows, columns) and (V, 3), the views, in random order.
-        reach_m: farther points get no vote.
-        voxel_size_m: of the map that the points are of.
-        least_through: least number of views that see through a dynamic point.
-        moved: (M,) written.
-    """
+    """Write which points (M, 3), in the world, moved, as images (V, rows, columns) in random order see them."""
     views = len(images)
     for m in range(len(points)):
         a, b, c = points[m, 0], points[m, 1], points[m, 2]

@@ -58,19 +58,11 @@ class OccupancyGrid:
 def occupancy_grid(
     points: FloatArray, normals: FloatArray, positions: FloatArray, options: GridOptions
 ) -> OccupancyGrid | None:
-    """The grid of a map around a path; None if no ground is found below the sensor.
+    """The grid of a map (N, 3) with normals, around the path (K, 3); None if no ground is found below the sensor.
 
     A cell is occupied if points lie in it at heights of obstacles above the ground. It is free if points of the ground
-    lie in it, if a ray from the path reaches it with the ground seen nearby, or if the path crosses it.
-
-    Args:
-        points: (N, 3) of the map, in the world with z up.
-        normals: (N, 3) of its surfaces.
-        positions: (K, 3) of the sensor.
-        options: heights, resolution and range.
-
-    Raises:
-        ValueError: the grid would have too many cells.
+    lie in it, if a ray from the path reaches it with the ground seen nearby, or if the path crosses it. A ValueError is
+    raised where the grid would have too many cells.
     """
     viewpoints = along_path(positions, _VIEWPOINTS_M)
     distance, _ = cKDTree(viewpoints[:, :2]).query(points[:, :2], distance_upper_bound=options.max_range_m)
@@ -160,15 +152,10 @@ class Ground:
 
 
 def find_ground(points: FloatArray, normals: FloatArray, positions: FloatArray) -> Ground | None:
-    """The ground around the positions (K, 3) of a sensor; None if none is found below it.
+    """The ground around the positions (K, 3) of a sensor, in the order of time; None if none is found below it.
 
     It begins with the most frequent height of upright surfaces below the sensor, and grows from cell to cell: points of
     the next cell belong to it if they are a slope away from it, and over gaps it is continued.
-
-    Args:
-        points: (N, 3) of the map.
-        normals: (N, 3) of its surfaces.
-        positions: of the sensor, in the order of time.
     """
     upright = points[np.abs(normals[:, 2]) > _UPRIGHT]
     everything = np.concatenate([points[:, :2], positions[:, :2]])
@@ -235,18 +222,9 @@ def grow_ground(
     heights: FloatArray,
     observed: NDArray[np.bool_],
 ) -> None:
-    """Grow the ground from seeds, breadth first.
+    """Write heights (rows, columns), NaN before, and where they were observed: the ground, grown breadth first.
 
-    Args:
-        z: (N,) heights of upright points, by cell and then ascending.
-        starts: (cells + 1,) the points of each cell.
-        seeds: (M,) cells.
-        seed_heights: (M,) the ground in them.
-        step_m: largest change of the ground from one cell to the next.
-        fewest: points that a height is measured from.
-        longest_gap: cells without points that the ground is continued over.
-        heights: (rows, columns) NaN; the ground.
-        observed: (rows, columns) False; where it was measured.
+    Points have heights z (N,) by cell and then ascending; those of a cell begin at its start (cells + 1,).
     """
     rows, columns = heights.shape
     queue = np.empty(rows * columns, dtype=np.int64)
@@ -289,14 +267,7 @@ def _height_near(z: FloatArray, first: int, last: int, expected: float, toleranc
 
 @compiled
 def mark_visible(occupied: NDArray[np.bool_], viewpoints: FloatArray, reach: float, visible: NDArray[np.bool_]) -> None:
-    """Mark the cells of a grid that straight rays from viewpoints reach before an occupied cell.
-
-    Args:
-        occupied: (rows, columns).
-        viewpoints: (K, 2) row and column, in cells.
-        reach: length of a ray, in cells.
-        visible: (rows, columns), False; True where a ray passes.
-    """
+    """Mark the cells of a grid that straight rays from viewpoints (K, 2), row and column, reach unobstructed."""
     rows, columns = occupied.shape
     rays = max(8, math.ceil(2.0 * math.pi * reach))
     for k in range(len(viewpoints)):

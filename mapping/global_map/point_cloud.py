@@ -72,11 +72,7 @@ def estimate_normals(points: FloatArray) -> FloatArray:
 
 
 def require_format(name: str) -> None:
-    """Check that maps can be written in a format.
-
-    Raises:
-        OutputError: a library for it is not installed.
-    """
+    """Raise an OutputError where the library for a format of maps is not installed."""
     if name == "e57" and find_spec("pye57") is None:
         raise OutputError("E57 maps need pye57; type: pip install 'lidarslam[e57]'")
 
@@ -84,13 +80,8 @@ def require_format(name: str) -> None:
 def write_cloud(path: Path, cloud: PointCloud, brightest: float | None = None) -> None:
     """Write a binary .ply, .pcd, .laz or .e57 file with points, normals and attributes; E57 holds no normals.
 
-    Args:
-        path: of the file, with one of these suffixes; one that is there is replaced.
-        cloud: with at least one point.
-        brightest: the largest intensity of the map that the cloud is a part of, for .laz; None: it is the whole map.
-
-    Raises:
-        OutputError: the file could not be written, has another suffix, or the cloud is empty.
+    The cloud may be a part of a map, whose largest intensity is `brightest`, for .laz. OutputError where the file has
+    another suffix or cannot be written, or the cloud is empty.
     """
     suffix = path.suffix.lower()
     if suffix not in _WRITERS:

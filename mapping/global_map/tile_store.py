@@ -96,19 +96,9 @@ class TileStore(BlockFile):
         return Layout.union([part.layout for part in self._parts])
 
     def take(self, voxels: Voxels, tiling: Tiling, recent: NDArray[np.int64], most: int) -> Voxels:
-        """Take tiles without a recent voxel from sorted voxels, and if still more than `most` are left, all of them.
+        """What is left in memory of sorted voxels, without the tiles that have no recent ones, by sorted keys (R,).
 
-        Args:
-            voxels: in memory.
-            tiling: of the map.
-            recent: sorted keys (R,) of the voxels that were added last.
-            most: number of voxels.
-
-        Returns:
-            Those that are left.
-
-        Raises:
-            OSError: the disk is full.
+        If these are still more than `most`, all are taken. An OSError is raised where the disk is full.
         """
         codes = tiling.codes(voxels.keys)
         tiles = _distinct(codes)

@@ -178,8 +178,7 @@ def row_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Rows) -> int:
     """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame.
 
-    Returns:
-        Number of points beyond the reach of the voxels, whose keys are `EMPTY`.
+    Returns the number of points beyond the reach of the voxels, whose keys are `EMPTY`.
     """
     T, sensor = T_world_lidar, T_world_lidar[:3, 3]
     reach, beyond = _reach_m(voxel_size_m), 0
@@ -204,12 +203,9 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
 
 @compiled
 def add_up(order: NDArray[np.intp], keys: Keys, sums: Rows, summed: int, unique: Keys, totals: Rows) -> int:
-    """Write the keys (M,) and the totals (M, C) of the rows (N, C) of equal keys (N,), given an order that sorts these.
+    """Write the M keys and totals (M, C) of rows (N, C) of equal keys (N,), by an order that sorts these; return M.
 
     The first `summed` columns are summed; the others are those of the earliest row, by the first two of them.
-
-    Returns:
-        M.
     """
     count, columns = 0, sums.shape[1]
     for n in range(len(order)):

@@ -103,12 +103,7 @@ class Alignment:
 
 
 class Comparison:
-    """The motion since half a second before each registered pose, by both.
-
-    Args:
-        samples: of the IMU.
-        T_lidar_imu: (4, 4) its extrinsic calibration; the identity while there is none.
-    """
+    """The motion since half a second before each registered pose, by both; the identity is an unknown calibration."""
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
         self._T_lidar_imu = T_lidar_imu
@@ -146,8 +141,7 @@ class Comparison:
     def mounting(self) -> Mounting:
         """The rotation between both frames (Wahba's problem, by SVD); the gyroscope's bias is in the mean.
 
-        Raises:
-            MountingError: the turns are too few, about one axis only, or do not agree.
+        A MountingError is raised where the turns are too few, about one axis only, or do not agree.
         """
         if len(self) < _FEWEST:
             raise MountingError(f"only {len(self)} turns could be compared")
@@ -258,12 +252,9 @@ class Comparison:
 
 
 def _robust_fit(J: FloatArray, y: FloatArray, prior: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
-    """Solution (K,) and covariance of `J x = y` for vectors (N, 3), reweighted by Cauchy's kernel.
+    """Solution (K,) and covariance of `J x = y` for J (N, 3, K) and y (N, 3), reweighted by Cauchy's kernel.
 
-    Args:
-        J: (N, 3, K).
-        y: (N, 3), of errors that are estimated, and have at least this standard deviation.
-        prior: (K, K) information of zero.
+    The prior is the information (K, K) of zero; errors of y are estimated, and have at least a standard deviation.
     """
     weight, error = np.ones(len(y)), least
     x: FloatArray = np.zeros(len(prior))

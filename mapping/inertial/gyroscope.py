@@ -53,12 +53,7 @@ class Integral:
 
 
 class Gyroscope:
-    """The angular velocity of the LiDAR, linear between samples.
-
-    Args:
-        samples: of at least two instants.
-        R_lidar_imu: (3, 3) extrinsic rotation.
-    """
+    """The angular velocity of the LiDAR, linear between two samples or more, by the extrinsic rotation (3, 3)."""
 
     def __init__(self, samples: ImuSamples, R_lidar_imu: FloatArray) -> None:
         self._stamps = samples.stamps

@@ -41,13 +41,7 @@ _LARGE_BIASES = (
 
 
 class Inertial(Stateful):
-    """Follows the registered scans, and predicts the next.
-
-    Args:
-        samples: of the IMU.
-        T_lidar_imu: (4, 4) extrinsic calibration.
-        lever_sigma_m: standard deviation of its translation, along each axis.
-    """
+    """Follows the registered scans, and predicts the next, given the IMU's extrinsic calibration (4, 4)."""
 
     _window: InertialWindow
     _registered_s: float | None  # stamp of the last registered scan

@@ -49,12 +49,7 @@ _OF_IMU = np.r_[0:9, _SIZE : _SIZE + 9, 9:15, _SIZE + 9 : _SIZE + 15, 2 * _SIZE]
 
 
 class Preintegration:
-    """Samples in the LiDAR's axes, linear between their stamps.
-
-    Args:
-        samples: of at least three instants.
-        R_lidar_imu: (3, 3) extrinsic rotation.
-    """
+    """Three samples or more in the LiDAR's axes, linear between their stamps, given the extrinsic rotation (3, 3)."""
 
     def __init__(self, samples: ImuSamples, R_lidar_imu: FloatArray) -> None:
         rates, forces = samples.angular_velocities @ R_lidar_imu.T, samples.accelerations @ R_lidar_imu.T
@@ -168,13 +163,7 @@ class _Prior:
 
 
 class InertialWindow(Stateful):
-    """The latest knots; the first of all begins it.
-
-    Args:
-        preintegration: of the samples, in the LiDAR's axes.
-        lever: (3,) position of the IMU in the LiDAR frame.
-        lever_sigma_m: its standard deviation along each axis.
-    """
+    """The latest knots, the first of which begins it; with the position (3,) of the IMU in the LiDAR frame."""
 
     _knots: list[Knot]
     _prior: _Prior | None

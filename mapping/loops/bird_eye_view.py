@@ -58,10 +58,7 @@ class BirdEyeView:
 
 
 def compare(descriptor: NDArray[np.complex64], others: NDArray[np.complex64]) -> tuple[FloatArray, FloatArray]:
-    """Similarities (M,), at most 1, with other descriptors (M, ...), and the turns (M,) of the sensor.
-
-    The turn, in radians from 0 to pi, may be half a turn more.
-    """
+    """Similarities (M,), at most 1, with other descriptors (M, ...), and turns (M,), to half a turn, from 0 to pi."""
     correlation = np.fft.irfft(np.einsum("mdf,df->md", others, descriptor.conj()), _DIRECTIONS, axis=1)
     best = correlation.argmax(axis=1)
     return correlation[np.arange(len(others)), best].astype(np.float64), best * (np.pi / _DIRECTIONS)
@@ -77,12 +74,8 @@ def align(
 ) -> tuple[FloatArray, float]:
     """`T_target_source` (4, 4), in the LiDAR frames, by correlation of two views; and the score, 0 to 1.
 
-    Args:
-        target, source: the views.
-        yaws: (Y,) turns of the source, upright, that are tried.
-        radius_m: points farther from the sensor are left out.
-        expected_xy: (2,) prior of the source's position, upright, in the target's view; None: anywhere.
-        within_m: how far off that is at most.
+    Turns (Y,) of the source, upright, are tried. Its position, upright, in the target's view is expected at some (2,)
+    within a distance, or anywhere.
     """
     cell_m = 2.0 * radius_m / _BINS
     size = next_fast_len(2 * _BINS, real=True)

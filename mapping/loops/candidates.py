@@ -1,7 +1,8 @@
 """Loop candidates: earlier keyframes near the estimate, and earlier keyframes with a similar descriptor."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +62,9 @@ def objection_to_drift(link: RelativePose, by_appearance: bool, track: Track) ->
 
 
 class KeyframeDatabase(Stateful):
-    """Sparse submaps and descriptors of all keyframes, and the search among them.
+    """Sparse submaps and descriptors of all keyframes, and the search among them."""
 
-    Attributes:
-        track: the present estimates.
-        submaps: one for each keyframe, in a file.
-    """
-
-    track: Track
+    track: Track  # the present estimates
 
     def __init__(self, config: LoopConfig, directory: Path | None = None) -> None:
         self._config = config
@@ -82,21 +78,18 @@ class KeyframeDatabase(Stateful):
     @property
     def radius_m(self) -> float:
         """How far descriptors reach; follows the first keyframe that has points."""
-        return next((_RADIUS_PER_RANGE * submap.range_m for submap in self.submaps if len(submap)), 1.0)
+        submaps = (self.submaps[index] for index in range(len(self)))
+        return next((_RADIUS_PER_RANGE * submap.range_m for submap in submaps if len(submap)), 1.0)
 
     def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> None:
         """Add a keyframe: its submap (N, 3), path length and segment, and the present estimates (K, 4, 4) of all."""
         track = self.track
-        self._keep(points)
+        self.keep(points)
         way_m_all, segments = np.append(track.way_m, way_m), np.append(track.segment, segment)
         self.track = Track(poses, way_m_all, segments, track.drift_rates)
 
-    def rebuild(self, submaps: Iterable[FloatArray]) -> None:
-        """Rebuild, after the estimates were restored, from the points (N, 3) of all submaps."""
-        for points in submaps:
-            self._keep(points)
-
-    def _keep(self, points: FloatArray) -> None:
+    def keep(self, points: FloatArray) -> None:
+        """Keep the submap (N, 3) of the next keyframe, whose estimate is known or follows."""
         self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))
         descriptor = BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m)
         if len(self) > len(self._descriptors):
@@ -164,10 +157,7 @@ class KeyframeDatabase(Stateful):
         return align(target, source, yaws, self.radius_m, expected_xy, 2.0 * translation)[0]
 
     def starts(self, first: int, second: int) -> list[FloatArray]:
-        """`T_first_second` (4, 4) to begin with for two keyframes of one place.
-
-        The estimate, the views aligned within its drift, and aligned anywhere, in each sector of headings.
-        """
+        """`T_first_second` (4, 4) to begin with: estimated, of views aligned within the drift, and in each sector."""
         rotation, translation = self.track.drift(np.array([first]), second)
         target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
         sectors = np.linspace(-np.pi, np.pi, _ALL_YAWS, endpoint=False).reshape(_SECTORS, -1)
@@ -182,7 +172,10 @@ class KeyframeDatabase(Stateful):
         elsewhere = others[self.track.segment[others] != self.track.segment[index]]
         found = [*self._similar(index, others), *self._similar(index, elsewhere, upside_down=True)]
         found.sort(key=lambda pair: -pair[0])
-        plausible = [(score, candidate) for score, candidate in found if self._explained_by_drift(candidate, index)]
+        rough = np.diag(np.repeat([_ROUGH_RAD**2, (_ROUGH_RANGES * self.submaps[index].range_m) ** 2], 3))
+        links = [RelativePose(candidate.index, index, candidate.T_first_second, rough) for _, candidate in found]
+        is_plausible = [not objection_to_drift(link, True, self.track) for link in links]
+        plausible = list(compress(found, is_plausible))
         if self._is_ambiguous(plausible, index):
             return []
         return [candidate for _, candidate in plausible[:_APPEARANCE_CANDIDATES]]
@@ -204,23 +197,15 @@ class KeyframeDatabase(Stateful):
 
     def _is_ambiguous(self, found: list[tuple[float, Candidate]], index: int) -> bool:
         """Whether a second place in the segment of the best candidate has nearly its score."""
-        if not found:
-            return False
         track, range_m = self.track, self.submaps[index].range_m
-        score, best = found[0]
-        for other_score, other in found[1:]:
-            if track.segment[other.index] != track.segment[best.index] or other_score <= _AMBIGUOUS * score:
-                continue
+        for score, other in found[1:]:
+            best = found[0][1]
             between = inverse(best.T_first_second) @ track.between(best.index, other.index) @ other.T_first_second
             apart_m = 2.0 * _ROUGH_RANGES * range_m + 2.0 * track.drift_m(best.index, other.index)
-            if np.linalg.norm(between[:3, 3]) > apart_m:
+            is_rival = track.segment[other.index] == track.segment[best.index] and score > _AMBIGUOUS * found[0][0]
+            if is_rival and np.linalg.norm(between[:3, 3]) > apart_m:
                 return True
         return False
-
-    def _explained_by_drift(self, candidate: Candidate, second: int) -> bool:
-        rough = np.repeat([_ROUGH_RAD**2, (_ROUGH_RANGES * self.submaps[second].range_m) ** 2], 3)
-        link = RelativePose(candidate.index, second, candidate.T_first_second, np.diag(rough))
-        return not objection_to_drift(link, True, self.track)
 
 
 def _spread(indices: NDArray[np.intp], cost: FloatArray, count: int) -> list[int]:

@@ -95,8 +95,7 @@ class Track:
     def drift(self, first: NDArray[np.intp], second: int) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (N,) of the second keyframe's attitude and position relative to others (N,).
 
-        A heading error grows along the path; its lever arm is about half the distance from the path between to the
-        keyframe.
+        The lever arm of a heading error is about half the distance from the path between to the keyframe.
         """
         way = np.abs(self.way_m[first] - self.way_m[second])
         sums, squares = self._sums
@@ -119,7 +118,7 @@ class Track:
         return np.diag(np.repeat([rotation[0] ** 2, translation[0] ** 2], 3))
 
     def correction_sigmas(self, link: RelativePose) -> float:
-        """Standard deviations of drift that a link corrects; the worse of rotation and translation.
+        """Standard deviations of drift that a link corrects, the worse of rotation and translation.
 
         0 between segments, where no drift model holds.
         """
@@ -131,7 +130,7 @@ class Track:
         return max(float(np.sqrt(xi[p] @ np.linalg.solve(covariance[p, p], xi[p]))) for p in parts)
 
     def close_cycle(self, a: RelativePose, b: RelativePose) -> tuple[float, float] | None:
-        """Chi-squared of the cycle of two links and the paths between them, and its largest standard deviation, metres.
+        """Chi-squared and largest standard deviation, metres, of the cycle of two links with the paths between.
 
         None when the links do not join the same two segments.
         """

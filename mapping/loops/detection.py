@@ -62,12 +62,9 @@ class LoopDetector(Stateful):
     ) -> list[LoopClosure]:
         """Add the next keyframe, and return the closures that are accepted or rejected by now.
 
-        Args:
-            points: (N, 3) its submap, in its LiDAR frame, compensated and thinned.
-            way_m: path length from the recording's start.
-            segment: stretch of continuous tracking; keyframes of one follow one another.
-            poses: (K, 4, 4) `T_world_lidar` of all keyframes, this one last, as they are estimated now.
-            barred: (K,) which of them it is not to be closed with; None: any may be.
+        It has a submap (N, 3) in its LiDAR frame, a path length from the start, and a segment, a stretch of continuous
+        tracking. Poses (K, 4, 4) are `T_world_lidar` of all keyframes as estimated now, this one last; it is not closed
+        with the barred ones (K,).
         """
         self.database.add(points, way_m, segment, poses)
         decided = self._drop_old(way_m, segment)
@@ -134,30 +131,25 @@ class LoopDetector(Stateful):
     def _accept_supported(self) -> list[LoopClosure]:
         """Accept pending closures that have enough support, until nothing changes."""
         accepted: list[LoopClosure] = []
-        while True:
-            for closure in self._pending:
-                supported, count = self._support(closure)
-                if supported:
-                    break
-            else:
-                return accepted
-            self._pending.remove(closure)
-            accepted.append(replace(closure, consistent=count))
+        while found := next(((c, n) for c in self._pending if (n := self._support(c)) is not None), None):
+            self._pending.remove(found[0])
+            accepted.append(replace(found[0], consistent=found[1]))
             self._accepted.append(accepted[-1])
+        return accepted
 
-    def _support(self, closure: LoopClosure) -> tuple[bool, int]:
-        """Whether a closure is accepted, and the number of others that agree, pending ones too."""
+    def _support(self, closure: LoopClosure) -> int | None:
+        """The number of other closures that agree, pending ones too; None where they are too few to accept it."""
         track, range_m = self.database.track, self.database.submaps[closure.second].range_m
         agreeing, against = self._votes(closure)
         # A rival has as much weight as it has support itself: a false closure mostly stands alone. Where places repeat,
         # false ones agree among themselves; then the estimate decides.
         rival = max((len(self._votes(other)[0]) for other in against[-_RIVALS:]), default=0)
         if against and rival * (_OUTVOTED if closure.by_appearance else 1) >= max(len(agreeing), 1):
-            return False, len(agreeing)
-        if not closure.by_appearance and track.drift_m(closure.first, closure.second) < _ALONE_RANGES * range_m:
-            return True, len(agreeing)
+            return None
         ways_m = track.way_m[[closure.second, *(other.second for other in agreeing)]]
-        return len(agreeing) >= _CONSISTENT and float(np.ptp(ways_m)) >= _SPAN_RANGES * range_m, len(agreeing)
+        is_near = not closure.by_appearance and track.drift_m(closure.first, closure.second) < _ALONE_RANGES * range_m
+        is_shared = len(agreeing) >= _CONSISTENT and float(np.ptp(ways_m)) >= _SPAN_RANGES * range_m
+        return len(agreeing) if is_near or is_shared else None
 
     def _votes(self, closure: LoopClosure) -> tuple[list[LoopClosure], list[LoopClosure]]:
         """Other closures that agree with one, and that contradict it, where their cycle is significant."""
@@ -174,12 +166,10 @@ class LoopDetector(Stateful):
     def _drop_old(self, way_m: float, segment: int) -> list[LoopClosure]:
         """Closures that no other agreed with for too long, as rejected."""
         track = self.database.track
-        old = [
-            c for c in self._pending
-            if track.segment[c.second] != segment or way_m - track.way_m[c.second] > _PENDING_M
-        ]  # fmt: skip
-        self._pending = [closure for closure in self._pending if closure not in old]
-        return [replace(closure, reason=_ALONE) for closure in old]
+        ends = [closure.second for closure in self._pending]
+        is_old = (track.segment[ends] != segment) | (way_m - track.way_m[ends] > _PENDING_M)
+        pending, self._pending = self._pending, [self._pending[n] for n in np.flatnonzero(~is_old)]
+        return [replace(pending[n], reason=_ALONE) for n in np.flatnonzero(is_old)]
 
 
 def _closure(candidate: Candidate, second: int, found: Verification) -> LoopClosure:

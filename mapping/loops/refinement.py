@@ -67,10 +67,9 @@ class DenseSubmap:
 
 
 def refine(target: DenseSubmap, source: DenseSubmap, closure: LoopClosure, drift: FloatArray) -> LoopClosure | None:
-    """Register again, the closure's pose with its covariance being the prior.
+    """Register again, with the closure as prior; None where correspondences are too few, or contradict the prior.
 
-    Drift (6, 6) within the two submaps is added to the covariance of the result: no number of points lowers it. None
-    where correspondences are too few, or where the result contradicts the prior.
+    Drift (6, 6) within the two submaps is added to the covariance of the result: no number of points lowers it.
     """
     prior = closure.T_first_second
     information = np.asarray(np.linalg.inv(closure.covariance), dtype=np.float64)

@@ -1,6 +1,5 @@
 """A keyframe's submap as loop detection keeps it: a few thousand points with normals, and a range image."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -9,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, skew
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import BlockFile
 from lidarslam.core.thinning import one_per_cell
+from lidarslam.mapping.tracking.birds_eye_map import levelling
 
 PLANE, LINE = 1, 2
 # Nearer points are mostly the carrier itself.
@@ -130,16 +130,11 @@ def _level_rotation(normals: FloatArray) -> FloatArray:
             break
         mean = (normals[near] * np.sign(along[near])[:, None]).sum(axis=0)
         axis = mean / np.linalg.norm(mean)
-    K = skew(np.array([axis[1], -axis[0], 0.0]))  # the cross product of the axis and z
-    return np.asarray(np.eye(3) + K + K @ K / (1.0 + axis[2]), dtype=np.float64)
+    return levelling(axis)
 
 
 class SubmapFile:
-    """Sparse submaps in order, in a file without a name: those of hours would take hundreds of megabytes of memory.
-
-    Args:
-        directory: where the file lies; None: where temporary files are.
-    """
+    """Sparse submaps in order, in a file without a name: those of hours would take hundreds of megabytes of memory."""
 
     def __init__(self, directory: Path | None = None) -> None:
         self._blocks = BlockFile(directory)
@@ -150,12 +145,7 @@ class SubmapFile:
         return len(self._points)
 
     def __getitem__(self, index: int) -> SparseSubmap:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"submap {index} of {len(self)}")
-        return self._recent(int(index) % len(self))
-
-    def __iter__(self) -> Iterator[SparseSubmap]:
-        return (self[index] for index in range(len(self)))
+        return self._recent(range(len(self))[index])
 
     def append(self, submap: SparseSubmap) -> None:
         """Keep one more; OSError where the disk is full."""

@@ -249,10 +249,7 @@ def evaluate(target: SubmapCloud, source: SubmapCloud, T_target_source: FloatArr
 
 
 def _covariance(found: Correspondences, residual_m: float, middles_m: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """(6, 6) from the normal equations without their degenerate directions, and the names of these.
-
-    Middles (2,) are of the target's and the source's submaps.
-    """
+    """(6, 6) without the degenerate directions, and the names of these, given the middles (2,) of target and source."""
     weights = found.weights / np.maximum(found.noise_m, residual_m) ** 2
     lever_m = float(np.sqrt(np.mean(np.sum(found.points**2, axis=1)))) if len(found.points) else 1.0
     degeneracy = find_degeneracy(found.jacobian, weights, found.tilt, lever_m)

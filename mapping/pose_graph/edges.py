@@ -1,7 +1,7 @@
 """Measurements of the graph besides loop closures: motion between keyframes, attitude by gravity, GNSS positions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -36,26 +36,23 @@ _UNKNOWN_M, _LEAST_GNSS_M, _HEIGHT = 3.0, 0.02, 2.0
 
 @dataclass(frozen=True, eq=False)
 class MotionSinceKeyframe:
-    """The odometry's motion composed since the last keyframe."""
+    """The odometry's motion composed since the last keyframe; at first none."""
 
-    T_keyframe_lidar: Annotated[FloatArray, TRANSFORM] | None  # (4, 4); None once a scan had none
-    covariance: Annotated[FloatArray, Shape(6, 6)]  # of it, rotation first
     length_m: float = 0.0  # path length
     lost: bool = False  # whether tracking was lost since
-
-    @classmethod
-    def none(cls) -> "MotionSinceKeyframe":
-        """At the keyframe itself."""
-        return cls(np.eye(4), np.zeros((6, 6)))
+    # (4, 4); None once a scan had none
+    T_keyframe_lidar: Annotated[FloatArray, TRANSFORM] | None = field(default_factory=lambda: np.eye(4))
+    # (6, 6) of it, rotation first
+    covariance: Annotated[FloatArray, Shape(6, 6)] = field(default_factory=lambda: np.zeros((6, 6)))
 
     def then(self, scan: GraphScan, step_m: float) -> "MotionSinceKeyframe":
         """One scan further: first-order propagation of the covariance."""
-        length_m, lost = self.length_m + step_m, self.lost or scan.lost
+        path = self.length_m + step_m, self.lost or scan.lost
         if self.T_keyframe_lidar is None or scan.T_prev_curr is None or scan.motion_covariance is None:
-            return MotionSinceKeyframe(None, self.covariance, length_m, lost)
+            return MotionSinceKeyframe(*path, None, self.covariance)
         A = adjoint(inverse(scan.T_prev_curr))
         covariance = A @ self.covariance @ A.T + scan.motion_covariance
-        return MotionSinceKeyframe(self.T_keyframe_lidar @ scan.T_prev_curr, covariance, length_m, lost)
+        return MotionSinceKeyframe(*path, self.T_keyframe_lidar @ scan.T_prev_curr, covariance)
 
 
 def trajectory_edges(
@@ -66,15 +63,10 @@ def trajectory_edges(
     now: FloatArray | None,
     one_map: bool = True,
 ) -> list[RelativePose]:
-    """Edges from the previous keyframe: one from the registered trajectory, one from the odometry where it has one.
+    """Edges to a keyframe from the one before: of the registered trajectory, and of the odometry where it has a motion.
 
-    Args:
-        key: of this keyframe; the previous one is `key - 1`.
-        T_first_second: (4, 4) from this keyframe to the previous one, along the trajectory.
-        motion: the odometry between them.
-        before, now: (6, 6) covariance of either pose, rotation first, in the LiDAR frame; None for a pose that was not
-            registered to a map.
-        one_map: whether both were registered to the same map.
+    Covariances (6, 6) of the poses before and now are in the LiDAR frame, None without registration to a map; with
+    `one_map` both were registered to the same one.
     """
     registered = now is not None
     covariance = drift_covariance(motion.length_m, registered and one_map, motion.lost)
@@ -154,23 +146,18 @@ class ProjectedTrack:
     scale: float  # of the projection at this place
 
     def aligned(self, trajectory: Trajectory) -> FloatArray:
-        """T_map_world (4, 4) of a trajectory; the origin of the map is the first position.
-
-        Raises:
-            TooFewPositionsError: too few positions are within its time.
-        """
+        """T_map_world (4, 4) of a trajectory; the origin of the map is the first position."""
         T = align_to_track(trajectory, self.track, self.projected - self.projected[0], self.scale).T_map_world.copy()
         T[:3, 3] /= self.scale
         return T
 
     def positions(self, trajectory: Trajectory, keyframe_scans: Sequence[int]) -> list[AntennaPosition]:
         """The positions within the time of a trajectory (M poses), assigned to the keyframes among its scans."""
-        stamps, track = trajectory.stamps, self.track
+        track, scans = self.track, np.asarray(keyframe_scans)
         rows = np.flatnonzero(track.is_within(trajectory, self.projected))
         if not len(rows):
             return []
-        scans = np.asarray(keyframe_scans)
-        keys = np.abs(stamps[scans][None, :] - track.stamps[rows, None]).argmin(axis=1)
+        keys = np.abs(trajectory.stamps[scans][None, :] - track.stamps[rows, None]).argmin(axis=1)
         antennas = trajectory.at(track.stamps[rows]) @ np.append(track.lidar_antenna, 1.0)
         T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])
         antennas = np.einsum("nij,nj->ni", T_keyframe_world, antennas)[:, :3]

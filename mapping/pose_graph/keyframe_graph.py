@@ -1,7 +1,7 @@
 """The keyframes of one recording: their submaps, and edges along the trajectory; loop closures come later.
 
 Scans come with the poses that scan-to-map registration gave them. Some become keyframes; the points seen until the next
-one are the submap of each. Consecutive keyframes are joined by edges of the trajectory and of the odometry.
+one are the submap of each.
 """
 
 import time
@@ -42,13 +42,7 @@ class SubmapStore(BlockFile):
 
 
 class KeyframeGraph(Stateful):
-    """Follows one recording, scan after scan.
-
-    Args:
-        config: of the keyframes.
-        directory: where submaps are kept meanwhile, in a file without a name; None: where temporary files are.
-        file: where they are kept instead, for `restore`.
-    """
+    """Follows one recording, scan after scan; submaps are kept in a file, see `BlockFile`."""
 
     scan_poses: list[Annotated[FloatArray, TRANSFORM]]  # as registered
     keyframe_ms: list[float]  # wall time of each keyframe
@@ -69,17 +63,15 @@ class KeyframeGraph(Stateful):
         self.scan_poses, self.keyframe_ms, self.keyframes, self.edges = [], [], [], []
         self.attitudes, self.redraws = [], []
         self._submap = None
-        self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
+        self._motion, self._path_m, self._segment = MotionSinceKeyframe(), 0.0, 0
 
     def draw(
         self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, known: PointAttributes | None = None
     ) -> None:
         """Add points (N, 3) of the latest scan, at its pose as registered, to the submap of the last keyframe."""
-        if not self._is_submap_open:
-            return
-        if self._submap is None:
-            self._submap = GlobalMap(voxel_size_m)
-        self._submap.add(points, inverse(self.scan_poses[self.keyframes[-1].scan]) @ T_world_lidar, known)
+        if self._is_submap_open:
+            self._submap = self._submap or GlobalMap(voxel_size_m)
+            self._submap.add(points, inverse(self.scan_poses[self.keyframes[-1].scan]) @ T_world_lidar, known)
 
     def add(self, scan: GraphScan) -> None:
         """Add the next scan; the points of the one before have been drawn by now."""
@@ -91,7 +83,7 @@ class KeyframeGraph(Stateful):
         if scan.belongs_in_map and len(scan.points) and self._selector.is_due(scan.T_world_lidar, scan.points):
             started = time.perf_counter()
             self._selector.take(scan.T_world_lidar, scan.points)
-            self._close_submap()
+            self.end_recording()
             self._begin_keyframe(scan)
             self.keyframe_ms.append(1e3 * (time.perf_counter() - started))
         self.attitudes += measured_attitude(scan, self.keyframes, self.scan_poses)
@@ -101,8 +93,10 @@ class KeyframeGraph(Stateful):
         return None
 
     def end_recording(self) -> None:
-        """There are no more scans: the submap of the last keyframe is complete."""
-        self._close_submap()
+        """Keep the submap of the last keyframe: there are no more scans, or another keyframe follows."""
+        if self._is_submap_open:
+            means, self._submap = self.means(len(self.keyframes) - 1), None
+            self._keep(means)
 
     def close(self) -> None:
         """Release the submaps on disk."""
@@ -119,19 +113,13 @@ class KeyframeGraph(Stateful):
         """Whether the last keyframe's submap still grows."""
         return len(self.store) < len(self.keyframes)
 
-    def _close_submap(self) -> None:
-        """Keep the last keyframe's submap."""
-        if self._is_submap_open:
-            means, self._submap = self.means(len(self.keyframes) - 1), None
-            self._keep(means)
-
     def _keep(self, means: VoxelMeans) -> None:
         """Keep the submap of the last keyframe."""
         self.store.append(means)
 
     def _begin_keyframe(self, scan: GraphScan, one_map: bool = True) -> None:
         """The latest scan becomes a keyframe; with `one_map` it was registered to the same one as the last keyframe."""
-        motion, self._motion = self._motion, MotionSinceKeyframe.none()
+        motion, self._motion = self._motion, MotionSinceKeyframe()
         if self.keyframes:
             last = self.keyframes[-1]
             T_first_second = inverse(self.scan_poses[last.scan]) @ scan.T_world_lidar

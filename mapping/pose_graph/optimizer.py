@@ -185,12 +185,7 @@ class RelaxSchedule(Stateful):
         self._waiting, self._keyframes = [], 0
 
     def is_due(self, found: Sequence[LoopClosure], poses: Sequence[FloatArray]) -> bool:
-        """Whether to optimise now: a closure contradicts the poses (4, 4) of all keyframes, which are enough by now.
-
-        Args:
-            found: closures since the last call, rejected ones too.
-            poses: as estimated now.
-        """
+        """Whether to optimise now: closures since the last call contradict the poses (4, 4) of enough keyframes."""
         self._waiting += [closure for closure in found if closure.accepted]
         if _PART * (len(poses) - self._keyframes) < len(poses):
             return False

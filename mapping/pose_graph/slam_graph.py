@@ -1,22 +1,19 @@
 """Graph SLAM: keyframes, relative poses between them, loop closures, and the poses that fit all of these best.
 
-Scans come with the poses that scan-to-map registration gave them. Some become keyframes; the points seen until the next
-one are the submap of each. Consecutive keyframes are joined by edges of the trajectory and of the odometry, and
-submaps that show the same place by loop closures. In the end the whole graph is optimised, the scans between keyframes
-follow, and the map is rebuilt from the submaps.
-
-Several recordings of one place are tracked each by itself, and added one after the other. Only loop closures join them;
-those that are connected end up in one frame.
+Consecutive keyframes are joined by edges of the trajectory and of the odometry, submaps that show the same place by
+loop closures. In the end the whole graph is optimised, the scans between keyframes follow, and the map is rebuilt from
+the submaps. Recordings of one place are tracked each by itself, and added one after the other; loop closures join them.
 """
 
 import logging
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 
@@ -39,7 +36,6 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
 # Submaps on either side: one alone is as sparse as the sensor, and over a longer path drift bends them.
 REACH = 1
 
@@ -47,12 +43,8 @@ REACH = 1
 class SlamGraph(KeyframeGraph):
     """Follows a run, one scan after the other; or takes whole recordings, one after the other.
 
-    Args:
-        config: settings of keyframes and loops.
-        directory: where submaps are kept meanwhile, in a file without a name; None: where temporary files are.
-        file: where they are kept instead, for `restore`.
-        local_radius_m: of the local map that scans were registered to; 0 without one.
-        given: loop closures that are given or forbidden, where one recording is followed.
+    The radius is that of the local map that scans were registered to, 0 without one. Loop closures may be given or
+    forbidden, where one recording is followed.
     """
 
     _detector: LoopDetector
@@ -80,24 +72,23 @@ class SlamGraph(KeyframeGraph):
         self._laid, self._is_map_due = SubmapPlacement(local_radius_m), False
 
     def _after_restore(self) -> None:
-        self._detector.database.rebuild(means_points(self.store[key]) for key in range(len(self.store)))
+        for key in range(len(self.store)):
+            self._detector.database.keep(means_points(self.store[key]))
 
     def add_recording(self, tracked: KeyframeGraph) -> None:
-        """Add all keyframes of a recording, which has ended, and look for loop closures with each of them.
-
-        Its world is unrelated to those of the recordings before.
-        """
+        """Add all keyframes of a recording that has ended, in a world of its own; look for loop closures with each."""
         first_scan, first_key = len(self.scan_poses), len(self.keyframes)
         first_segment = self.keyframes[-1].segment + 1 if self.keyframes else 0
         # The world of the first recording is that of the graph, which attitudes are in.
-        attitudes = _by_key([] if self._first_scans else tracked.attitudes, lambda attitude: attitude.key)
-        edges = _by_key(tracked.edges, lambda edge: edge.second)
+        known = [] if self._first_scans else tracked.attitudes
+        attitudes = {key: list(group) for key, group in groupby(known, attrgetter("key"))}
+        edges = {key: list(group) for key, group in groupby(tracked.edges, attrgetter("second"))}
         self._first_scans.append(first_scan)
         self.scan_poses += tracked.scan_poses
         self.redraws += [first_key + count for count in tracked.redraws]
         for key, keyframe in enumerate(tracked.keyframes):
             started = time.perf_counter()
-            self._chain(tracked.scan_poses, tracked.keyframes[max(0, key - 1) : key], keyframe)
+            self._chain(tracked.scan_poses, tracked.keyframes[max(0, key - 1) : key + 1])
             self.edges += [replace(e, first=first_key + e.first, second=first_key + key) for e in edges.get(key, [])]
             self.keyframes.append(
                 replace(keyframe, scan=first_scan + keyframe.scan, segment=first_segment + keyframe.segment)
@@ -109,13 +100,12 @@ class SlamGraph(KeyframeGraph):
     def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
         """The local map rebuilt without the latest scan, in the frame of registration, with cells of that edge.
 
-        None unless loop closures refined since the last call show that submaps lie elsewhere in the local map, or are
-        missing.
+        None unless closures refined since the last call show that submaps lie elsewhere in it, or are missing.
         """
         is_due, self._is_map_due = self._is_map_due, False
         if not is_due:
             return None
-        certain = [one for one in self._accepted() if squared_error(one, self._poses) < CHI_SQUARED_99]
+        certain = [c for c in self._closures if c.accepted and squared_error(c, self._poses) < CHI_SQUARED_99]
         members = connected_with_last(self.keyframes, certain)
         targets = self.scan_poses[self.keyframes[-1].scan] @ inverse(self._poses[-1]) @ np.array(self._poses)
         drawn = self._laid.redrawn(targets, members, cell_m, self.means, scan=len(self.scan_poses) - 1)
@@ -125,22 +115,18 @@ class SlamGraph(KeyframeGraph):
     def finish(self, placed: tuple[FloatArray, ProjectedTrack] | None = None) -> Corrected | None:
         """Optimise everything, with the stamps (M,) of all scans and a GNSS track; None when there is no keyframe.
 
-        Raises:
-            TooFewPositionsError: too few positions are within the time of the scans.
+        A TooFewPositionsError is raised where too few positions are within the time of the scans.
         """
         if not self.keyframes:
             return None
-        self._close_submap()
+        self.end_recording()
         self._closures += self._detector.finish()
         self._take(self._close_given(self.keyframes[-1].scan, len(self.scan_poses) - 1))
         self._refine_closures(until=len(self.keyframes))
         return self._corrected(self._closures, placed)
 
     def present(self) -> Corrected | None:
-        """Optimise the graph so far, and leave it as it is; None when there is no keyframe.
-
-        Candidates that wait for others to agree are left out, and so are those of the last keyframe.
-        """
+        """Optimise the graph so far, and leave it as it is, without pending candidates; None without a keyframe."""
         if not self.keyframes:
             return None
         waiting = set(self._unrefined)
@@ -195,9 +181,6 @@ class SlamGraph(KeyframeGraph):
         logger.info("GNSS: %d of %d positions are inliers", optimised.position_inliers.sum(), len(positions))
         return replace(optimised, poses=T_world_map @ optimised.poses)
 
-    def _accepted(self) -> list[LoopClosure]:
-        return [closure for closure in self._closures if closure.accepted]
-
     def _constraints(self, closures: Sequence[LoopClosure]) -> tuple[list[RelativePose], list[LoopClosure]]:
         """Constraints that are never outliers, the edges and given closures, and closures that may be outliers."""
         accepted = [closure for closure in closures if closure.accepted]
@@ -221,14 +204,14 @@ class SlamGraph(KeyframeGraph):
     def _begin_keyframe(self, scan: GraphScan, one_map: bool = True) -> None:
         last = self.keyframes[-1].scan if self.keyframes else 0
         super()._begin_keyframe(scan, one_map and not self._laid.is_exchanged(last, len(self.scan_poses) - 1))
-        self._chain(self.scan_poses, self.keyframes[-2:-1], self.keyframes[-1])
+        self._chain(self.scan_poses, self.keyframes[-2:])
         self._laid.follow(scan.T_world_lidar)
 
-    def _chain(self, scan_poses: Sequence[FloatArray], before: Sequence[Keyframe], keyframe: Keyframe) -> None:
-        """Add the pose of the next keyframe, from the one before it in its recording where there is one."""
-        pose = scan_poses[keyframe.scan]
-        for last in before:
-            pose = self._poses[-1] @ (inverse(scan_poses[last.scan]) @ pose)
+    def _chain(self, scan_poses: Sequence[FloatArray], latest: Sequence[Keyframe]) -> None:
+        """Add the pose of the last of the latest keyframes, from the one before it in its recording."""
+        pose = scan_poses[latest[-1].scan]
+        if len(latest) > 1:
+            pose = self._poses[-1] @ (inverse(scan_poses[latest[0].scan]) @ pose)
         self._poses.append(pose)
 
     def _keep(self, means: VoxelMeans) -> None:
@@ -248,8 +231,8 @@ class SlamGraph(KeyframeGraph):
     def _refine_closures(self, until: int) -> list[LoopClosure]:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""
         rows = [row for row in self._unrefined if self._closures[row].second <= until]
+        self._unrefined = [row for row in self._unrefined if row not in rows]
         for row in rows:
-            self._unrefined.remove(row)
             self._closures[row] = self._refined(self._closures[row])
         return [self._closures[row] for row in rows]
 
@@ -260,13 +243,10 @@ class SlamGraph(KeyframeGraph):
         target, source = (self._dense_submap(key, cell_m) for key in ends)
         closure = refine(target, source, closure, self._bend(closure.first) + self._bend(closure.second)) or closure
         first, second = self.keyframes[closure.first], self.keyframes[closure.second]
-        if first.segment != second.segment:
-            return closure
         # Of a recording that was added, the places of submaps in its rebuilt local maps are unknown.
-        if self._first_scans and any(closure.first < count <= closure.second for count in self.redraws):
-            return closure
+        is_unknown = self._first_scans and any(closure.first < count <= closure.second for count in self.redraws)
         place = self._laid.place(closure.first, first.scan, self.scan_poses[first.scan], second.scan)
-        if place is None:
+        if first.segment != second.segment or is_unknown or place is None:
             return closure
         T_odom_first, since = place
         way = np.array(self.scan_poses[since : second.scan + 1])
@@ -287,8 +267,3 @@ class SlamGraph(KeyframeGraph):
         """A keyframe with its neighbours in its segment that have submaps by now."""
         near = range(max(0, key - REACH), min(len(self.store), key + REACH + 1))
         return [k for k in near if self.keyframes[k].segment == self.keyframes[key].segment]
-
-
-def _by_key(items: Sequence[T], key: Callable[[T], int]) -> dict[int, list[T]]:
-    """Items of keyframes, in their order."""
-    return {one: list(group) for one, group in groupby(items, key)}

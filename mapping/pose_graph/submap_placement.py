@@ -54,11 +54,7 @@ class Drawn:
 
 
 class SubmapPlacement(Stateful):
-    """Where the submaps of keyframes lie in the running local map, and which of them it still holds.
-
-    Args:
-        radius_m: of the local map.
-    """
+    """Where the submaps of keyframes lie in the running local map, of this radius, and which of them it still holds."""
 
     _poses: list[Annotated[FloatArray, TRANSFORM]]  # T_odom_keyframe
     _held: list[int]  # keyframes whose submaps it holds
@@ -97,7 +93,10 @@ class SubmapPlacement(Stateful):
         """
         relative = np.where(members, self._distances(targets) / self.radius_m, np.inf)
         is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()
-        if not is_missing and not self._is_off(targets, np.flatnonzero(relative < _RIGHT_WITHIN), cell_m):
+        near = np.flatnonzero(relative < _RIGHT_WITHIN)
+        off = inverse(np.array([self._poses[key] for key in near]).reshape(-1, 4, 4)) @ targets[near]
+        is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cell_m
+        if not is_missing and not (is_far | (rotation_angle(off) > _OFF_RAD)).any():
             return None
         self._poses, self._held = list(targets), np.flatnonzero(relative < 1.0).tolist()
         drawn = Drawn(scan + SCANS_LATER, np.array(self._held, dtype=np.intp), len(targets), targets[self._held])
@@ -105,38 +104,24 @@ class SubmapPlacement(Stateful):
         held = [submap(key).rows for key in self._held]
         step = 1 + sum(map(len, held)) // _MOST_POINTS
         submaps = [(targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True)]
-        return draw_local_map(submaps, cell_m, max(self.radius_m, *(_reach_m(rows) for rows in held)))
-
-    def _is_off(self, targets: FloatArray, near: NDArray[np.intp], cell_m: float) -> bool:
-        """Whether one of the submaps of keyframes (N,) lies elsewhere than it should."""
-        if not len(near):
-            return False
-        off = inverse(np.array([self._poses[key] for key in near])) @ targets[near]
-        is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cell_m
-        return bool((is_far | (rotation_angle(off) > _OFF_RAD)).any())
+        # Ended the map before a submap does, its border would be of the latest scans alone.
+        reaches = (float(np.linalg.norm(rows[:, POSITION], axis=1).max(initial=0.0)) for rows in held)
+        return draw_local_map(submaps, cell_m, max(self.radius_m, *reaches))
 
     def is_exchanged(self, first: int, second: int) -> bool:
         """Whether two scans were registered to different maps, one of them rebuilt."""
         return any(first < drawn.since <= second for drawn in self._drawn)
 
     def place(self, key: int, scan: int, T_odom_keyframe: FloatArray, at: int) -> tuple[FloatArray, int] | None:
-        """Where a keyframe's submap lies in the map that a later scan was registered to, and since which scan it does.
+        """Where a keyframe's submap lies in the map that a later scan `at` was registered to, and since which scan.
 
-        Args:
-            key: the keyframe.
-            scan, T_odom_keyframe: its scan, and pose (4, 4) as registered.
-            at: the later scan.
-
-        Returns:
-            None where it was left out of the map.
+        Given the keyframe's own scan and registered pose (4, 4). None where the map does not have it.
         """
         drawn = next((drawn for drawn in reversed(self._drawn) if drawn.since <= at), None)
         if drawn is None or key >= drawn.keyframes:
             return T_odom_keyframe, scan
-        row = int(np.searchsorted(drawn.keys, key))
-        if row == len(drawn.keys) or drawn.keys[row] != key:
-            return None
-        return drawn.T_odom_keyframe[row], drawn.since
+        rows = np.flatnonzero(drawn.keys == key)
+        return (drawn.T_odom_keyframe[rows[0]], drawn.since) if len(rows) else None
 
     def _distances(self, poses: FloatArray) -> FloatArray:
         """(K,) of poses (K, 4, 4) from the last keyframe."""
@@ -144,19 +129,11 @@ class SubmapPlacement(Stateful):
 
 
 def connected_with_last(keyframes: Sequence[Keyframe], closures: Iterable[RelativePose]) -> NDArray[np.bool_]:
-    """(K,) the keyframes whose poses follow from the last one's.
-
-    Those of a segment do; loop closures join segments.
-    """
+    """(K,) the keyframes whose poses follow from the last one's: those of a segment do; loop closures join segments."""
     segments = np.array([keyframe.segment for keyframe in keyframes])
     pairs = [(int(key), int(key) + 1) for key in np.flatnonzero(np.diff(segments) == 0)]
     component = first_connected(len(keyframes), pairs + [(closure.first, closure.second) for closure in closures])
     return np.asarray(component == component[-1])
-
-
-def _reach_m(rows: Rows) -> float:
-    """How far a submap reaches. Where the local map ended before, its border would be of the latest scans alone."""
-    return float(np.linalg.norm(rows[:, POSITION], axis=1).max(initial=0.0))
 
 
 def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, radius_m: float) -> SurfelMap:
@@ -183,7 +160,7 @@ def as_registered(
 
     A scan registered to surfaces seen from an earlier keyframe measures its pose relative to that keyframe, with all
     its points and without drift. Registering the two submaps measures the same again from the same points, with more
-    noise.
+    noise. Where the map did not hold the place, or the two contradict one another, the closure is as it was.
 
     Args:
         closure: of two keyframes.
@@ -192,9 +169,6 @@ def as_registered(
         first, second: (6, 6) covariances of the poses of the keyframes, rotation first, in their LiDAR frames; None of
             one that was not registered.
         radius_m: of the local map; 0 without one.
-
-    Returns:
-        The closure as it was, where the map did not hold the place, or the two contradict one another.
     """
     if first is None or second is None or not len(way):
         return closure

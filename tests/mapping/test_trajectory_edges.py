@@ -17,7 +17,7 @@ def scan(T_prev_curr: FloatArray | None, lost: bool = False) -> GraphScan:
 
 
 def motion_of(*scans: GraphScan) -> MotionSinceKeyframe:
-    motion = MotionSinceKeyframe.none()
+    motion = MotionSinceKeyframe()
     for one in scans:
         motion = motion.then(one, 1.5)
     return motion
