@@ -20,7 +20,6 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.tasks import Where
 from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeRequest
@@ -186,28 +185,6 @@ def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcom
     assert "02_foreign: 12 scans" in text
 
 
-@pytest.mark.slow
-def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(
-    merged: tuple[Path, MergeOutcome], places: dict[str, Path], tmp_path: Path
-) -> None:
-    for place in places.values():
-        turned = tmp_path / place.name
-        turned.mkdir()
-        for path in sorted(place.glob("*.npy")):
-            table = np.load(path)
-            table["y"], table["z"] = -table["z"], table["y"].copy()
-            np.save(turned / path.name, table)
-        (turned / "timestamps.txt").write_bytes((place / "timestamps.txt").read_bytes())
-    sources = [tmp_path / name for name in ("first", "foreign", "second")]
-    outcome = merge(request(tmp_path / "merged", *sources, settings=("reader.mounting=left",)), quiet)
-    assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
-    for name in (".", "01_first", "02_foreign", "03_second"):
-        np.testing.assert_allclose(load_map(tmp_path / "merged" / name).points, load_map(merged[0] / name).points)
-        if name != ".":
-            poses, expected = (read_tum(out / name / "trajectory.tum") for out in (tmp_path / "merged", merged[0]))
-            np.testing.assert_allclose(poses.T_world_lidar, expected.T_world_lidar, atol=1e-6)
-
-
 def graph_keys(out: Path) -> tuple[list[int], int]:
     """Keys of the poses of a pose graph, and how many edges it has."""
     words = [line.split() for line in (out / "pose_graph.g2o").read_text().splitlines()]
@@ -232,19 +209,6 @@ def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) 
         odometry = read_tum(out / name / "odometry.tum").positions[0]
         assert np.linalg.norm(odometry) < 0.05  # as it was, in a frame of its own
     assert keyframes[0] + keyframes[2] == len(graph_keys(out)[0])
-
-
-@pytest.mark.slow
-def test_side_by_side_is_the_same_as_one_after_another(
-    merged: tuple[Path, MergeOutcome],
-    places: dict[str, Path],
-    tmp_path: Path,
-    timeless: Callable[[Path], dict[str, Any]],
-) -> None:
-    pytest.importorskip("ray")
-    sources = [places[name] for name in ("first", "foreign", "second")]
-    merge(request(tmp_path / "out", *sources, where=Where(2)), quiet)
-    assert timeless(tmp_path / "out") == timeless(merged[0])
 
 
 # What follows is about files and errors; the rooms are too small to be joined.

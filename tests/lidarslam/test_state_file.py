@@ -23,20 +23,17 @@ STATE: State = {
 
 
 def assert_same(found: Any, expected: Any) -> None:
-    if isinstance(expected, dict):
-        assert set(found) == set(expected)
-        for name in expected:
-            assert_same(found[name], expected[name])
-    elif isinstance(expected, list):
-        assert len(found) == len(expected)
-        for one, other in zip(found, expected, strict=True):
-            assert_same(one, other)
-    elif isinstance(expected, np.ndarray):
+    assert type(found) is type(expected)
+    if isinstance(expected, np.ndarray):
         assert found.dtype == expected.dtype
         np.testing.assert_array_equal(found, expected)
+    elif isinstance(expected, dict):
+        assert_same([*found, *found.values()], [*expected, *expected.values()])
+    elif isinstance(expected, list):
+        for one, other in zip(found, expected, strict=True):
+            assert_same(one, other)
     else:
         assert found == expected
-        assert type(found) is type(expected)
 
 
 def test_a_state_comes_back_to_the_last_bit(tmp_path: Path) -> None:
@@ -45,7 +42,7 @@ def test_a_state_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["state.npz"]
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_noticed_or_does_not_matter(tmp_path: Path, share: float, bit: int) -> None:
     path = tmp_path / "state.npz"
@@ -62,15 +59,12 @@ def test_a_flipped_bit_is_noticed_or_does_not_matter(tmp_path: Path, share: floa
     assert_same(found._values, STATE)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(share=st.floats(0.0, 1.0, exclude_max=True))
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.999])
 def test_a_file_cut_short_is_damaged(tmp_path: Path, share: float) -> None:
-    path = tmp_path / "state.npz"
-    write_state(path, STATE)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    write_state(tmp_path / "state.npz", STATE)
+    os.truncate(tmp_path / "state.npz", int(share * (tmp_path / "state.npz").stat().st_size))
     with pytest.raises(InputError, match="is damaged"):
-        read_state(path)
+        read_state(tmp_path / "state.npz")
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])

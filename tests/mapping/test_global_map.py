@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 
 
@@ -12,17 +11,6 @@ def test_precision_does_not_suffer_far_from_the_origin():
     far = np.array([[12_345.678, -9_876.543, 210.987]])
     grid.add(far, np.eye(4))
     np.testing.assert_allclose(grid.points(), far, atol=1e-6)
-
-
-def test_memory_follows_the_area_not_the_scans(rng, monkeypatch):
-    monkeypatch.setattr(module, "_MIN_PENDING", 5_000)
-    grid = GlobalMap(0.5)
-    sizes = []
-    for _ in range(300):
-        grid.add(rng.uniform(-5.0, 5.0, (2_000, 3)), np.eye(4))
-        sizes.append(len(grid._merged.keys) + grid._pending_size)
-    assert len(grid.points()) == 20**3
-    assert max(sizes) < 20**3 * 1.5 + 5_000 + 2_000
 
 
 def test_normals_face_the_sensor(rng):

@@ -104,15 +104,24 @@ def take(inertial: Inertial, stamp: float, T_world_lidar: FloatArray, **flags: b
     return predicted
 
 
-def followed(inertial: Inertial, last_s: float, rng: np.random.Generator) -> list[tuple[float, GravityDirection]]:
-    """Give it the scans of the walk, with errors, in a world that the first one makes; what it measures of gravity."""
+def followed(
+    inertial: Inertial, last_s: float, rng: np.random.Generator, motion: Callable[[FloatArray], FloatArray] = walk
+) -> list[tuple[float, GravityDirection]]:
+    """Give it the scans of a motion, with errors, in a world that the first one makes; what it measures of gravity."""
     directions = []
     for stamp in np.arange(0.5, last_s, PERIOD_S):
         error = rng.normal(size=6) * ([np.deg2rad(0.03)] * 3 + [0.003] * 3)
-        take(inertial, stamp, inverse(walk(0.5)) @ walk(stamp) @ exp(error))
+        take(inertial, stamp, inverse(motion(0.5)) @ motion(stamp) @ exp(error))
         if inertial.direction is not None:
             directions.append((stamp, inertial.direction))
     return directions
+
+
+def assert_predicted(state: MotionState, T_world_lidar: FloatArray, within_m: float) -> None:
+    """A predicted pose is near the true one, and within the stated covariance."""
+    error = log(inverse(state.T_world_lidar) @ T_world_lidar)
+    assert np.linalg.norm(error[3:]) < within_m
+    assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
 
 
 def angle_deg(a: FloatArray, b: FloatArray) -> float:
@@ -147,7 +156,7 @@ def test_a_gap_between_samples_is_not_covered():
         assert not gyroscope.covers(first_s, last_s)
 
 
-@pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("stamp_at", [0.0, 0.5])
 def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at, rng):
     """By one angular velocity, once it is evened; the gyroscope's bias has no part in it."""
     stamp, offsets = 1.0, PERIOD_S * (np.sort(rng.uniform(size=3000)) - stamp_at)
@@ -175,12 +184,12 @@ def test_sweeps_without_times_or_samples_stay_as_they_are():
 
 
 def test_biases_and_gravity_are_recovered(rng):
-    inertial = Inertial(samples(walk, 20.0), T_LIDAR_IMU)
-    directions = followed(inertial, 19.9, rng)
+    inertial = Inertial(samples(walk, 15.0), T_LIDAR_IMU)
+    directions = followed(inertial, 14.9, rng)
     np.testing.assert_allclose(inertial._window.last.bias[3:], T_LIDAR_IMU[:3, :3] @ BIAS, atol=1e-3)
     np.testing.assert_allclose(inertial._window.last.bias[:3], T_LIDAR_IMU[:3, :3] @ FORCE_BIAS, atol=0.02)
     up = walk(0.5)[:3, :3].T @ [0.0, 0.0, 1.0]
-    assert [stamp for stamp, _ in directions] == pytest.approx(np.arange(directions[0][0], 19.9))
+    assert [stamp for stamp, _ in directions] == pytest.approx(np.arange(directions[0][0], 14.9))
     assert directions[0][0] < 5.0
     stamp, last = directions[-1]
     assert angle_deg(last.world, up) < 0.15
@@ -193,10 +202,8 @@ def test_pose_and_velocity_are_predicted(rng):
     followed(inertial, 8.0, rng)
     stamp, h = 8.1, 1e-4
     state = inertial.prior(empty(stamp), Prior()).inertial
-    error = log(inverse(state.T_world_lidar) @ inverse(walk(0.5)) @ walk(stamp))
-    assert np.rad2deg(np.linalg.norm(error[:3])) < 0.06
-    assert np.linalg.norm(error[3:]) < 0.02
-    assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
+    assert_predicted(state, inverse(walk(0.5)) @ walk(stamp), 0.02)
+    assert np.rad2deg(rotation_angle(inverse(state.T_world_lidar) @ inverse(walk(0.5)) @ walk(stamp))) < 0.06
     velocity = log(inverse(walk(stamp - h)) @ walk(stamp + h)) / (2 * h)
     np.testing.assert_allclose(state.velocity, velocity, atol=0.06)
 
@@ -207,20 +214,12 @@ def test_it_predicts_through_scans_that_are_lost_and_ends_then(rng):
     before = inertial._window.last.bias
     for stamp in np.arange(8.0, 9.9, PERIOD_S):
         state = take(inertial, stamp, exp([0.0, 0.0, 2.0, 9.0, 9.0, 0.0]), is_registered=False, is_connected=False)
-        error = log(inverse(state.T_world_lidar) @ inverse(walk(0.5)) @ walk(stamp))
-        assert np.linalg.norm(error[3:]) < 0.02 + 0.05 * (stamp - 7.9) ** 2
-        assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
+        assert_predicted(state, inverse(walk(0.5)) @ walk(stamp), 0.02 + 0.05 * (stamp - 7.9) ** 2)
     np.testing.assert_allclose(inertial._window.last.bias, before, atol=1e-5)
     assert inertial.prior(empty(10.2), Prior()).inertial is None
-
-
-def test_another_place_changes_no_bias(rng):
-    inertial = Inertial(samples(walk, 10.0), T_LIDAR_IMU)
-    followed(inertial, 8.0, rng)
-    before = inertial._window.last.bias
-    take(inertial, 8.0, exp([0.0, 0.0, 1.0, 9.0, 9.0, 0.0]), is_connected=False)
-    assert inertial.direction is None
-    np.testing.assert_array_equal(inertial._window.last.bias, before)
+    take(inertial, 10.0, exp([0.0, 0.0, 1.0, 9.0, 9.0, 0.0]), is_connected=False)
+    assert inertial.direction is None, "another place"
+    np.testing.assert_allclose(inertial._window.last.bias, before, atol=1e-5)
 
 
 def test_a_direction_without_structure_is_held_by_the_imu(rng):
@@ -262,39 +261,26 @@ def test_reversed_time_gives_the_reversed_motion(rng):
 
 
 def test_a_wrong_mounting_or_clock_is_noticed(rng):
-    imu, turned = samples(walk, 10.0), T_LIDAR_IMU @ exp([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+    imu, turned = samples(walk, 8.0), T_LIDAR_IMU @ exp([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
     late = replace(imu, stamps=imu.stamps + 0.3)
     for wrong, T in ((imu, T_LIDAR_IMU), (imu, turned), (late, T_LIDAR_IMU)):
         inertial = Inertial(wrong, T)
-        followed(inertial, 9.0, rng)
+        followed(inertial, 7.0, rng)
         is_right = wrong is imu and T is T_LIDAR_IMU
         assert any("the IMU's mounting or clock is wrong" in warning for warning in inertial.warnings) != is_right
 
 
-def test_scaled_accelerations_are_recovered(rng):
-    """Beside gravity, which is not scaled; the prediction is as good as without."""
-    inertial = Inertial(samples(shaken, 20.0, scale=1.25), T_LIDAR_IMU)
-    for stamp in np.arange(0.5, 19.0, PERIOD_S):
-        error = exp(rng.normal(size=6) * ([np.deg2rad(0.03)] * 3 + [0.003] * 3))
-        take(inertial, stamp, inverse(shaken(0.5)) @ shaken(stamp) @ error)
-    seen = "the IMU's accelerations are 1.25 times those of the LiDAR's positions; estimated, corrected"
-    assert inertial.warnings[-1] == seen
-    state = inertial.prior(empty(19.4), Prior()).inertial
-    error = log(inverse(state.T_world_lidar) @ inverse(shaken(0.5)) @ shaken(19.4))
-    assert np.linalg.norm(error[3:]) < 0.02
-    assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
-
-
-def test_an_unknown_lever_arm_is_recovered(rng):
+def test_scaled_accelerations_and_an_unknown_lever_arm_are_recovered(rng):
+    """Gravity is not scaled; the prediction is as good as without."""
     T_turned = make_transform(T_LIDAR_IMU[:3, :3], np.zeros(3))
-    inertial = Inertial(samples(shaken, 20.0), T_turned, UNKNOWN_LEVER_M)
-    for stamp in np.arange(0.5, 19.0, PERIOD_S):
-        error = exp(rng.normal(size=6) * ([np.deg2rad(0.03)] * 3 + [0.003] * 3))
-        take(inertial, stamp, inverse(shaken(0.5)) @ shaken(stamp) @ error)
+    inertial = Inertial(samples(shaken, 20.0, scale=1.25), T_turned, UNKNOWN_LEVER_M)
+    followed(inertial, 19.0, rng, shaken)
+    assert "the IMU's accelerations are 1.25 times those of the LiDAR's positions" in inertial.warnings[-1]
+    assert_predicted(inertial.prior(empty(19.4), Prior()).inertial, inverse(shaken(0.5)) @ shaken(19.4), 0.02)
     np.testing.assert_allclose(inertial.lever, T_LIDAR_IMU[:3, 3], atol=0.01)
 
 
-@pytest.mark.parametrize("begin_s", [-0.1, -0.05, 0.0])
+@pytest.mark.parametrize("begin_s", [-0.1, 0.0])
 def test_the_velocity_of_a_sweep_in_a_curve(begin_s, rng):
     """Begin and end of the sweep, moved by the predicted velocity, lie where the sensor was."""
 
@@ -340,9 +326,7 @@ def test_another_world_after_tracking_was_lost_has_another_vertical(rng):
     T_other_world = exp([0.2, -0.1, 0.4, 3.0, 0.0, 0.0])
     for stamp in np.arange(12.0, 19.0, PERIOD_S):
         state = take(inertial, stamp, T_other_world @ walk(stamp))
-    error = log(inverse(state.T_world_lidar) @ T_other_world @ walk(stamp))
-    assert np.linalg.norm(error[3:]) < 0.01
-    assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
+    assert_predicted(state, T_other_world @ walk(stamp), 0.01)
 
 
 def test_forces_without_gravity_are_refused():
@@ -382,13 +366,12 @@ def test_a_prediction_follows_the_imu_where_the_motion_is_uncertain():
 
 
 def test_large_biases_are_reported(rng):
-    biased = samples(walk, 20.0, bias=np.deg2rad([1.0, -1.0, 0.5]), force_bias=np.array([0.4, 0.8, -0.3]))
+    biased = samples(walk, 15.0, bias=np.deg2rad([1.0, -1.0, 0.5]), force_bias=np.array([0.4, 0.8, -0.3]))
     inertial = Inertial(biased, T_LIDAR_IMU)
-    followed(inertial, 19.0, rng)
-    assert inertial.warnings == [
-        "the IMU's accelerometer has a bias of 0.10 g; estimated, corrected",
-        "the IMU's gyroscope has a bias of 1.50 deg/s; estimated, corrected",
-    ]
+    followed(inertial, 14.0, rng)
+    forces, rates = inertial.warnings
+    assert "the IMU's accelerometer has a bias of 0.10 g" in forces
+    assert "the IMU's gyroscope has a bias of 1.50 deg/s" in rates
 
 
 def compared(
@@ -414,18 +397,16 @@ def test_the_mounting_is_recovered(rng):
     assert found.sigma < np.deg2rad(1.0)
 
 
-@pytest.mark.parametrize(("motion", "why"), [(yaw_only, "one axis only"), (still, "turns too little")])
-def test_motions_that_show_no_mounting(motion, why, rng):
+@pytest.mark.parametrize(
+    ("motion", "last_s", "why"),
+    [(yaw_only, 20.0, "one axis only"), (still, 20.0, "turns too little"), (walk, 2.5, "only 14 turns")],
+)
+def test_motions_that_show_no_mounting(motion, last_s, why, rng):
     with pytest.raises(MountingError, match=why):
-        compared(motion, rng, samples(motion, 20.0), np.eye(4)).mounting()
+        compared(motion, rng, samples(motion, last_s), np.eye(4)).mounting()
 
 
-def test_too_few_turns_show_no_mounting(rng):
-    with pytest.raises(MountingError, match="only 14 turns"):
-        compared(walk, rng, samples(walk, 2.5), np.eye(4)).mounting()
-
-
-@pytest.mark.parametrize("late_s", [0.02, -0.02, 0.0])
+@pytest.mark.parametrize("late_s", [-0.02, 0.0])
 def test_errors_of_clock_and_rotation_are_found_with_their_deviations(late_s, rng):
     imu, turned = samples(walk, 12.0), np.array([0.02, -0.03, 0.025])
     late = replace(imu, stamps=imu.stamps + late_s)

@@ -140,15 +140,6 @@ def test_nothing_is_closed_on_a_way_without_return(hall):
     assert accepted(closures) == []
 
 
-def test_closures_keep_their_distance(twice, monkeypatch):
-    submaps, truth = twice
-    monkeypatch.setattr(detection, "_SPACING_M", 7.0)
-    found = accepted(detect(submaps, drifted(truth))[0])
-    ways = np.array([submaps[c.second].way_m for c in found])
-    assert len(ways) >= 2
-    assert (np.diff(ways) >= 7.0).all()
-
-
 @pytest.mark.parametrize(
     "mount",
     [

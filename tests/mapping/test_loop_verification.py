@@ -194,13 +194,3 @@ def test_covariance_holds_what_drift_does_within_a_place(room):
     # What lies behind makes up for a submap that is drawn ahead; points are trusted as much either way.
     more = covariance(0.0, 1.0, 1.0) - covariance(0.0, 1.0, -1.0)
     assert more == pytest.approx(np.diag([1e-4 * 4 / 3] * 3 + [4e-4 * 4 / 3] * 3), abs=1e-12)
-
-
-def test_points_know_which_way_their_keyframe_lies(room):
-    other = submap_from(ROOM, pose(1.5, 0.8, 40.0), 5)
-    another = submap_from(ROOM, pose(1.5, 0.8, 40.0), 6)
-    place = SubmapCloud.join(room[0].submap, [(np.eye(4), other), (np.eye(4), another)], [-3.0, 2.0], (0.1, 0.2))
-    assert set(place.ahead_m) == {-3.0, 0.0, 2.0}
-    assert place.middle_m == 1.0  # half the way to the next
-    assert place.drift_rates == (0.1, 0.2)
-    assert len(place.ahead_m) == len(place.points)

@@ -64,19 +64,6 @@ def test_equals_a_dictionary_of_voxels(rng, monkeypatch):
     assert kinds >= {(True, True), (True, False), (False, False)}
 
 
-def test_what_is_chosen_of_a_map_keeps_its_attributes(rng):
-    grid = GlobalMap(VOXEL_M)
-    points = VOXEL_M * (np.arange(40)[:, None] + 0.5) * [1.0, 0.0, 0.0]
-    numbers = np.arange(40, dtype=np.float32)
-    grid.add(points, np.eye(4), PointAttributes(intensity=numbers))
-    grid.add(points[::2], np.eye(4), PointAttributes(intensity=numbers[::2]))
-    left_out = rng.random(20) < 0.5
-    cloud = grid.cloud(min_hits=2, left_out=left_out)
-    assert cloud.attributes.intensity is not None
-    np.testing.assert_allclose(cloud.points[:, 0], points[::2][~left_out, 0], atol=1e-6)
-    np.testing.assert_array_equal(cloud.attributes.intensity, numbers[::2][~left_out])
-
-
 def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng):
     poses = [exp([0.0, 0.0, 0.0, x, 0.0, 0.0]) for x in (0.0, 2.0, 4.0)]  # whole voxels, so that they are cut alike
     direct, drawn = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)

@@ -130,18 +130,10 @@ def _read(file: Path) -> tuple[dict[str, object], FloatArray]:
         key, _, text = line.partition(":")
         about[key] = text.strip()
     image = (file.parent / str(about["image"])).read_bytes()
-    magic, width, height, most, pixels = _pgm(image)
-    assert (magic, most) == (b"P5", 255)
-    return about, (255.0 - np.frombuffer(pixels, np.uint8).reshape(height, width)) / 255.0
-
-
-def _pgm(image: bytes) -> tuple[bytes, int, int, int, bytes]:
-    words, position = [], 0
-    for _ in range(4):
-        end = min(at for at in (image.find(b" ", position), image.find(b"\n", position)) if at >= 0)
-        words.append(image[position:end])
-        position = end + 1
-    return words[0], int(words[1]), int(words[2]), int(words[3]), image[position:]
+    magic, width, height, most = image.split(maxsplit=4)[:4]
+    assert (magic, most) == (b"P5", b"255")
+    pixels = np.frombuffer(image, np.uint8)[-int(width) * int(height) :]
+    return about, (255.0 - pixels.reshape(int(height), int(width))) / 255.0
 
 
 def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):

@@ -89,7 +89,7 @@ def test_a_loop_takes_the_drift_out(rng):
     assert errors[1] < 0.3 * errors[0]
 
 
-@pytest.mark.parametrize(("true", "false"), [(3, 1), (10, 3), (10, 6)])
+@pytest.mark.parametrize(("true", "false"), [(0, 1), (3, 1), (10, 6)])
 def test_false_loops_are_rejected_and_change_nothing(true, false, rng):
     truth = laps(2 * LAP)
     edges = with_errors(chained(truth), rng)
@@ -101,13 +101,6 @@ def test_false_loops_are_rejected_and_change_nothing(true, false, rng):
     found = optimise(start, edges, wrong + loops)
     assert found.inliers.tolist() == [False] * false + [True] * true
     assert_near(found.poses, expected.poses, 1e-6)
-
-
-def test_a_single_false_loop_is_rejected_where_the_chain_would_have_to_break(rng):
-    truth = laps(2 * LAP)
-    found = optimise(truth, chained(truth), false_edges(truth, FALSE[:1], rng))
-    assert found.inliers.tolist() == [False]
-    assert_near(found.poses, truth, 1e-6)
 
 
 def test_false_loops_that_agree_and_outnumber_the_true_are_inliers(rng):
@@ -176,7 +169,7 @@ def test_loops_bring_two_components_together():
     assert_near(optimised.poses, truth, 1e-5)
 
 
-@pytest.mark.parametrize(("true", "false"), [(2, 1), (2, 2), (3, 6)])
+@pytest.mark.parametrize(("true", "false"), [(2, 1), (3, 6)])
 def test_false_loops_between_components_are_rejected(true, false, rng):
     truth = laps(2 * LAP)
     poses, edges = apart(truth, exp([0.0, 0.1, 2.5, 80.0, -50.0, 3.0]))

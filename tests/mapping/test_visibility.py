@@ -103,7 +103,7 @@ def at(azimuth_deg: float, range_m: float = 5.0, elevation_deg: float = 1.0) -> 
     return range_m * np.array([[np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]])
 
 
-@pytest.mark.parametrize("azimuth_deg", [0.1, 45.3, 179.9, 180.1, 359.9, -1e-15])
+@pytest.mark.parametrize("azimuth_deg", [0.1, 180.1, -1e-15])
 @pytest.mark.parametrize(
     ("through", "support", "expected", "with_gaps"),
     [
@@ -166,12 +166,8 @@ def test_far_away_and_outside_the_rows_nothing_is_seen():
         assert seen_through(point, placed(images), VOXEL_M).tolist() == [expected]
     assert seen_through(at(10.0, 4.9), placed(images), 0.01).all()  # near, though pixels are wider than voxels
     assert not seen_through(np.full((1, 3), np.nan), placed(images), VOXEL_M).any()
-
-
-def test_without_views_or_points_nothing_is_seen():
-    assert seen_through(at(10.0), placed([]), VOXEL_M).tolist() == [False]
-    assert seen_through(np.empty((0, 3)), placed([wall(9.0)]), VOXEL_M).shape == (0,)
-    assert len(Views().placed(np.empty((0, 4, 4)))) == 0
+    assert not seen_through(at(10.0), placed([]), VOXEL_M).any()
+    assert seen_through(np.empty((0, 3)), placed(images), VOXEL_M).shape == (0,)
 
 
 @settings(max_examples=60, deadline=None)
@@ -236,15 +232,9 @@ def test_views_are_of_every_second_scan_and_where_these_are_in_the_end():
     np.testing.assert_array_equal(views.placed(poses[:21]).T_world_lidar[:, 0, 3], np.arange(1.0, 21.0, 4.0))
 
 
-def test_of_a_longer_way_views_are_of_every_fourth_scan():
-    views, poses = Views(), exp(np.arange(1000.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-    for number in range(1000):
-        views.add(at(10.0), number)
-    np.testing.assert_allclose(views.placed(poses).T_world_lidar[:, 0, 3], np.arange(0.0, 1000.0, 4.0))
-
-
 def test_views_are_bounded_however_long_the_way():
     views = Views(every=1)
+    assert len(views.placed(np.empty((0, 4, 4)))) == 0
     for number in range(2100):
         views.add(at(10.0), number)
         assert len(views) <= 512
@@ -270,18 +260,17 @@ def test_views_of_several_recordings_are_joined(rng):
     assert seen_through(at(10.0), PlacedViews.join(parts), VOXEL_M).all()
 
 
-@pytest.mark.parametrize("after", [0, 1, 7, 600])
+@pytest.mark.parametrize("after", [0, 7, 600])
 def test_views_go_on(after, rng, through_disk):
     whole, first, second = Views(every=1), Views(every=1), Views()
-    clouds = rng.uniform(-5.0, 5.0, (700, 20, 3))
-    for number, cloud in enumerate(clouds):
+    clouds = list(enumerate(rng.uniform(-5.0, 5.0, (700, 20, 3))))
+    for number, cloud in clouds:
         whole.add(cloud, number)
-        (first if number < after else second).add(cloud, number)
-        if number + 1 == after or after == 0 == number:
-            second = Views()
-            second.restore(through_disk(first.state()))
-            if after == 0:
-                second.add(cloud, number)
+    for number, cloud in clouds[:after]:
+        first.add(cloud, number)
+    second.restore(through_disk(first.state()))
+    for number, cloud in clouds[after:]:
+        second.add(cloud, number)
     expected, found = whole.state(), second.state()
     assert found.keys() == expected.keys()
     for name, value in expected.items():
