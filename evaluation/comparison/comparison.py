@@ -1,5 +1,6 @@
 """Results of a comparison of methods: plain values that the report draws and comparison.json keeps."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -20,9 +21,11 @@ no result but the message; `not run`: the comparison was interrupted before, or 
 TimesCover = Literal["reading, registration and map", "registration"]
 """The stages that the times of a scan include."""
 
+GROUND_TRUTH = "ground truth"
+"""Name of the reference that came with a recording."""
+
 WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 """Statuses of a run that came to the recording's end; of any other, the figures are of a part."""
-
 
 _TIMES = (
     "elapsed_ms_per_scan",
@@ -143,15 +146,6 @@ class MissingRecording:
     reason: str  # in a sentence
 
 
-@dataclass(frozen=True)
-class PublishedRow:
-    """A row of a published table, quoted next to ours."""
-
-    method: str  # as published
-    values: Mapping[str, float | str]  # column -> value, for instance {"09 translation_percent": 6.05}
-    source: str  # where it was published
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """The content of a report."""
@@ -161,7 +155,6 @@ class Comparison:
     sequences: Sequence[SequenceComparison]  # one or more recordings
     versions: Mapping[str, str] = field(default_factory=dict)  # program -> version; "commit" when it is known
     machine: Mapping[str, str] = field(default_factory=dict)  # name -> text, such as processor, cores, memory, system
-    published: Sequence[PublishedRow] = ()  # rows quoted next to ours that are in none of the `tables`
     tables: Sequence[Table] = ()  # over several recordings, published rows included; a report shows them first
     missing: Sequence[MissingRecording] = ()  # recordings that were asked for and are not there
     notes: Sequence[str] = ()  # remarks on the whole, such as that it was interrupted
@@ -200,6 +193,13 @@ class LostInterval:
     reason: str  # of the first loss, and the number of others
 
 
+def look_up(figures: object, path: str) -> float | None:
+    """The finite number at a path of keys separated by slashes; None where there is none."""
+    for key in path.split("/"):
+        figures = figures.get(key) if isinstance(figures, Mapping) else None
+    return float(figures) if isinstance(figures, int | float) and math.isfinite(figures) else None
+
+
 def lost_intervals(method: MethodResult) -> list[LostInterval]:
     """The intervals in order of time; none without a trajectory."""
     if method.lost is None or method.trajectory is None:
@@ -208,21 +208,15 @@ def lost_intervals(method: MethodResult) -> list[LostInterval]:
     edges = np.flatnonzero(np.diff(np.r_[False, method.lost, False]))
     runs = list(zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True))
     reasons = method.lost_reasons if len(method.lost_reasons) == len(runs) else [method.message] * len(runs)
-    merged: list[tuple[int, int, list[str]]] = []
+    merged: list[list[tuple[int, int, str]]] = []
     for (first, last), reason in zip(runs, reasons, strict=True):
-        if merged and times_s[first] - times_s[merged[-1][1]] < _MERGED_GAP_S:
-            begin, _, earlier = merged.pop()
-            merged.append((begin, last, [*earlier, reason]))
-        else:
-            merged.append((first, last, [reason]))
-    return [
-        LostInterval(
-            first,
-            last,
-            float(times_s[first]),
-            float(times_s[last]),
-            int(method.lost[first : last + 1].sum()),
-            why[0] if len(why) == 1 else f"{why[0]}, and {len(why) - 1} more",
-        )
-        for first, last, why in merged
-    ]
+        if not merged or times_s[first] - times_s[merged[-1][-1][1]] >= _MERGED_GAP_S:
+            merged.append([])
+        merged[-1].append((first, last, reason))
+    intervals = []
+    for stretches in merged:
+        first, last, why = stretches[0][0], stretches[-1][1], stretches[0][2]
+        why += f", and {len(stretches) - 1} more" if len(stretches) > 1 else ""
+        scans = int(method.lost[first : last + 1].sum())
+        intervals.append(LostInterval(first, last, float(times_s[first]), float(times_s[last]), scans, why))
+    return intervals

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.evaluation.comparison.comparison import SequenceComparison
+from lidarslam.evaluation.comparison.comparison import SequenceComparison, look_up
 from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M
 from lidarslam.evaluation.trajectory.metrics import metrics_json
 
@@ -73,11 +73,8 @@ class Gate:
 
     def of(self, figures: Figures) -> float | None:
         """The figure; None where it could not be computed."""
-        value: object = figures
         path = FIGURES.get(self.figure) or PATHS.get(self.figure) or f"metrics/{self.figure.replace('.', '/')}"
-        for key in path.split("/"):
-            value = value.get(key) if isinstance(value, Mapping) else None
-        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+        return look_up(figures, path)
 
 
 @dataclass(frozen=True)
@@ -97,11 +94,7 @@ class JudgedGate:
 
 
 def parse_gate(kind: Kind, text: str, with_method: bool = False) -> Gate:
-    """The gate `NAME=VALUE`, of a comparison `METHOD:NAME=VALUE` too.
-
-    Raises:
-        ConfigError: the text has another form, or no figure has that name.
-    """
+    """The gate `NAME=VALUE`, of a comparison `METHOD:NAME=VALUE` too."""
     method_and_name, _, value = text.rpartition("=")
     method, colon, name = method_and_name.strip().rpartition(":")
     form = f"--{kind} {text}: expected {'[METHOD:]' if with_method else ''}NAME=VALUE, such as ate=0.1"
@@ -127,11 +120,7 @@ def judge(gates: Iterable[Gate], figures: Figures) -> list[JudgedGate]:
 
 
 def require_methods(gates: Iterable[Gate], methods: Sequence[str]) -> None:
-    """Refuse gates of methods that are not compared.
-
-    Raises:
-        ConfigError: there is one.
-    """
+    """Refuse gates of methods that are not compared."""
     for gate in gates:
         if gate.method is not None and gate.method not in methods:
             raise ConfigError(f"--{gate.kind}: no method is called {gate.method!r}; there are: {', '.join(methods)}")

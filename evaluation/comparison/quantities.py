@@ -2,9 +2,12 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
-from lidarslam.core.errors import ConfigError
-from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison
+from pydantic import Field, model_validator
+
+from lidarslam.core.settings import Settings
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison, look_up
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 
@@ -27,15 +30,19 @@ class Quantity:
     def of(self, result: MethodResult) -> float | None:
         """The number; None where there is none."""
         entry = {**result.to_json(), "map_entropy": result.map_entropy}
-        value = _look_up(entry, self.path)
+        value = look_up(entry, self.path)
         if self.percent_of is None or value is None:
             return value
-        whole = _look_up(entry, self.percent_of)
+        whole = look_up(entry, self.percent_of)
         return 100.0 * value / whole if whole else None
 
     def is_comparable(self, result: MethodResult) -> bool:
         """Whether the number is of the whole recording, and a time of all stages of a scan."""
         return result.status in WHOLE and not (self.is_time and result.times_cover == "registration")
+
+    def column(self, heading: str = "", sequences: Sequence[str] = ()) -> TableColumn:
+        """Its column of a table."""
+        return TableColumn(heading, self.label, self.unit, self.digits, self.lower_is_better, sequences)
 
     def cell(self, result: MethodResult) -> TableCell:
         """The number in a table."""
@@ -48,23 +55,6 @@ def times_note(results: Iterable[MethodResult]) -> str:
     if not names:
         return ""
     return f"Times of {', '.join(names)}: registration alone, without reading and map; not ranked with the others."
-
-
-def _look_up(entry: object, path: str) -> float | None:
-    for key in path.split("/"):
-        entry = entry.get(key) if isinstance(entry, Mapping) else None
-    return float(entry) if isinstance(entry, int | float) else None
-
-
-def find_quantity(name: str) -> Quantity:
-    """The quantity of that name.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    if name not in QUANTITIES:
-        raise ConfigError(f"no quantity is called {name!r}; there are: {', '.join(QUANTITIES)}")
-    return QUANTITIES[name]
 
 
 QUANTITIES: dict[str, Quantity] = {
@@ -110,35 +100,56 @@ QUANTITIES: dict[str, Quantity] = {
 """Name -> quantity, in the order of metrics.json."""
 
 
-@dataclass(frozen=True)
-class TablePlan:
-    """Content of a table of means."""
+class Published(Settings):
+    """A row of a published table; a value for each column, null where none was published."""
 
-    # title, note: as in `Table`
+    method: str
+    values: tuple[float | str | None, ...]
+    source: str
+
+
+class TablePlan(Settings):
+    """Means over groups of recordings; a column for each group and quantity, the quantities side by side."""
+
     title: str
-    groups: Mapping[str, Sequence[str]]  # heading -> the recordings averaged under it
-    quantities: Sequence[Quantity]  # the columns under each heading
-    published: Sequence[TableRow] = ()  # others' rows, a cell for each column
+    groups: Mapping[str, tuple[str, ...]] = Field(description="heading -> names of recordings")
+    quantities: tuple[str, ...]
+    published: tuple[Published, ...] = ()
     note: str = ""
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        columns = len(self.groups) * len(self.quantities)
+        for row in self.published:
+            if len(row.values) != columns:
+                raise ValueError(
+                    f"table {self.title!r}, row {row.method!r}: expected {columns} values, one for each group and"
+                    f" quantity, got {len(row.values)}"
+                )
+        unknown = next((name for name in self.quantities if name not in QUANTITIES), None)
+        if unknown is not None:
+            names = ", ".join(QUANTITIES)
+            raise ValueError(f"table {self.title!r}: no quantity is called {unknown!r}; there are: {names}")
+        return self
 
 
 def mean_table(plan: TablePlan, sequences: Sequence[SequenceComparison]) -> Table:
     """The unweighted means over the recordings of each group that a method finished and has a value of."""
-    columns = [
-        TableColumn(heading, q.label, q.unit, q.digits, q.lower_is_better, tuple(group))
-        for heading, group in plan.groups.items()
-        for q in plan.quantities
-    ]
-    quantities = [quantity for _ in plan.groups for quantity in plan.quantities]
+    chosen = [QUANTITIES[name] for name in plan.quantities]
+    columns = [q.column(heading, group) for heading, group in plan.groups.items() for q in chosen]
+    quantities = chosen * len(plan.groups)
     results = {(sequence.sequence, result.name): result for sequence in sequences for result in sequence.methods}
     methods = dict.fromkeys(name for _, name in results)
     rows = []
     for method in methods:
         found = [[results.get((name, method)) for name in column.sequences] for column in columns]
         rows.append(TableRow(method, [_mean(*of) for of in zip(found, quantities, strict=True)]))
-    has_times = any(quantity.is_time for quantity in plan.quantities)
+    for row in plan.published:
+        cells = [TableCell(v, len(of.sequences)) for v, of in zip(row.values, columns, strict=True)]
+        rows.append(TableRow(row.method, cells, row.source))
+    has_times = any(quantity.is_time for quantity in chosen)
     note = " ".join(filter(None, [plan.note, times_note(results.values()) if has_times else ""]))
-    return Table(plan.title, columns, [*rows, *plan.published], note)
+    return Table(plan.title, columns, rows, note)
 
 
 def _mean(results: Sequence[MethodResult | None], quantity: Quantity) -> TableCell:

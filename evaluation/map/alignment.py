@@ -84,10 +84,6 @@ def align_map(
     guess, which is taken whatever its fitness.
 
     Guesses are `T_reference_map` (4, 4) by name; with `refine`, ICP follows.
-
-    Raises:
-        InputError: no trustworthy pose was found.
-        ValueError: without a search, the number of guesses is not one.
     """
     if not search and len(guesses) != 1:
         raise ValueError(f"expected one guess, or a search, got {len(guesses)} guesses")

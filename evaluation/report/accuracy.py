@@ -19,8 +19,8 @@ from lidarslam.evaluation.report.figure import (
     plot_text,
     thin_curve,
 )
+from lidarslam.evaluation.report.tables import DriftSeries, drift_series
 from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
 _NOMINAL_WIDTH, _LOWEST, _TALLEST, _SIDE_HEIGHT = 500.0, 240.0, 480.0, 210
@@ -43,7 +43,6 @@ _BEYOND = 1.5
 _MAP_CELLS = 60_000
 
 Measured = Sequence[tuple[MethodResult, TrajectoryMetrics]]
-Parts = Sequence[tuple[str, Mapping[int, Drift | None]]]
 
 
 def trajectory_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
@@ -173,37 +172,45 @@ def _trajectory_caption(
 def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """Position and orientation error over the distance travelled; None without a reference."""
     measured = measured_methods(sequence)
-    if not measured:
-        return None
     errors = [metrics.absolute_errors() for _, metrics in measured]
     curves = {
         "Position error [m]": [metres for metres, _ in errors],
         "Orientation error [°]": [np.rad2deg(rad) for _, rad in errors],
     }
-    panels = [_error_panel(title, measured, of, styles, signed=False) for title, of in curves.items()]
     caption = (
         f"Absolute trajectory error, {aligned_how(measured)}: distance between the estimated and the reference position"
         f" and angle between the orientations, over the distance travelled along the reference"
         f" ({sequence.reference_name}). Crosses mark scans on which tracking was lost."
-        f"{_leaving(measured, curves, signed=False)}"
     )
-    return Figure("Absolute errors", caption, panels, [method.name for method, _ in measured])
+    return _over_distance("Absolute errors", caption, measured, curves, styles, signed=False)
 
 
 def deviation_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """Components of the error along and about the axes of the reference's LiDAR; None without a reference."""
     measured = measured_methods(sequence)
-    if not measured:
-        return None
     found = [np.hstack(metrics.deviations()) for _, metrics in measured]
     curves = {title: [components[:, axis] for components in found] for axis, title in enumerate(_COMPONENTS)}
-    panels = [_error_panel(title, measured, of, styles, signed=True) for title, of in curves.items()]
     caption = (
         "Pose of the estimate in the frame of the reference's LiDAR (x forward, y left, z up),"
         f" {aligned_how(measured)}, over the distance travelled along the reference."
-        f"{_leaving(measured, curves, signed=True)}"
     )
-    return Figure("Error components", caption, panels, [method.name for method, _ in measured], columns=3)
+    return _over_distance("Error components", caption, measured, curves, styles, signed=True)
+
+
+def _over_distance(
+    title: str,
+    caption: str,
+    measured: Measured,
+    curves: Mapping[str, Sequence[FloatArray]],
+    styles: Styles,
+    signed: bool,
+) -> Figure | None:
+    """A panel for each title, with a curve for each method."""
+    if not measured:
+        return None
+    panels = [_error_panel(title, measured, of, styles, signed) for title, of in curves.items()]
+    names = [method.name for method, _ in measured]
+    return Figure(title, caption + _leaving(measured, curves, signed), panels, names, columns=3 if signed else 2)
 
 
 def measured_methods(sequence: SequenceComparison) -> list[tuple[MethodResult, TrajectoryMetrics]]:
@@ -276,61 +283,44 @@ def _leaving(measured: Measured, panels: Mapping[str, Sequence[FloatArray]], sig
 
 def length_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """Drift by segment length, KITTI's and the short one; None when no trajectory is long enough for either."""
-    measured = measured_methods(sequence)
-    kitti = [(m.name, metrics.kitti.by_length) for m, metrics in measured if metrics.kitti is not None]
-    short = [(method.name, metrics.segments) for method, metrics in measured]
-    length = "segment length [m]"
-    panels = _drift_panels(kitti, KITTI_LENGTHS_M, length, 100, styles, ", 100 to 800 m")
-    panels += _drift_panels(short, SHORT_LENGTHS_M, length, 10, styles, ", 5 to 100 m")
-    if not panels:
-        return None
+    short, kitti, _ = drift_series(sequence)
     caption = (
         "Mean translation error in percent of the segment length and mean rotation error per 100 m (segments of 100 to"
         " 800 m, as the KITTI development kit computes it) or per 10 m (segments of 5 to 100 m)."
     )
-    return Figure("Drift by segment length", caption, panels, [method.name for method, _ in measured])
+    return _drift_figure("Drift by segment length", caption, [kitti, short], "segment length [m]", short, styles)
 
 
 def speed_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """KITTI's drift by the speed over the segment; None when no segment of 100 m exists."""
-    kitti = [(m.name, metrics.kitti.by_speed) for m, metrics in measured_methods(sequence) if metrics.kitti is not None]
-    speeds = sorted({mps for _, by_speed in kitti for mps, drift in by_speed.items() if drift is not None})
-    panels = _drift_panels(kitti, speeds, "speed over the segment [m/s]", 100, styles, "")
-    if not panels:
-        return None
+    *_, by_speed = drift_series(sequence)
     caption = "Mean errors over all segments of 100 to 800 m that were driven within 2 m/s of the speed."
-    return Figure("Drift by speed", caption, panels, [name for name, _ in kitti])
+    return _drift_figure("Drift by speed", caption, [by_speed], "speed over the segment [m/s]", by_speed, styles)
 
 
-def _drift_panels(
-    parts: Parts, places: Sequence[int], x_label: str, per_m: int, styles: Styles, over: str
-) -> list[Panel]:
-    """Translation and rotation over the lengths or speeds at which any method has a drift."""
-    reached = [place for place in places if any(by_place.get(place) for _, by_place in parts)]
-    if not reached:
-        return []
-    translation, rotation = {}, {}
-    for name, by_place in parts:
-        drifts = [by_place.get(place) for place in reached]
-        translation[name] = np.array([drift.translation_percent if drift else np.nan for drift in drifts])
-        rotation[name] = np.array([drift.rotation_deg_per_m * per_m if drift else np.nan for drift in drifts])
+def _drift_figure(
+    title: str, caption: str, parts: Sequence[DriftSeries], x_label: str, named: DriftSeries, styles: Styles
+) -> Figure | None:
+    """Translation and rotation of each part; the legend has the methods of `named`."""
     layout = {
         "xaxis": {"title": {"text": x_label}, "type": "category"},
         "yaxis": {"rangemode": "tozero"},
         "hovermode": "x unified",
     }
     panels = []
-    titles = (f"Translation drift{over} [%]", f"Rotation drift{over} [° per {per_m} m]")
-    for title, curves in zip(titles, (translation, rotation), strict=True):
-        traces = [
-            line_trace(
-                name, styles[name], [*map(str, reached)], curve,
-                mode="lines+markers", marker=styles[name].marker, hovertemplate="%{y:.3f}",
-            )
-            for name, curve in curves.items()
-        ]  # fmt: skip
-        panels.append(Panel(title, traces, layout, 250, needs_log(list(curves.values()))))
-    return panels
+    for part in parts:
+        titles = (f"Translation drift{part.over} [%]", f"Rotation drift{part.over} [° per {part.per_m} m]")
+        for number, panel_title in enumerate(titles if part.places else ()):
+            curves = {name: np.array(part.of(name)[number], dtype=np.float64) for name in part.by_method}
+            traces = [
+                line_trace(
+                    name, styles[name], [*map(str, part.places)], curve,
+                    mode="lines+markers", marker=styles[name].marker, hovertemplate="%{y:.3f}",
+                )
+                for name, curve in curves.items()
+            ]  # fmt: skip
+            panels.append(Panel(panel_title, traces, layout, 250, needs_log(list(curves.values()))))
+    return Figure(title, caption, panels, list(named.by_method)) if panels else None
 
 
 def map_figure(sequence: SequenceComparison) -> Figure | None:

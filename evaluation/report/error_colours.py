@@ -1,5 +1,7 @@
 """Colours of distances, distinguishable under every colour blindness."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,12 +12,9 @@ DISTANCE_FIELD = "distance_m"
 """Of the points of a file, their distances to the reference map."""
 
 # Viridis at nine even stops (van der Walt, Smith, 2015): even in lightness, from dark for none to bright for far.
-_VIRIDIS = np.array(
-    [
-        [68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142],
-        [31, 158, 137], [53, 183, 121], [109, 205, 89], [253, 231, 37],
-    ],
-    dtype=np.float64,
+_VIRIDIS = (
+    (68, 1, 84), (72, 40, 120), (62, 74, 137), (49, 104, 142), (38, 130, 142), (31, 158, 137), (53, 183, 121),
+    (109, 205, 89), (253, 231, 37),
 )  # fmt: skip
 
 
@@ -27,5 +26,11 @@ def error_colours(distances_m: FloatArray, clip_m: float = DEFAULT_CLIP_M) -> ND
 
 def viridis(level: FloatArray) -> NDArray[np.uint8]:
     """Colours (N, 3) of levels (N,): dark violet at 0, over blue and green to yellow at 1."""
-    stops = np.linspace(0.0, 1.0, len(_VIRIDIS))
-    return np.stack([np.interp(level, stops, column) for column in _VIRIDIS.T], axis=1).round().astype(np.uint8)
+    return ramp(level, _VIRIDIS)
+
+
+def ramp(level: FloatArray, stops: Sequence[tuple[int, int, int]]) -> NDArray[np.uint8]:
+    """Colours (N, 3) of levels (N,) from 0 to 1, between colours at even distances."""
+    places = np.linspace(0.0, 1.0, len(stops))
+    channels = [np.interp(level, places, stop) for stop in zip(*stops, strict=True)]
+    return np.stack(channels, axis=1).round().astype(np.uint8)

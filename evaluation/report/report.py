@@ -2,8 +2,8 @@
 
 import re
 from base64 import b64encode
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from hashlib import sha256
 from importlib.resources import files
 from itertools import groupby
@@ -24,7 +24,7 @@ from lidarslam.evaluation.report.accuracy import (
 )
 from lidarslam.evaluation.report.execution import resources_figure, scan_figure, tracking_figure
 from lidarslam.evaluation.report.figure import Figure, Styles, method_styles
-from lidarslam.evaluation.report.tables import published_table, sequence_tables
+from lidarslam.evaluation.report.tables import sequence_tables
 
 _TEMPLATES = "templates"
 _MARKDOWN_SPECIAL = re.compile(r"([\\`*_\[\]|~#$])")
@@ -49,7 +49,6 @@ def render_html(comparison: Comparison) -> str:
         styles,
         [block for section in sections for block in section.blocks],
         comparison=comparison,
-        overview=_overview(comparison),
         sections=sections,
         settings=_settings(comparison),
     )
@@ -84,13 +83,7 @@ def render_markdown(comparison: Comparison) -> str:
         for sequence in comparison.sequences
     ]
     template = _environment().get_template("report.md.j2")
-    return template.render(comparison=comparison, overview=_overview(comparison), sections=sections)
-
-
-def _overview(comparison: Comparison) -> list[Table]:
-    """The tables over all recordings."""
-    published = published_table(comparison)
-    return [*comparison.tables, *([] if published is None else [published])]
+    return template.render(comparison=comparison, sections=sections)
 
 
 def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table | Figure]:
@@ -166,23 +159,8 @@ def _file(name: str) -> str:
     return (files("lidarslam.evaluation.report") / _TEMPLATES / name).read_text(encoding="utf-8")
 
 
-@dataclass(frozen=True, eq=False)
-class RunPage:
-    """The content of the page of a run."""
-
-    title: str
-    about: Sequence[str]  # lines below the title
-    sequence: SequenceComparison  # the recording with one method, the run
-    picture: str | None  # of map and trajectory, a PNG file in base64
-    caption: str = ""  # of the picture
-    warnings: Sequence[str] = ()
-    summary: Mapping[str, str] = field(default_factory=dict)  # quantity -> text
-    changed: Mapping[str, str] = field(default_factory=dict)  # settings that differ from the defaults
-    settings: str = ""  # all of them as YAML
-
-
-def render_run(page: RunPage) -> str:
-    """The page, which fetches nothing and runs no script but its own; see `render_page`."""
-    styles = method_styles(method.name for method in page.sequence.methods)
-    blocks = list(sequence_blocks(page.sequence, styles))
-    return render_page("run.html.j2", page.title, styles, blocks, page=page, content_blocks=blocks)
+def render_run(title: str, sequence: SequenceComparison, **content: object) -> str:
+    """The page of a run, of a recording with one method; see `render_page`."""
+    styles = method_styles(method.name for method in sequence.methods)
+    blocks = list(sequence_blocks(sequence, styles))
+    return render_page("run.html.j2", title, styles, blocks, blocks_shown=blocks, **content)

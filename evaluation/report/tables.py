@@ -1,15 +1,11 @@
 """The tables of a report."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 
-from lidarslam.evaluation.comparison.comparison import (
-    WHOLE,
-    Comparison,
-    MethodResult,
-    SequenceComparison,
-    lost_intervals,
-)
-from lidarslam.evaluation.comparison.quantities import QUANTITIES, Quantity, times_note
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison, lost_intervals
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
@@ -34,24 +30,49 @@ _TIME_NOTE = (
 _SYMBOLS = {"ok": "✓", "lost": "△", "stopped": "◐"}
 _MOST_INTERVALS = 40
 
-_Drifts = Mapping[str, Mapping[int, Drift | None]]
+
+@dataclass(frozen=True)
+class DriftSeries:
+    """Drift of the measured methods over segment lengths, or over speeds, as far as any of them has one."""
+
+    title: str  # of the table
+    over: str  # the lengths, behind the title of a plot
+    unit: str  # of the places
+    per_m: int  # length that the rotation is given over
+    places: Sequence[int]  # lengths or speeds
+    by_method: Mapping[str, Mapping[int, Drift | None]]
+
+    def of(self, name: str) -> tuple[list[float | None], list[float | None]]:
+        """Translation in percent and rotation in degrees of a method at all places."""
+        found = [self.by_method.get(name, {}).get(place) for place in self.places]
+        rotations = [None if drift is None else drift.rotation_deg_per_m * self.per_m for drift in found]
+        return [None if drift is None else drift.translation_percent for drift in found], rotations
+
+
+def drift_series(sequence: SequenceComparison) -> list[DriftSeries]:
+    """Over short segments, over KITTI's, and of these by speed; a series without any drift has no place."""
+    measured = {method.name: method.metrics for method in sequence.methods if method.metrics is not None}
+    kitti = {name: metrics.kitti for name, metrics in measured.items() if metrics.kitti is not None}
+    short = {name: metrics.segments for name, metrics in measured.items()}
+    lengths = {name: drift.by_length for name, drift in kitti.items()}
+    speeds = {name: drift.by_speed for name, drift in kitti.items()}
+    title = "drift over segments of"
+    series = [
+        DriftSeries(f"{title} 5 to 100 m", ", 5 to 100 m", "m", 10, SHORT_LENGTHS_M, short),
+        DriftSeries(f"{title} 100 to 800 m (KITTI)", ", 100 to 800 m", "m", 100, KITTI_LENGTHS_M, lengths),
+        DriftSeries(f"{title} 100 to 800 m by speed", "", "m/s", 100, sorted({*chain(*speeds.values())}), speeds),
+    ]
+    return [
+        replace(one, places=[place for place in one.places if any(of.get(place) for of in one.by_method.values())])
+        for one in series
+    ]
 
 
 def sequence_tables(sequence: SequenceComparison) -> dict[str, list[Table]]:
     """The tables of one recording by subject; a table without any value is left out."""
-    measured = [(method.name, method.metrics) for method in sequence.methods if method.metrics is not None]
-    short = {name: metrics.segments for name, metrics in measured}
-    kitti = {name: metrics.kitti for name, metrics in measured if metrics.kitti is not None}
-    lengths = {name: drift.by_length for name, drift in kitti.items()}
-    speeds = {name: drift.by_speed for name, drift in kitti.items()}
-    reached = sorted({mps for by_speed in speeds.values() for mps, drift in by_speed.items() if drift is not None})
     tables = {
         "summary": [_summary_table(sequence)],
-        "drift": [
-            _drift_table(sequence, "drift over segments of 5 to 100 m", short, SHORT_LENGTHS_M, "m", 10),
-            _drift_table(sequence, "drift over segments of 100 to 800 m (KITTI)", lengths, KITTI_LENGTHS_M, "m", 100),
-            _drift_table(sequence, "drift over segments of 100 to 800 m by speed", speeds, reached, "m/s", 100),
-        ],
+        "drift": [_drift_table(sequence, series) for series in drift_series(sequence)],
         "map": [_map_table(sequence)],
         "time": [_time_table(sequence)],
         "tracking": [_lost_table(sequence)],
@@ -59,26 +80,9 @@ def sequence_tables(sequence: SequenceComparison) -> dict[str, list[Table]]:
     return {subject: [table for table in of if table.columns and table.rows] for subject, of in tables.items()}
 
 
-def published_table(comparison: Comparison) -> Table | None:
-    """Published figures that are in no other table; None when there are none."""
-    headings = list(dict.fromkeys(heading for row in comparison.published for heading in row.values))
-    rows = [
-        TableRow(row.method, [TableCell(_as_published(row.values.get(heading))) for heading in headings], row.source)
-        for row in comparison.published
-    ]
-    columns = [TableColumn("", heading, digits=2) for heading in headings]
-    note = "Quoted from their sources; none of these methods was run here."
-    return Table("Published figures", columns, rows, note) if rows else None
-
-
-def _as_published(value: float | str | None) -> float | str | None:
-    """A quoted figure keeps all its decimals."""
-    return f"{value:g}" if isinstance(value, float | int) and round(value, 2) != value else value
-
-
 def _summary_table(sequence: SequenceComparison) -> Table:
     quantities = [QUANTITIES[name] for name in _SUMMARY]
-    columns = [TableColumn("", "Status", numeric=False), *map(_column, quantities)]
+    columns = [TableColumn("", "Status", numeric=False), *(quantity.column() for quantity in quantities)]
     rows = [
         TableRow(m.name, [TableCell(_status(m), note=m.message), *(q.cell(m) for q in quantities)])
         for m in sequence.methods
@@ -91,31 +95,27 @@ def _summary_table(sequence: SequenceComparison) -> Table:
     ).without_empty()
 
 
-def _drift_table(
-    sequence: SequenceComparison, title: str, drifts: _Drifts, places: Sequence[int], unit: str, per_m: int
-) -> Table:
+def _drift_table(sequence: SequenceComparison, series: DriftSeries) -> Table:
     """Two decimals over KITTI's lengths, three over short ones, as papers print them."""
-    reached = [place for place in places if any(by_place.get(place) for by_place in drifts.values())]
-    digits = 2 if per_m == 100 else 3
+    digits = 2 if series.per_m == 100 else 3
     columns = [
-        TableColumn(heading, f"{place} {unit}", digits=digits, lower_is_better=True)
-        for heading in ("translation [%]", f"rotation [deg/{per_m} m]")
-        for place in reached
+        TableColumn(heading, f"{place} {series.unit}", digits=digits, lower_is_better=True)
+        for heading in ("translation [%]", f"rotation [deg/{series.per_m} m]")
+        for place in series.places
     ]
-    rows = []
-    for method in sequence.methods:
-        found = [drifts.get(method.name, {}).get(place) for place in reached]
-        values = [None if drift is None else drift.translation_percent for drift in found]
-        values += [None if drift is None else drift.rotation_deg_per_m * per_m for drift in found]
-        rows.append(TableRow(method.name, [TableCell(value, ranked=method.status in WHOLE) for value in values]))
-    return Table(f"{sequence.sequence}: {title}", columns, rows, folded=unit == "m/s")
+    rows = [
+        TableRow(m.name, [TableCell(value, ranked=m.status in WHOLE) for value in chain(*series.of(m.name))])
+        for m in sequence.methods
+    ]
+    return Table(f"{sequence.sequence}: {series.title}", columns, rows, folded=series.unit == "m/s")
 
 
 def _map_table(sequence: SequenceComparison) -> Table:
     if all(method.map_metrics is None for method in sequence.methods):
         return Table("", [], [])
     quantities = [q for name, q in QUANTITIES.items() if name.startswith("map_") and name != "map_entropy"]
-    columns = [_column(quantity, prefix="map ") for quantity in quantities]
+    # The title says "map" already.
+    columns = [replace(q.column(), label=q.label.removeprefix("map ")) for q in quantities]
     rows = [TableRow(m.name, [quantity.cell(m) for quantity in quantities]) for m in sequence.methods]
     note = (
         "Accuracy: mean distance of the map from the reference map; completeness: of the reference map from the map;"
@@ -129,25 +129,21 @@ def _time_table(sequence: SequenceComparison) -> Table:
     """A stage that did not run has no time; stages are not ranked, as methods divide their work differently."""
     stages = dict.fromkeys(stage for method in sequence.methods for stage, ms in method.stage_ms.items() if ms > 0.0)
     quantities = [QUANTITIES[name] for name in _TIME]
-    columns = [*map(_column, quantities), *(TableColumn("median of a stage", stage, "ms", 1) for stage in stages)]
-    rows = [
-        TableRow(
-            m.name,
-            [*(q.cell(m) for q in quantities), *(TableCell(m.stage_ms.get(stage) or None) for stage in stages)],
-        )
-        for m in sequence.methods
-    ]
+    columns = [q.column() for q in quantities]
+    columns += [TableColumn("median of a stage", stage, "ms", 1) for stage in stages]
+    rows = []
+    for m in sequence.methods:
+        cells = [TableCell(m.stage_ms.get(stage) or None) for stage in stages]
+        rows.append(TableRow(m.name, [*(q.cell(m) for q in quantities), *cells]))
     note = " ".join(filter(None, [_TIME_NOTE, times_note(sequence.methods)]))
     return Table(f"{sequence.sequence}: time and memory", columns, rows, note).without_empty()
 
 
 def _lost_table(sequence: SequenceComparison) -> Table:
     """Intervals of lost tracking and the reasons of failures."""
-    heads = (("Status", "", False), ("Lost scans", "", True), ("First", "scan", True), ("Last", "scan", True))
-    times = (("From", "s", True), ("To", "s", True), ("Reason", "", False))
-    columns = [
-        TableColumn("", label, unit, int(unit == "s"), numeric=numeric) for label, unit, numeric in (*heads, *times)
-    ]
+    numbers = {"Lost scans": "", "First": "scan", "Last": "scan", "From": "s", "To": "s"}
+    columns = [TableColumn("", label, unit, int(unit == "s")) for label, unit in numbers.items()]
+    status, reason = (TableColumn("", label, numeric=False) for label in ("Status", "Reason"))
     rows = []
     for method in sequence.methods:
         intervals = lost_intervals(method)
@@ -162,13 +158,7 @@ def _lost_table(sequence: SequenceComparison) -> Table:
     note = (
         "Scans are numbered from 0; times since the method's first scan. Losses less than 1 s apart are one interval."
     )
-    return Table(f"{sequence.sequence}: tracking lost", columns, rows, note, folded=True)
-
-
-def _column(quantity: Quantity, prefix: str = "") -> TableColumn:
-    """A prefix of the label that the table's title has already is dropped."""
-    label = quantity.label.removeprefix(prefix)
-    return TableColumn("", label, quantity.unit, quantity.digits, quantity.lower_is_better)
+    return Table(f"{sequence.sequence}: tracking lost", [status, *columns, reason], rows, note, folded=True)
 
 
 def _status(method: MethodResult) -> str:

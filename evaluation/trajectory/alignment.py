@@ -27,9 +27,6 @@ def align(estimate: Trajectory, reference: Trajectory, method: AlignmentMethod =
 
     Both trajectories hold the same instants. `se3` minimises the squared distances of all positions, `first_pose`
     lets the first poses coincide, `none` is the identity for trajectories that share a world already.
-
-    Raises:
-        ValueError: the trajectories are empty, differ in length, or the method is unknown.
     """
     if len(estimate) != len(reference) or not len(estimate):
         raise ValueError(f"alignment needs poses of the same instants, got {len(estimate)} and {len(reference)}")

@@ -1,5 +1,6 @@
 """Association of an estimate with a reference in time."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,9 +49,6 @@ def associate(
     The reference is interpolated at constant body velocity. A stamp is matched when the reference poses around it are
     at most `max_gap_s` apart, or when one of them is at most `tolerance_s` away; so a stamp is extrapolated by
     `tolerance_s` at most. At equal stamps the reference pose is taken as it is, to the last bit.
-
-    Raises:
-        InputError: fewer than three poses are matched.
     """
     matched = _is_matched(estimate.stamps, reference.stamps, tolerance_s, max_gap_s)
     rows = np.flatnonzero(matched)
@@ -59,6 +57,13 @@ def associate(
     stamps = estimate.stamps[rows]
     at_stamps = Trajectory(stamps, _reference_at(reference, stamps))
     return Association(estimate.select(rows), at_stamps, rows, len(estimate), len(reference))
+
+
+def common_instants(estimate: Trajectory, reference: Trajectory) -> Association | None:
+    """As `associate`; None where they have too few instants in common, as trajectories of different recordings."""
+    with suppress(InputError):
+        return associate(estimate, reference)
+    return None
 
 
 def _is_matched(stamps: FloatArray, reference: FloatArray, tolerance_s: float, max_gap_s: float) -> NDArray[np.bool_]:

@@ -97,9 +97,6 @@ def evaluate_trajectory(
 
     The two are matched in time by `associate`, which explains `tolerance_s` and `max_gap_s`. The `alignment`, which
     `align` explains, concerns the absolute errors only.
-
-    Raises:
-        InputError: fewer than three poses are of the same instant.
     """
     association = associate(estimate, reference, tolerance_s, max_gap_s)
     pair = association.estimate, association.reference

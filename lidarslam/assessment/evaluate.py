@@ -4,7 +4,7 @@ import io
 import json
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,13 @@ from lidarslam.assessment.inputs import (
     pair,
     read_estimate,
     read_reference,
-    recording_truth,
 )
 from lidarslam.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import cannot_write, replacing
+from lidarslam.core.files import make_directory, written
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
 from lidarslam.evaluation.map.metrics import MapComparison
 from lidarslam.evaluation.report.error_colours import DEFAULT_CLIP_M, DISTANCE_FIELD, error_colours
@@ -47,7 +47,6 @@ _FIELDS = [
     *((colour, "|u1") for colour in ("red", "green", "blue")),
     (DISTANCE_FIELD, "<f4"),
 ]
-APE, RPE = "ape.zip", "rpe.zip"
 
 
 @dataclass(frozen=True)
@@ -96,20 +95,14 @@ class Evaluation:
 
 
 def evaluate(request: EvaluateRequest) -> Evaluation:
-    """Compare, and write the figures.
-
-    Raises:
-        InputError: a file is missing or damaged, or there is no reference.
-        OutputError: a file cannot be written.
-    """
+    """Compare, and write the figures; InputError where there is no reference."""
     check_error_files(request.errors)
     estimate = read_estimate(request.run, request.map_file)
     notes: list[str] = []
     reference, metrics, trajectory = _reference(request, estimate, notes), None, None
     if reference is not None:
-        trajectories = pair(estimate, reference)
-        trajectory = trajectories[0]
-        metrics = evaluate_trajectory(*trajectories, request.tolerance_s, request.max_gap_s, request.alignment)
+        trajectory, true = pair(estimate, reference)
+        metrics = evaluate_trajectory(trajectory, true, request.tolerance_s, request.max_gap_s, request.alignment)
         notes += [warning] if (warning := disagreement(metrics)) is not None else []
     # Poses of KITTI's camera do not give the LiDAR's world.
     in_camera = estimate.run is not None and reference is not None and reference.stamps is None
@@ -123,37 +116,28 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     elif estimate.map_file is not None:
         entropy = map_entropy(estimate.map_points())
     out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
-    written = [*([] if out is None else [out]), *request.errors]
+    saved = [*([] if out is None else [out]), *request.errors]
     if request.evo is not None:
         if metrics is None:
             raise InputError("--evo saves the errors of a trajectory, and there is no reference for it")
         name = "estimate" if isinstance(request.run, Trajectory) else request.run.resolve().stem
-        written += write_evo_files(request.evo, name, metrics)
+        saved += write_evo_files(request.evo, name, metrics)
     label = None if reference is None else reference.label
-    evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
+    evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, saved)
     if out is not None:
         RunDirectory(out.parent).write_json(out.name, evaluation.to_json())
     if compared is not None:
         for path in request.errors:
             write_errors(path, compared.comparison, compared.positions, request.errors_clip_m)
     if request.report and estimate.run is not None and request.out is None:
-        _draw_report(request, estimate.run, evaluation, trajectory if in_camera else None)
+        from lidarslam.viewer.run_report import leave_report  # loads the pictures
+
+        errors = MethodResult(str(estimate.run), "ok", trajectory=trajectory if in_camera else None, metrics=metrics)
+        if compared is not None:
+            errors = replace(errors, map_metrics=compared.json, map_errors=compared.errors)
+        named = request.reference.name if isinstance(request.reference, Path) else GROUND_TRUTH
+        leave_report(estimate.run, errors, named, notes)
     return evaluation
-
-
-def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:
-    """The page of the run with its errors; `compared` are the poses in the camera's frame, if they were compared."""
-    from lidarslam.viewer.run_report import Accuracy, leave_report
-
-    accuracy = Accuracy(
-        evaluation.metrics,
-        request.reference.name if isinstance(request.reference, Path) else "ground truth",
-        compared,
-        None if evaluation.map is None else evaluation.map.json,
-        None if evaluation.map is None else evaluation.map.errors,
-        tuple(evaluation.notes),
-    )
-    leave_report(run, accuracy)
 
 
 def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -> Poses | None:
@@ -163,21 +147,12 @@ def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -
     if not request.needs_reference:
         return None
     try:
-        return _own_truth(estimate)
+        return estimate.truth()
     except InputError as error:
         if request.reference_map is None:
             raise
         notes.append(f"the trajectory is not evaluated: {error}")
         return None
-
-
-def _own_truth(estimate: Estimate) -> Poses:
-    source, advice = estimate.source, "name a trajectory with --reference or a map with --reference-map"
-    if source is None:
-        raise InputError(f"{estimate.poses.label}: has no reference; {advice}")
-    if not source.exists():
-        raise InputError(f"{source}: the run's recording is not there any more; {advice}")
-    return recording_truth(source, estimate.config.reader)
 
 
 def _evaluate_map(
@@ -198,11 +173,7 @@ def _evaluate_map(
 
 
 def check_error_files(paths: Sequence[Path]) -> None:
-    """Refuse files that cannot be written later.
-
-    Raises:
-        OutputError: a file's name ends in neither .ply nor .rrd, or its folder does not exist.
-    """
+    """Refuse files that cannot be written later."""
     for path in paths:
         if path.suffix.lower() not in _SUFFIXES:
             raise OutputError(f"{path}: the errors can be written as {' or '.join(_SUFFIXES)}; name such a file")
@@ -215,50 +186,40 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, c
 
     A .ply file holds the points in double precision, with colours and distances. A .rrd file, for Rerun, also holds
     the reference coloured by its distance from the map, and the sensor's path (K, 3).
-
-    Raises:
-        OutputError: it cannot be written.
     """
-    with replacing(path) as partial:
-        if path.suffix.lower() == ".rrd":
-            from lidarslam.viewer.rerun_errors import save_errors
+    if path.suffix.lower() == ".rrd":
+        from lidarslam.viewer.rerun_errors import show_errors
+        from lidarslam.viewer.rerun_output import save
 
-            save_errors(partial, comparison, positions, clip_m)
-            return
-        errors = comparison.map_errors
-        vertices = np.empty(len(errors.points), _FIELDS)
-        columns = [*errors.points.T, *error_colours(errors.distances_m, clip_m).T, errors.distances_m]
-        for (name, _), column in zip(_FIELDS, columns, strict=True):
-            vertices[name] = column
-        try:
-            write_ply(partial, vertices)
-        except OSError as error:
-            raise cannot_write(path, error) from error
+        save(show_errors(comparison, positions, clip_m), path)
+        return
+    errors = comparison.map_errors
+    columns = [*errors.points.T, *error_colours(errors.distances_m, clip_m).T, errors.distances_m]
+    vertices = np.empty(len(errors.points), _FIELDS)
+    for (name, _), column in zip(_FIELDS, columns, strict=True):
+        vertices[name] = column
+    with written(path) as partial:
+        write_ply(partial, vertices)
 
 
 def write_evo_files(folder: Path, name: str, metrics: TrajectoryMetrics) -> list[Path]:
     """Write NAME_ape.zip, the positions' errors after alignment, and NAME_rpe.zip, those from scan to scan.
 
-    Both hold `info.json`, `stats.json` and the arrays of a result of evo's.
-
-    Raises:
-        OutputError: they cannot be written.
+    Both hold `info.json`, `stats.json` and the arrays of a result of evo's. The files; none without an error.
     """
     association = metrics.association
-    rows = np.arange(len(association.estimate))
-    ends = rows[1:][np.diff(association.rows) == 1]
-    absolute, _ = absolute_errors(association, metrics.T_reference_estimate)
-    relative, _ = relative_errors(association)
+    estimate, reference, rows = association.estimate, association.reference, np.arange(len(association))
     aligned = {"se3": "with SE(3) Umeyama alignment", "first_pose": "with origin alignment", "none": "not aligned"}
-    titles = (
-        f"APE w.r.t. translation part (m)\n({aligned[metrics.alignment]})",
-        "RPE w.r.t. translation part (m)\nfor delta = 1 (frames) using consecutive pairs\n(not aligned)",
-    )
-    paths = [folder / f"{name}_{ending}" for ending in (APE, RPE)]
-    parts = zip(paths, titles, ("APE (m)", "RPE (m)"), (absolute, relative), (rows, ends), strict=True)
-    for path, title, label, errors, chosen in parts:
-        info = {"title": title, "ref_name": "reference", "est_name": name, "label": label}
-        estimate, reference = association.estimate, association.reference
+    ape = f"APE w.r.t. translation part (m)\n({aligned[metrics.alignment]})"
+    rpe = "RPE w.r.t. translation part (m)\nfor delta = 1 (frames) using consecutive pairs\n(not aligned)"
+    results = {
+        "ape": (ape, absolute_errors(association, metrics.T_reference_estimate)[0], rows),
+        "rpe": (rpe, relative_errors(association)[0], rows[1:][np.diff(association.rows) == 1]),
+    }
+    make_directory(folder)
+    paths = []
+    for kind, (title, errors, chosen) in results.items():
+        info = {"title": title, "ref_name": "reference", "est_name": name, "label": f"{kind.upper()} (m)"}
         arrays = {
             "error_array": errors,
             "seconds_from_start": estimate.stamps[chosen] - estimate.stamps[0],
@@ -266,23 +227,17 @@ def write_evo_files(folder: Path, name: str, metrics: TrajectoryMetrics) -> list
             "distances_from_start": reference.distances[chosen],
             "distances": estimate.distances[chosen],
         }
-        if len(errors):
-            _write_arrays(path, info, arrays)
-    return [path for path, errors in zip(paths, (absolute, relative), strict=True) if len(errors)]
-
-
-def _write_arrays(path: Path, info: dict[str, str], arrays: dict[str, FloatArray]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+        if not len(errors):
+            continue
+        paths.append(folder / f"{name}_{kind}.zip")
+        with written(paths[-1]) as partial, zipfile.ZipFile(partial, "w") as archive:
             archive.writestr("info.json", json.dumps(info))
-            archive.writestr("stats.json", json.dumps(_statistics(arrays["error_array"])))
-            for name, values in arrays.items():
+            archive.writestr("stats.json", json.dumps(_statistics(errors)))
+            for array, values in arrays.items():
                 content = io.BytesIO()
                 np.save(content, values, allow_pickle=False)
-                archive.writestr(f"{name}.npy", content.getvalue())
-    except OSError as error:
-        raise cannot_write(path, error) from error
+                archive.writestr(f"{array}.npy", content.getvalue())
+    return paths
 
 
 def _statistics(errors: FloatArray) -> dict[str, float]:

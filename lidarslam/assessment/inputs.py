@@ -1,6 +1,7 @@
 """Estimates and references, read from runs, recordings, trajectory files and maps."""
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from lidarslam.storage.unfinished import require_whole
 # KITTI's LiDAR turns ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1
 _KITTI_COLUMNS = 12
+_ADVICE = "name a trajectory with --reference or a map with --reference-map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,11 @@ class Poses:
     stamps: FloatArray | None  # (N,), None in KITTI's text format
     T_world_lidar: FloatArray  # (N, 4, 4); of KITTI's camera where the file is in that frame
     T_cam_lidar: FloatArray | None = None  # of a KITTI recording, whose pose files are in the camera's frame
+
+    @classmethod
+    def of(cls, label: str, trajectory: Trajectory, T_cam_lidar: FloatArray | None = None) -> "Poses":
+        """Those of a trajectory."""
+        return cls(label, trajectory.stamps, trajectory.T_world_lidar, T_cam_lidar)
 
     def in_camera(self) -> "Poses":
         """The same in the frame of KITTI's camera, if there is one."""
@@ -45,41 +52,40 @@ class Estimate:
     """A trajectory and its map."""
 
     poses: Poses  # the trajectory
-    run: Path | None  # the run directory, None of a bare trajectory
-    map_file: Path | None  # its map, None when there is none
-    source: Path | None  # the recording of the run, None of a bare trajectory
-    config: Config  # of the run; the defaults of a bare trajectory
+    run: Path | None = None  # the run directory, None of a bare trajectory
+    map_file: Path | None = None  # its map, None when there is none
+    source: Path | None = None  # the recording of the run, None of a bare trajectory
+    config: Config = field(default_factory=Config)  # of the run; the defaults of a bare trajectory
 
     def map_points(self) -> FloatArray:
-        """The map's points (N, 3).
-
-        Raises:
-            InputError: there is no map, or it cannot be read.
-        """
+        """The map's points (N, 3)."""
         if self.map_file is None:
             advice = "name it with --map FILE" if self.run is None else "tracking was lost on every scan"
             raise InputError(f"{self.poses.label}: has no map to compare; {advice}")
         return read_cloud(self.map_file)
 
+    def truth(self) -> Poses:
+        """The ground truth that came with the recording of the run; InputError where it is not available."""
+        if self.source is None:
+            raise InputError(f"{self.poses.label}: has no reference; {_ADVICE}")
+        if not self.source.exists():
+            raise InputError(f"{self.source}: the run's recording is not there any more; {_ADVICE}")
+        return _recording_truth(self.source, self.config.reader)
+
 
 def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Estimate:
-    """A run directory, or a trajectory, in memory or in TUM or KITTI text, with a map given separately.
-
-    Raises:
-        InputError: it is none of these, or damaged.
-    """
+    """A run directory, or a trajectory, in memory or in TUM or KITTI text, with a map given separately."""
     if isinstance(path, Trajectory):
-        return Estimate(_in_memory(path, "the trajectory"), None, map_file, None, Config())
+        return Estimate(Poses.of("the trajectory", path), map_file=map_file)
     if not path.exists():
         raise InputError(absent(path))
     if not path.is_dir():
-        return Estimate(read_poses(path), None, map_file, None, Config())
-    trajectory, config_file = read_trajectory(path), path / files.CONFIG
-    poses = Poses(str(path), trajectory.stamps, trajectory.T_world_lidar)
+        return Estimate(_read_poses(path), map_file=map_file)
+    poses, config_file = Poses.of(str(path), read_trajectory(path)), path / files.CONFIG
     own_map = path / files.MAP_PLY
     chosen_map = map_file or (own_map if own_map.is_file() else None)
     if not config_file.is_file():
-        return Estimate(poses, path, chosen_map, None, Config())
+        return Estimate(poses, path, chosen_map)
     try:
         source = Path(read_yaml(config_file)[files.RUN_SECTION]["source"])
     except (ConfigError, TypeError, KeyError):
@@ -88,61 +94,38 @@ def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Esti
 
 
 def read_reference(path: Path | Trajectory, config: ReaderConfig) -> Poses:
-    """A trajectory to compare with: in memory, a TUM or KITTI text file, a run directory, or the truth of a recording.
-
-    Raises:
-        InputError: it is none of these, is damaged, or the recording came without ground truth.
-    """
+    """A trajectory in memory or in TUM or KITTI text, that of a run directory, or the truth of a recording."""
     if isinstance(path, Trajectory):
-        return _in_memory(path, "the reference")
+        return Poses.of("the reference", path)
     if not path.exists():
         raise InputError(absent(path))
     require_whole(path)
     if (path / files.TRAJECTORY_TUM).is_file():
-        trajectory = read_trajectory(path)
-        return Poses(f"the run {path}", trajectory.stamps, trajectory.T_world_lidar)
+        return Poses.of(f"the run {path}", read_trajectory(path))
     if path.is_dir() or is_recording(path):
-        return recording_truth(path, config)
-    return read_poses(path)
+        return _recording_truth(path, config)
+    return _read_poses(path)
 
 
-def recording_truth(source: Path, config: ReaderConfig) -> Poses:
-    """The ground truth that came with a recording.
-
-    Raises:
-        InputError: the recording cannot be opened, or came without.
-    """
+def _recording_truth(source: Path, config: ReaderConfig) -> Poses:
     recording = open_recording(source, config)
     truth = recording.ground_truth
     if truth is None:
-        raise InputError(
-            f"{source}: came with no ground truth; name a trajectory with --reference or a map with --reference-map"
-        )
-    return Poses(f"the ground truth of {source}", truth.stamps, truth.T_world_lidar, recording.T_cam_lidar)
+        raise InputError(f"{source}: came with no ground truth; {_ADVICE}")
+    return Poses.of(f"the ground truth of {source}", truth, recording.T_cam_lidar)
 
 
 def truth_of_run(run: Path) -> Trajectory | None:
-    """The ground truth that came with the recording of a run; None without, or where it is not available.
-
-    Raises:
-        InputError: there is no run, or it is damaged.
-    """
+    """The ground truth that came with the recording of a run; None without, or where it is not available."""
     estimate = read_estimate(run)
-    if estimate.source is None or not estimate.source.exists():
-        return None
-    try:
-        truth = recording_truth(estimate.source, estimate.config.reader)
-    except InputError:
-        return None
-    return None if truth.stamps is None else Trajectory(truth.stamps, truth.T_world_lidar)
+    with suppress(InputError):
+        truth = estimate.truth()
+        return None if truth.stamps is None else Trajectory(truth.stamps, truth.T_world_lidar)
+    return None
 
 
-def read_poses(path: Path) -> Poses:
-    """A trajectory file, TUM or KITTI text by its columns.
-
-    Raises:
-        InputError: it is damaged.
-    """
+def _read_poses(path: Path) -> Poses:
+    """A trajectory file, TUM or KITTI text by its columns."""
     try:
         with path.open(encoding="utf-8-sig") as lines:
             rows = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
@@ -153,12 +136,7 @@ def read_poses(path: Path) -> Poses:
         ) from error
     if columns == _KITTI_COLUMNS:
         return Poses(str(path), None, read_kitti_poses(path))
-    trajectory = read_tum(path)
-    return Poses(str(path), trajectory.stamps, trajectory.T_world_lidar)
-
-
-def _in_memory(trajectory: Trajectory, label: str) -> Poses:
-    return Poses(label, trajectory.stamps, trajectory.T_world_lidar)
+    return Poses.of(str(path), read_tum(path))
 
 
 def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
@@ -166,9 +144,6 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
 
     KITTI's text has no stamps, so that its poses are matched by their number, and is in the camera's frame: the truth
     of a recording is brought there, and a run is represented by its own trajectory in that format.
-
-    Raises:
-        InputError: one has no stamps, and the other not as many poses.
     """
     poses = estimate.poses
     if reference.stamps is None and estimate.run is not None and (estimate.run / files.TRAJECTORY_KITTI).is_file():
@@ -203,22 +178,14 @@ class ReferenceMap:
 
 
 def load_reference_map(path: Path) -> ReferenceMap:
-    """A map from a file; that of a simulated recording brings its trajectory with it.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """A map from a file; that of a simulated recording brings its trajectory with it."""
     truth = path.parent / GROUND_TRUTH
     is_simulated = path.name == REFERENCE_MAP and _is_simulated(path.parent) and truth.is_file()
     return ReferenceMap(path, read_cloud(path), read_tum(truth) if is_simulated else None)
 
 
 def find_reference_map(source: Path) -> ReferenceMap | None:
-    """The exact map of a simulated recording, which is in its folder; None of any other.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """The exact map of a simulated recording, which is in its folder; None of any other."""
     # Of a recording in KITTI's layout, the source may be sequences/NN.
     for folder in [source, *source.resolve().parents[:2]]:
         if (folder / REFERENCE_MAP).is_file() and _is_simulated(folder):

@@ -15,7 +15,7 @@ from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
 from lidarslam.evaluation.map.metrics import DEFAULT_SPACING_M, F_SCORE_THRESHOLDS_M, MapComparison, compare_maps
 from lidarslam.evaluation.trajectory.alignment import align, align_poses
-from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
 _DRAWN_POINTS = 200_000
@@ -84,9 +84,6 @@ def evaluate_map(
     """Compare the map of an estimate, in the world of its poses, with a reference map.
 
     The metrics are those of its trajectory, None when that has no reference.
-
-    Raises:
-        InputError: there is no map, or it cannot be aligned.
     """
     options = options or MapOptions()
     points = estimate.map_points()
@@ -107,20 +104,16 @@ def _along_trajectory(
     The positions are the true ones where there are any, as those of a lost trajectory are wrong.
     """
     poses, method = estimate.poses, "se3" if metrics is None else metrics.alignment
-    without_truth = None, poses.T_world_lidar[:, :3, 3]
+    association = None if metrics is None else metrics.association
+    T_reference_world = None if metrics is None else metrics.T_reference_estimate_joint
     if reference.truth is not None and poses.stamps is not None:
-        try:
-            association = associate(Trajectory(poses.stamps, poses.T_world_lidar), reference.truth)
-        except InputError:
-            return without_truth
-        pair = association.estimate, association.reference
-        T_reference_world = align_poses(*pair, align(*pair, method), method)
-        true_positions = association.reference.positions
-    elif metrics is not None:
-        T_reference_world, true_positions = metrics.T_reference_estimate_joint, metrics.association.reference.positions
-    else:
-        return without_truth
-    return T_reference_world, transform_points(inverse(T_reference_world), true_positions)
+        association = common_instants(Trajectory(poses.stamps, poses.T_world_lidar), reference.truth)
+        if association is not None:
+            pair = association.estimate, association.reference
+            T_reference_world = align_poses(*pair, align(*pair, method), method)
+    if association is None or T_reference_world is None:
+        return None, poses.T_world_lidar[:, :3, 3]
+    return T_reference_world, transform_points(inverse(T_reference_world), association.reference.positions)
 
 
 def _align(

@@ -27,9 +27,6 @@ def read_cloud(path: Path) -> FloatArray:
 
     Coordinates stay in double precision, because surveys count metres from far away. The scans of an E57 file are
     put together by their poses.
-
-    Raises:
-        InputError: the file is missing, damaged, of another kind, or holds no point; or its reader is not installed.
     """
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}; name a point cloud")

@@ -113,7 +113,7 @@ def export_bag(run: Path, out: Path, clouds: bool, frame: str, overwrite: bool) 
     scans = read_run_scans(run)
     with show_count(out.name) as count:
         written = export_bag(scans, out, frame, clouds, count)
-    for topic, messages in written.messages.items():
+    for topic, messages in written.items():
         say(f"{topic:<13}{messages:>7,} {'message' if messages == 1 else 'messages'}")
     say(f"written to {out}")
 

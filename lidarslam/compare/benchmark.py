@@ -1,6 +1,6 @@
 """A benchmark file: recordings, methods, tables and published rows, so that a table of a paper is one command."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +17,7 @@ from lidarslam.core.settings import Settings
 from lidarslam.core.tasks import open_tasks
 from lidarslam.datasets.fetched import fetched, is_url
 from lidarslam.datasets.published.evalio import located
-from lidarslam.evaluation.comparison.quantities import TablePlan, find_quantity
-from lidarslam.evaluation.comparison.table import TableCell, TableRow
+from lidarslam.evaluation.comparison.quantities import TablePlan
 from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
 from lidarslam.storage.comparison_folder import RECORDINGS
 
@@ -31,50 +30,6 @@ class BenchmarkMethod(Settings):
     set: tuple[str, ...] = Field((), description="settings, key.path=value")
 
 
-class Published(Settings):
-    """A row of a published table; a value for each column, null where none was published."""
-
-    method: str
-    values: tuple[float | str | None, ...]
-    source: str
-
-
-class BenchmarkTable(Settings):
-    """Means over groups of recordings; a column for each group and quantity, the quantities side by side."""
-
-    title: str
-    groups: Mapping[str, tuple[str, ...]] = Field(description="heading -> names of recordings")
-    quantities: tuple[str, ...]
-    published: tuple[Published, ...] = ()
-    note: str = ""
-
-    @model_validator(mode="after")
-    def _is_consistent(self) -> Self:
-        columns = len(self.groups) * len(self.quantities)
-        for row in self.published:
-            if len(row.values) != columns:
-                raise ValueError(
-                    f"table {self.title!r}, row {row.method!r}: expected {columns} values, one for each group and"
-                    f" quantity, got {len(row.values)}"
-                )
-        try:
-            self.plan()
-        except ConfigError as error:
-            raise ValueError(f"table {self.title!r}: {error}") from error
-        return self
-
-    def plan(self) -> TablePlan:
-        """The table to fill."""
-        sizes = [len(group) for group in self.groups.values() for _ in self.quantities]
-        published = tuple(
-            TableRow(row.method, [TableCell(*cell) for cell in zip(row.values, sizes, strict=True)], row.source)
-            for row in self.published
-        )
-        return TablePlan(
-            self.title, self.groups, [find_quantity(name) for name in self.quantities], published, self.note
-        )
-
-
 class Benchmark(Settings):
     """The whole file; paths are relative to the data's folder."""
 
@@ -84,7 +39,7 @@ class Benchmark(Settings):
     methods: tuple[str | BenchmarkMethod, ...] = Field(min_length=1)
     set: tuple[str, ...] = Field((), description="settings for everything, key.path=value")
     reference: str | None = Field(None, description="a method's name; null: ground truth")
-    tables: tuple[BenchmarkTable, ...] = ()
+    tables: tuple[TablePlan, ...] = ()
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -106,11 +61,7 @@ class Benchmark(Settings):
 
 
 def load_benchmark(path: Path) -> Benchmark:
-    """Read a benchmark file.
-
-    Raises:
-        ConfigError: it cannot be read, is not YAML, or does not fit.
-    """
+    """Read a benchmark file."""
     try:
         return Benchmark.model_validate(read_yaml(path))
     except ValidationError as error:
@@ -126,9 +77,6 @@ def fill_request(request: CompareRequest, benchmark: Benchmark) -> CompareReques
 
     The benchmark's paths are relative to `request.data`; without it, to the current folder, and those of the
     recordings that are simulated to one in `request.out`.
-
-    Raises:
-        ConfigError: a method does not exist, or not in this version.
     """
     return replace(
         request,
@@ -137,16 +85,12 @@ def fill_request(request: CompareRequest, benchmark: Benchmark) -> CompareReques
         settings=(*benchmark.set, *request.settings),
         skip_missing=True,
         title=benchmark.title,
-        tables=tuple(table.plan() for table in benchmark.tables),
+        tables=benchmark.tables,
     )
 
 
 def require_data(request: CompareRequest, benchmark: Benchmark) -> None:
-    """Refuse a benchmark none of whose recordings is there or can be simulated.
-
-    Raises:
-        InputError: it is one; the message has the data that it needs.
-    """
+    """Refuse a benchmark none of whose recordings is there or can be simulated."""
     if any(entry.simulate or (entry.source and entry.source.exists()) for entry in request.recordings):
         return
     place = "the current folder" if request.data is None else str(request.data)
@@ -157,11 +101,7 @@ def require_data(request: CompareRequest, benchmark: Benchmark) -> None:
 def make_recordings(
     request: CompareRequest, counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 ) -> None:
-    """Simulate the recordings that are not there yet.
-
-    Raises:
-        LidarSlamError: one cannot be made.
-    """
+    """Simulate the recordings that are not there yet."""
     wanted = [
         RecordRequest(entry.source, **entry.simulate.model_dump())
         for entry in request.recordings

@@ -3,6 +3,7 @@
 import contextlib
 import tarfile
 import tempfile
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -17,10 +18,10 @@ from lidarslam.compare.plan import CompareRequest, PlannedRecording, make_plan
 from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison, format_result
 from lidarslam.core.files import cannot_write, only_writer
-from lidarslam.core.tasks import Where, open_tasks
+from lidarslam.core.tasks import open_tasks
 from lidarslam.core.text import count
 from lidarslam.datasets.fetched import fetch, url_of
-from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.gates import format_gates, judge_comparison, require_methods
 from lidarslam.evaluation.comparison.quantities import mean_table
 from lidarslam.run.interruption import ended_like_interrupted
@@ -86,9 +87,6 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
 
     A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. The command is the
     process of each method, see `run_method`.
-
-    Raises:
-        LidarSlamError: the sources, the configuration or the output directory are not usable.
     """
     from lidarslam.evaluation.report.report import render_html, render_markdown
 
@@ -137,27 +135,51 @@ class _Turns:
 
     def take_together(self, recordings: Sequence[PlannedRecording]) -> None:
         """Run all methods on all recordings side by side."""
-        wanted = [(planned, run) for planned in recordings for run in planned.runs if self._has_to_run(planned, run)]
+        wanted = [(each, run) for each in recordings for run in each.runs if self._without_process(each, run) is None]
+        if not wanted:
+            return
         scans = [len(range(len(p.recording))[p.entry.start : p.entry.stop : p.entry.step]) for p, _ in wanted]
-        counted = 0
+        where, counted = self.request.where, 0
 
-        def take(index: int, result: MethodResult) -> None:
+        def take(index: int, done: tuple[MethodResult, bytes | None]) -> None:
             nonlocal counted
+            (planned, run), (result, packed) = wanted[index], done
+            if packed is not None:
+                clear(run.request.out)
+                with tarfile.open(fileobj=BytesIO(packed)) as archive:
+                    archive.extractall(run.request.out, filter="data")
             counted += scans[index]
             counter(counted, sum(scans))
-            planned, run = wanted[index]
             self._done[run.request.out] = result
             self.narrator.tell(format_result(planned.name, result))
 
-        runs = [run for _, run in wanted]
-        if not runs:
-            return
-        with self.narrator.counting(f"{count(len(runs), 'run')} side by side") as counter:
-            self.interrupted = run_side_by_side(runs, self.request.limits, self.command, self.request.where, take)
+        command = None if self.command == COMMAND else self.command
+        tasks = [
+            MethodTask(
+                run,
+                self.request.limits,
+                command,
+                str(Path.cwd()),
+                url_of(run.request.source),
+                where.cluster is not None,
+            )
+            for _, run in wanted
+        ]
+        with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
+            try:
+                with open_tasks(where) as executor:
+                    deque(executor.run(run_task, tasks, take), maxlen=0)
+            except KeyboardInterrupt:
+                self.interrupted = True
 
-    def _has_to_run(self, planned: PlannedRecording, run: MethodRun) -> bool:
-        is_reused = self.request.reuse and finished_before(run) is not None
-        return not is_reused and obstacle(run, planned.recording) is None
+    def _without_process(self, planned: PlannedRecording, run: MethodRun) -> MethodResult | None:
+        """An earlier result, or why there is none; None where the method has to be run."""
+        if self.interrupted:
+            return MethodResult(run.name, "not run", _INTERRUPTED)
+        if self.request.reuse and (earlier := finished_before(run)) is not None:
+            return earlier
+        why = obstacle(run, planned.recording)
+        return None if why is None else MethodResult(run.name, "not run", why)
 
     def measured(self, planned: PlannedRecording) -> SequenceComparison:
         """All methods on one recording, with their errors."""
@@ -166,9 +188,10 @@ class _Turns:
             if run.request.out in self._done:
                 results.append(self._done[run.request.out])
                 continue
-            earlier = finished_before(run) if self.request.reuse and not self.interrupted else None
-            results.append(earlier or self._run(planned, run))
-            self.narrator.tell(format_result(planned.name, results[-1], reused=earlier is not None))
+            known = self._without_process(planned, run)
+            results.append(known or self._run(planned, run))
+            reused = known is not None and known.status in WHOLE
+            self.narrator.tell(format_result(planned.name, results[-1], reused))
         try:
             return measure(planned, results, with_maps=not self.interrupted)
         except KeyboardInterrupt:  # comparing maps takes time
@@ -176,16 +199,12 @@ class _Turns:
             return measure(planned, results, with_maps=False)
 
     def _run(self, planned: PlannedRecording, run: MethodRun) -> MethodResult:
-        if self.interrupted:
-            return MethodResult(run.name, "not run", _INTERRUPTED)
-        if (why := obstacle(run, planned.recording)) is not None:
-            return MethodResult(run.name, "not run", why)
+        result = MethodResult(run.name, "not run", _INTERRUPTED)
         try:
             with self.narrator.counting(f"{planned.name} {run.name}") as counter:
                 result, self.interrupted = run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
-            return MethodResult(run.name, "not run", _INTERRUPTED)
         return result
 
 
@@ -201,49 +220,8 @@ class MethodTask:
     is_remote: bool  # whether the run directory comes back with the result: the machine may have other disks
 
 
-@dataclass(frozen=True, eq=False)
-class MethodDone:
-    """The result of a task."""
-
-    result: MethodResult
-    packed: bytes | None  # the run directory of a machine with other disks
-
-
-def run_side_by_side(
-    runs: Sequence[MethodRun],
-    limits: Limits,
-    command: Sequence[str],
-    where: Where,
-    on_done: Callable[[int, MethodResult], None],
-) -> bool:
-    """Run methods to any end, as `run_method`; whether Ctrl-C ended that early.
-
-    `on_done` is called with the index of a run and its result, as they end.
-
-    Raises:
-        LidarSlamError: the tasks cannot be carried out.
-    """
-    is_remote, own = where.cluster is not None, None if command == COMMAND else command
-    items = [MethodTask(run, limits, own, str(Path.cwd()), url_of(run.request.source), is_remote) for run in runs]
-
-    def take(index: int, done: MethodDone) -> None:
-        if done.packed is not None:
-            clear(runs[index].request.out)
-            with tarfile.open(fileobj=BytesIO(done.packed)) as archive:
-                archive.extractall(runs[index].request.out, filter="data")
-        on_done(index, done.result)
-
-    try:
-        with open_tasks(where) as tasks:
-            for _ in tasks.run(run_task, items, take):
-                pass
-    except KeyboardInterrupt:
-        return True
-    return False
-
-
-def run_task(task: MethodTask) -> MethodDone:
-    """Run the method of a task; the run directory is packed where it has to be brought back."""
+def run_task(task: MethodTask) -> tuple[MethodResult, bytes | None]:
+    """Run the method of a task; its result, and the run directory where it has to be brought back."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a machine without that folder has no file there either
             stack.enter_context(contextlib.chdir(task.folder))
@@ -256,7 +234,7 @@ def run_task(task: MethodTask) -> MethodDone:
             request = replace(request, out=place / request.out.parent.name / request.out.name)
         run = replace(task.run, request=request)
         result, _ = run_method(run, task.limits, lambda *_: None, task.command or COMMAND)
-        return MethodDone(result, _packed(request.out) if task.is_remote else None)
+        return result, _packed(request.out) if task.is_remote else None
 
 
 def _packed(folder: Path) -> bytes:

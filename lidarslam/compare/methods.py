@@ -71,11 +71,7 @@ def _grammar() -> str:
 
 
 def parse_method(name: str) -> Method:
-    """The method of that name.
-
-    Raises:
-        ConfigError: no method is called so, or another package's cannot be loaded.
-    """
+    """The method of that name."""
     peer, by_scene = name.removesuffix(f"@{BY_SCENE}"), name.endswith(f"@{BY_SCENE}")
     match = _NAME.fullmatch(name)
     base = "" if match is None else match["base"]
@@ -113,11 +109,7 @@ def _voxel_size_m(name: str, match: re.Match[str]) -> float:
 
 
 def parse_methods(names: str) -> tuple[Method, ...]:
-    """The methods of a list with commas.
-
-    Raises:
-        ConfigError: one of them does not exist, one is named twice, or there is none.
-    """
+    """The methods of a list with commas."""
     chosen = [name.strip() for name in names.split(",") if name.strip()]
     if not chosen:
         raise ConfigError(f"no method is named; there are: {_grammar()}")

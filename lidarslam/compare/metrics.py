@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarslam.assessment.inputs import ReferenceMap, find_reference_map, load_reference_map, read_estimate
+from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
 from lidarslam.assessment.map_evaluation import evaluate_map
 from lidarslam.compare.peers.scene import scene_note
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory, read_tum
-from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult, SequenceComparison
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
-
-GROUND_TRUTH = "ground truth"
 
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
@@ -71,22 +69,20 @@ def _measure_maps(planned: PlannedRecording, results: Sequence[MethodResult], no
     except InputError as error:
         notes.append(f"no map is compared: {error}")
         return list(results)
-    if reference is None:
-        return list(results)
     folders = {run.name: run.request.out for run in planned.runs}
     is_method = planned.entry.reference in folders  # whose world is not the reference map's
-    return [_measure_map(result, folders[result.name], reference, is_method, notes) for result in results]
-
-
-def _measure_map(
-    result: MethodResult, folder: Path, reference: ReferenceMap, by_map_alone: bool, notes: list[str]
-) -> MethodResult:
-    if result.trajectory is None:
-        return result
-    try:
-        evaluation = evaluate_map(read_estimate(folder), None if by_map_alone else result.metrics, reference)
-    except InputError as error:
-        notes.append(f"{result.name}: no map is compared: {error}")
-        return result
-    notes.extend(f"{result.name}: {warning}" for warning in evaluation.warnings())
-    return replace(result, map_metrics=evaluation.json, map_errors=evaluation.errors)
+    measured = []
+    for result in results:
+        measured.append(result)
+        if reference is None or result.trajectory is None:
+            continue
+        try:
+            compared = evaluate_map(
+                read_estimate(folders[result.name]), None if is_method else result.metrics, reference
+            )
+        except InputError as error:
+            notes.append(f"{result.name}: no map is compared: {error}")
+            continue
+        notes.extend(f"{result.name}: {warning}" for warning in compared.warnings())
+        measured[-1] = replace(result, map_metrics=compared.json, map_errors=compared.errors)
+    return measured

@@ -102,13 +102,7 @@ class PlannedRecording:
 
 
 def make_plan(request: CompareRequest) -> tuple[list[PlannedRecording], list[MissingRecording]]:
-    """Open every recording and resolve every configuration; the planned recordings and the missing ones.
-
-    Raises:
-        InputError: a recording is not there and may not be skipped, or none is.
-        ConfigError: a setting, a reference or a prior does not fit.
-        OutputError: the folder holds a comparison already, or is none.
-    """
+    """Open every recording and resolve every configuration; the planned recordings and the missing ones."""
     planned: list[PlannedRecording] = []
     missing: list[MissingRecording] = []
     for entry in request.recordings:

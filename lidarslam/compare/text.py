@@ -65,13 +65,9 @@ def _table(sequence: SequenceComparison) -> Table:
     drifts = ["kitti_translation_percent", *(f"segment_{each}_translation_percent" for each in SHORT_LENGTHS_M[::-1])]
     drift = next((name for name in drifts if any(QUANTITIES[name].of(result) is not None for result in results)), None)
     quantities = [QUANTITIES[name] for name in ("ate_rmse_m", drift or drifts[0], *_SHOWN)]
-    columns = [TableColumn("", q.label, q.unit, q.digits, q.lower_is_better) for q in quantities]
-    rows = []
-    for result in results:
-        cells = [quantity.cell(result) for quantity in quantities]
-        rows.append(TableRow(result.name, [TableCell(result.status), *cells]))
+    columns = [TableColumn("", "status", numeric=False), *(quantity.column() for quantity in quantities)]
+    rows = [TableRow(of.name, [TableCell(of.status), *(each.cell(of) for each in quantities)]) for of in results]
     against = "" if sequence.reference is None else f", against {sequence.reference_name}"
-    columns = [TableColumn("", "status", numeric=False), *columns]
     return Table(f"{sequence.sequence}{against}", columns, rows, times_note(results)).without_empty()
 
 

@@ -63,6 +63,16 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def written(path: Path, remedy: str = "") -> Iterator[Path]:
+    """As `replacing`; the errors of the system are for the user."""
+    try:
+        with replacing(path) as partial:
+            yield partial
+    except OSError as error:
+        raise cannot_write(path, error, remedy) from error
+
+
 def remove_partial_files(directory: Path) -> None:
     """Remove the files that `replacing` left in a directory when the process was killed."""
     for partial in directory.glob(f"{_PARTIAL}*"):

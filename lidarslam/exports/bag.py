@@ -3,19 +3,11 @@
 import sqlite3
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
@@ -32,14 +24,7 @@ from lidarslam.storage.finished_run import load_map
 
 # REP 105.
 _MAP_FRAME, _ODOM_FRAME = "map", "odom"
-_ODOMETRY_TOPIC, _TF_TOPIC, _PATH_TOPIC, _CLOUD_TOPIC, _MAP_TOPIC = (
-    "/odometry",
-    "/tf",
-    "/path",
-    "/points",
-    "/map_points",
-)
-_LATCHED = (_PATH_TOPIC, _MAP_TOPIC)
+_PATH_TOPIC, _MAP_TOPIC = _LATCHED = ("/path", "/map_points")
 # Of one file; without a suffix, a rosbag2 folder.
 SUFFIXES = (".mcap", ".db3", ".bag", "")
 # The newest version that ROS 2 Humble reads; for a lone .db3 the oldest with types and metadata in the file.
@@ -48,40 +33,28 @@ _LONE_SQLITE_VERSION: Literal[9] = 9
 _LONGEST = QosTime(9223372036, 854775807)  # as ROS 2 writes infinity
 
 
-@dataclass(frozen=True)
-class WrittenBag:
-    """A bag as it was written."""
-
-    path: Path
-    messages: dict[str, int]  # topic -> number
-
-
 def export_bag(
     run: RunScans, out: Path, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
-) -> WrittenBag:
+) -> dict[str, int]:
     """Write odometry, tf, path and map of a run, and its deskewed clouds, for which the recording is read again.
 
     The file has one of `SUFFIXES`, of which none gives a folder; `count` is called with the number of scans done, and
-    the total.
-
-    Raises:
-        InputError: the map or the recording cannot be read.
-        OutputError: the bag cannot be written.
+    the total. The number of messages of each topic.
     """
     make_directory(out.parent)
     try:
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".partial-") as folder:
             place = Path(folder) / (out.name if out.suffix == ".bag" else out.stem)
-            writer = _writer(place, out.suffix)
-            with writer:
-                messages = _write(_Topics(writer), run, lidar_frame, with_clouds, count)
+            with _writer(place, out.suffix) as writer:
+                topics = _Topics(writer)
+                _write(topics, run, lidar_frame, with_clouds, count)
             for written in place.glob("*.mcap"):
                 write_chunk_checksums(written)
             made = place / f"{place.name}{out.suffix}" if out.suffix in (".mcap", ".db3") else place
             made.replace(out)
     except (OSError, sqlite3.Error) as error:
         raise cannot_write(out, error) from error
-    return WrittenBag(out, messages)
+    return topics.counts
 
 
 def _writer(place: Path, suffix: str) -> Rosbag1Writer | Rosbag2Writer:
@@ -94,7 +67,7 @@ def _writer(place: Path, suffix: str) -> Rosbag1Writer | Rosbag2Writer:
 
 def _write(
     topics: "_Topics", run: RunScans, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
-) -> dict[str, int]:
+) -> None:
     """Everything, in the order of time; the whole path and the map come with the first stamp."""
     messages, trajectory = topics.messages, run.trajectory
     first = float(trajectory.stamps[0])
@@ -104,18 +77,16 @@ def _write(
         attributes = cloud.attributes.only(("intensity", "rgb"))
         topics.write(_MAP_TOPIC, first, messages.cloud(first, _MAP_FRAME, cloud.points, attributes))
     written = 0
-    if with_clouds:
-        for index, scan in run.deskewed():
-            for number in range(written, index + 1):
-                _write_pose(topics, run, number, lidar_frame)
-            written = index + 1
-            attributes = PointAttributes(intensity=scan.intensities, rgb=scan.colours, ring=scan.rings)
-            topics.write(_CLOUD_TOPIC, scan.stamp, messages.cloud(scan.stamp, lidar_frame, scan.points, attributes))
-            count(written, len(trajectory))
+    for index, scan in run.deskewed() if with_clouds else ():
+        for number in range(written, index + 1):
+            _write_pose(topics, run, number, lidar_frame)
+        written = index + 1
+        attributes = PointAttributes(intensity=scan.intensities, rgb=scan.colours, ring=scan.rings)
+        topics.write("/points", scan.stamp, messages.cloud(scan.stamp, lidar_frame, scan.points, attributes))
+        count(written, len(trajectory))
     for number in range(written, len(trajectory)):
         _write_pose(topics, run, number, lidar_frame)
     count(len(trajectory), len(trajectory))
-    return topics.counts
 
 
 def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str) -> None:
@@ -123,21 +94,21 @@ def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str)
     stamp = float(run.trajectory.stamps[number])
     T_map_lidar, T_odom_lidar = run.trajectory.T_world_lidar[number], run.odometry.T_world_lidar[number]
     corrected = (_MAP_FRAME, _ODOM_FRAME, T_map_lidar @ inverse(T_odom_lidar))
-    topics.write(
-        _TF_TOPIC, stamp, topics.messages.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar))
-    )
-    known = run.known_velocities(number)
-    velocity = np.mean(known, axis=0) if known else np.zeros(6)
-    frames = (_MAP_FRAME, lidar_frame)
-    message = topics.messages.odometry(stamp, frames, T_map_lidar, run.sigmas[number], velocity)
-    topics.write(_ODOMETRY_TOPIC, stamp, message)
+    messages = topics.messages
+    topics.write("/tf", stamp, messages.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar)))
+    known, sigmas = run.known_velocities(number), run.sigmas[number]
+    covariance = np.diag(sigmas**2) if np.isfinite(sigmas).all() else None
+    velocity = np.mean(known, axis=0) if known else None
+    header = messages.header(stamp, _MAP_FRAME)
+    odometry = made.odometry(messages.store, header, lidar_frame, T_map_lidar, covariance, velocity)
+    topics.write("/odometry", stamp, odometry)
 
 
 class _Topics:
     """The topics of a bag, opened with their first message."""
 
     def __init__(self, bag: Rosbag1Writer | Rosbag2Writer) -> None:
-        self._bag = bag
+        self._bag: Any = bag
         self.messages = RosMessages(ros2=isinstance(bag, Rosbag2Writer))
         self._connections: dict[str, Any] = {}
         self.counts: dict[str, int] = {}
@@ -145,18 +116,12 @@ class _Topics:
     def write(self, topic: str, stamp: float, message: Any) -> None:
         """Write a message, recorded at its stamp."""
         if topic not in self._connections:
-            self._connections[topic] = self._open(topic, message.__msgtype__)
-        data = self.messages.serialize(message)
-        self._bag.write(self._connections[topic], nanoseconds(stamp), data)
+            bag, latched = self._bag, topic in _LATCHED
+            how = {"offered_qos_profiles": [_qos(latched)]} if self.messages.ros2 else {"latching": int(latched)}
+            opened = bag.add_connection(topic, message.__msgtype__, typestore=self.messages.store, **how)
+            self._connections[topic] = opened
+        self._bag.write(self._connections[topic], nanoseconds(stamp), self.messages.serialize(message))
         self.counts[topic] = self.counts.get(topic, 0) + 1
-
-    def _open(self, topic: str, message_type: str) -> Any:
-        store = self.messages.store
-        if isinstance(self._bag, Rosbag1Writer):
-            latching = int(topic in _LATCHED)
-            return self._bag.add_connection(topic, message_type, typestore=store, latching=latching)
-        qos = _qos(latched=topic in _LATCHED)
-        return self._bag.add_connection(topic, message_type, typestore=store, offered_qos_profiles=[qos])
 
 
 def _qos(latched: bool) -> Qos:
@@ -183,7 +148,7 @@ class RosMessages:
     """Makes and serialises messages: for ROS 2 as CDR, for ROS 1 packed."""
 
     def __init__(self, ros2: bool) -> None:
-        self._ros2 = ros2
+        self.ros2 = ros2
         self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
         if not ros2:  # ROS 2's store has it
             self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
@@ -191,32 +156,21 @@ class RosMessages:
 
     def serialize(self, message: Any) -> bytes:
         """The bytes of a message."""
-        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
+        serialize = self.store.serialize_cdr if self.ros2 else self.store.serialize_ros1
         return bytes(serialize(message, message.__msgtype__))
-
-    def odometry(
-        self, stamp: float, frames: tuple[str, str], T: FloatArray, sigmas: FloatArray, velocity: FloatArray
-    ) -> Any:
-        """A pose (4, 4) of the second frame in the first, with standard deviations (6,) and body velocity (6,).
-
-        Both have the rotation first and the axes of the second frame; standard deviations that are not finite are
-        unknown.
-        """
-        covariance = np.diag(sigmas**2) if np.isfinite(sigmas).all() else None
-        return made.odometry(self.store, self._header(stamp, frames[0]), frames[1], T, covariance, velocity)
 
     def transforms(self, stamp: float, *poses: tuple[str, str, FloatArray]) -> Any:
         """Parent frame, child frame and pose (4, 4) of the child in the parent, of each transform."""
-        return made.transforms(self.store, *((self._header(stamp, parent), child, T) for parent, child, T in poses))
+        return made.transforms(self.store, *((self.header(stamp, parent), child, T) for parent, child, T in poses))
 
     def path(self, stamps: FloatArray, frame: str, T: FloatArray) -> Any:
         """Poses (N, 4, 4) in a frame; the header has the last stamp."""
         types, store = self.store.types, self.store
         poses = [
-            types["geometry_msgs/msg/PoseStamped"](self._header(float(stamp), frame), made.pose(store, each))
+            types["geometry_msgs/msg/PoseStamped"](self.header(float(stamp), frame), made.pose(store, each))
             for stamp, each in zip(stamps, T, strict=True)
         ]
-        return types["nav_msgs/msg/Path"](self._header(float(stamps[-1]), frame), poses)
+        return types["nav_msgs/msg/Path"](self.header(float(stamps[-1]), frame), poses)
 
     def cloud(self, stamp: float, frame: str, points: FloatArray, attributes: PointAttributes) -> Any:
         """Points (N, 3) with intensity, ring and colour where known."""
@@ -231,8 +185,9 @@ class RosMessages:
         records = np.empty(len(points), np.dtype([(name, values.dtype) for name, values in columns.items()]))
         for name, values in columns.items():
             records[name] = values
-        return made.point_cloud(self.store, self._header(stamp, frame), records)
+        return made.point_cloud(self.store, self.header(stamp, frame), records)
 
-    def _header(self, stamp: float, frame: str) -> Any:
+    def header(self, stamp: float, frame: str) -> Any:
+        """Of the next message."""
         self._sequence += 1
         return made.header(self.store, nanoseconds(stamp), frame, self._sequence - 1)

@@ -12,9 +12,9 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.files import cannot_write, make_directory, replacing
+from lidarslam.core.files import make_directory, written
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory, format_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounted_recording import recorded_axes
 from lidarslam.datasets.published.kitti_raw import KittiRawRecording
@@ -24,12 +24,7 @@ from lidarslam.datasets.ros.bag_imu import static_transform
 from lidarslam.datasets.ros.bag_message import deserialize
 from lidarslam.datasets.ros.rosbag import BagRecording
 from lidarslam.exports.source import read_source, require_new
-from lidarslam.mapping.global_map.georeference import (
-    Georeference,
-    GnssTrack,
-    TooFewPositionsError,
-    align_to_track,
-)
+from lidarslam.mapping.global_map.georeference import Georeference, GnssTrack, TooFewPositionsError, align_to_track
 from lidarslam.mapping.global_map.point_cloud import write_laz
 from lidarslam.storage.finished_run import load_map, read_trajectory
 
@@ -67,11 +62,7 @@ class Utm:
 
 
 def utm_around(geodetic: FloatArray) -> Utm:
-    """The zone of most positions (N, 3): latitude and longitude in degrees, height.
-
-    Raises:
-        ConfigError: pyproj is not installed.
-    """
+    """The zone of most positions (N, 3): latitude and longitude in degrees, height."""
     try:
         pyproj: Any = import_module("pyproj")
     except ModuleNotFoundError as error:
@@ -103,19 +94,14 @@ class GeoRun:
 
 
 def georeference(run: Path) -> GeoRun:
-    """Align a run with the GNSS track of its recording.
-
-    Raises:
-        InputError: there is no run, its recording has no GNSS, or the track is too short to determine the heading.
-        ConfigError: pyproj is not installed.
-    """
-    trajectory, source = read_trajectory(run), read_source(run, "has the GNSS positions")
-    track = read_gnss(source.path, source.reader)
+    """Align a run with the GNSS track of its recording."""
+    trajectory, of = read_trajectory(run), read_source(run, "has the GNSS positions")
+    track = read_gnss(of.source, of.reader)
     utm = utm_around(track.geodetic)
     try:
         placed = align_to_track(trajectory, track, utm.project(track.geodetic), utm.scale)
     except TooFewPositionsError as error:
-        raise InputError(f"{source.path}: {error}") from error
+        raise InputError(f"{of.source}: {error}") from error
     if placed.heading_sigma_deg > _LARGEST_HEADING_SIGMA_DEG:
         raise InputError(
             f"{run}: too short to determine the heading from its GNSS positions: they leave"
@@ -125,11 +111,7 @@ def georeference(run: Path) -> GeoRun:
 
 
 def export_geo(geo: GeoRun, out: Path, overwrite: bool) -> Iterator[str]:
-    """Write map, trajectory and the pose of the world; lines about them.
-
-    Raises:
-        OutputError: a file cannot be written, or is there already.
-    """
+    """Write map, trajectory and the pose of the world; lines about them."""
     make_directory(out)
     for name in _FILES:
         require_new(out / name, overwrite)
@@ -139,29 +121,24 @@ def export_geo(geo: GeoRun, out: Path, overwrite: bool) -> Iterator[str]:
     trajectory = Trajectory(geo.trajectory.stamps, T)
     lines = utm.geodetic(trajectory.positions)
     cloud = load_map(geo.run)
-    written = [name for name in _FILES if name != MAP or len(cloud)]
-    try:
-        if len(cloud):
-            normals = cloud.normals @ placed.T_map_world[:3, :3].T
-            with replacing(out / MAP) as partial:
-                write_laz(partial, replace(cloud, points=placed.positions(cloud.points), normals=normals), utm.wkt)
-        with replacing(out / TRAJECTORY) as partial:
-            write_tum(partial, trajectory)
-        texts = {
-            GEOJSON: json.dumps(_geojson(geo, lines)),
-            KML: _kml(geo.run.resolve().name, lines),
-            ABOUT: json.dumps(_about(geo), indent=2),
-        }
-        for name, text in texts.items():
-            with replacing(out / name) as partial:
-                partial.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise cannot_write(out, error) from error
+    if len(cloud):
+        normals = cloud.normals @ placed.T_map_world[:3, :3].T
+        with written(out / MAP) as partial:
+            write_laz(partial, replace(cloud, points=placed.positions(cloud.points), normals=normals), utm.wkt)
+    texts = {
+        TRAJECTORY: format_tum(trajectory),
+        GEOJSON: json.dumps(_geojson(geo, lines)) + "\n",
+        KML: _kml(geo.run.resolve().name, lines) + "\n",
+        ABOUT: json.dumps(_about(geo), indent=2) + "\n",
+    }
+    for name, text in texts.items():
+        with written(out / name) as partial:
+            partial.write_text(text, encoding="utf-8")
     yield f"{utm.name}, EPSG:{utm.epsg}, scale {utm.scale:.6f}"
     yield f"{placed.matched:,} GNSS positions; residual {placed.rms_m:.2f} m RMS, {placed.median_m:.2f} m median"
     yield f"heading known to {placed.heading_sigma_deg:.2f} deg"
     yield from (f"note: {note}" for note in geo.track.notes)
-    yield f"written to {', '.join(str(out / name) for name in written)}"
+    yield f"written to {', '.join(str(out / name) for name in _FILES if name != MAP or len(cloud))}"
 
 
 def _about(geo: GeoRun) -> dict[str, Any]:
@@ -199,17 +176,10 @@ def _kml(name: str, geodetic: FloatArray) -> str:
 
 
 def read_gnss(source: Path, config: ReaderConfig) -> GnssTrack:
-    """Read the GNSS track of a recording.
-
-    Raises:
-        InputError: the recording cannot be read, or has none.
-    """
+    """Read the GNSS track of a recording."""
     recording, T_upright_recorded = recorded_axes(open_recording(source, config))
-    track = None
-    if isinstance(recording, KittiRawRecording):
-        track = _of_drive(recording)
-    elif isinstance(recording, BagRecording):
-        track = _of_bag(*recording.frames)
+    track = _of_drive(recording) if isinstance(recording, KittiRawRecording) else None
+    track = _of_bag(*recording.frames) if isinstance(recording, BagRecording) else track
     if track is None:
         readable = "KITTI raw drives with oxts, and bags with sensor_msgs/NavSatFix"
         raise InputError(f"{source}: has no GNSS positions; it is read from {readable}")
@@ -222,9 +192,7 @@ def _of_drive(drive: KittiRawRecording) -> GnssTrack | None:
     rows, stamps = drive.oxts
     T_lidar_imu = None if drive.imu is None else drive.imu.T_lidar_imu
     timed = np.isfinite(stamps)
-    place = np.zeros(3) if T_lidar_imu is None else T_lidar_imu[:3, 3]
-    notes = (_SAME_PLACE,) if T_lidar_imu is None else ()
-    return GnssTrack(stamps[timed], rows.geodetic[timed], rows.accuracy_m[timed], place, notes)
+    return GnssTrack(stamps[timed], rows.geodetic[timed], rows.accuracy_m[timed], *_antenna(T_lidar_imu))
 
 
 def _of_bag(bag: BagFile, lidar_frame: str) -> GnssTrack | None:
@@ -248,8 +216,10 @@ def _of_bag(bag: BagFile, lidar_frame: str) -> GnssTrack | None:
             frame_id = message.frame_id
     if not stamps:
         return None
-    T_lidar_antenna = static_transform(bag, lidar_frame, frame_id)
-    place = np.zeros(3) if T_lidar_antenna is None else T_lidar_antenna[:3, 3]
-    order = np.argsort(stamps, kind="stable")
-    notes = (_SAME_PLACE,) if T_lidar_antenna is None else ()
-    return GnssTrack(np.array(stamps)[order], np.array(geodetic)[order], np.array(sigmas)[order], place, notes)
+    antenna, order = _antenna(static_transform(bag, lidar_frame, frame_id)), np.argsort(stamps, kind="stable")
+    return GnssTrack(np.array(stamps)[order], np.array(geodetic)[order], np.array(sigmas)[order], *antenna)
+
+
+def _antenna(T_lidar_antenna: FloatArray | None) -> tuple[FloatArray, tuple[str, ...]]:
+    """Where the antenna is, and a note where that is not known."""
+    return (np.zeros(3), (_SAME_PLACE,)) if T_lidar_antenna is None else (T_lidar_antenna[:3, 3], ())

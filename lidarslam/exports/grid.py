@@ -8,7 +8,8 @@ import yaml
 from PIL import Image
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.files import cannot_write, make_directory, replacing
+from lidarslam.core.files import make_directory, written
+from lidarslam.exports.source import read_map
 from lidarslam.mapping.global_map.occupancy_grid import (
     FREE,
     OCCUPIED,
@@ -17,7 +18,7 @@ from lidarslam.mapping.global_map.occupancy_grid import (
     OccupancyGrid,
     occupancy_grid,
 )
-from lidarslam.storage.finished_run import load_map, read_summary, read_trajectory
+from lidarslam.storage.finished_run import read_trajectory
 
 _FINEST_M = 0.05
 _GREY = {OCCUPIED: 0, UNKNOWN: 205, FREE: 254}
@@ -30,20 +31,12 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, options: dict[
 
     Without a resolution, the edge of a cell is that of the map's voxels, at least 5 cm; the options are those of
     `GridOptions`.
-
-    Raises:
-        InputError: there is no run, no map, or no ground in it.
-        OutputError: the files cannot be written.
     """
-    trajectory, cloud = read_trajectory(run), load_map(run)
-    if not len(cloud):
-        raise InputError(f"{run}: has no map")
-    voxel = read_summary(run).get("map_voxel_size_m")
-    chosen = resolution_m or max(_FINEST_M, round(voxel or 0.0, 2))
+    trajectory, (cloud, voxel_m) = read_trajectory(run), read_map(run)
+    chosen = resolution_m or max(_FINEST_M, round(voxel_m or 0.0, 2))
+    asked = GridOptions(resolution_m=chosen, **options)
     try:
-        grid = occupancy_grid(
-            cloud.points, cloud.normals, trajectory.positions, GridOptions(resolution_m=chosen, **options)
-        )
+        grid = occupancy_grid(cloud.points, cloud.normals, trajectory.positions, asked)
     except ValueError as error:
         raise ConfigError(f"the grid would have {error}; take a larger --resolution or a smaller --max-range") from None
     if grid is None:
@@ -56,39 +49,23 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, options: dict[
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> list[Path]:
-    """Write `path`, a .yaml file, and the image next to it; the files.
-
-    Raises:
-        OutputError: they cannot be written.
-    """
+    """Write `path`, a .yaml file, and the image next to it; the files."""
     image = path.with_suffix(".pgm")
     pixels = np.full(grid.cells.shape, _GREY[UNKNOWN], dtype=np.uint8)
     for value, grey in _GREY.items():
         pixels[grid.cells == value] = grey
-    about = {
-        "image": image.name,
-        "mode": "trinary",
-        "resolution": grid.resolution_m,
-        "origin": [round(float(grid.origin[0]), 6), round(float(grid.origin[1]), 6), 0.0],
-        "negate": 0,
-        **_THRESHOLDS,
-    }
+    origin = [round(float(grid.origin[0]), 6), round(float(grid.origin[1]), 6), 0.0]
+    about = {"image": image.name, "mode": "trinary", "resolution": grid.resolution_m, "origin": origin, "negate": 0}
     make_directory(path.parent)
-    try:
-        with replacing(image) as partial:
-            Image.fromarray(pixels[::-1]).save(partial, format="PPM")  # the first row of an image is its top
-        with replacing(path) as partial:
-            partial.write_text(yaml.safe_dump(about, sort_keys=False, default_flow_style=None), encoding="utf-8")
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    with written(image) as partial:
+        Image.fromarray(pixels[::-1]).save(partial, format="PPM")  # the first row of an image is its top
+    with written(path) as partial:
+        text = yaml.safe_dump({**about, **_THRESHOLDS}, sort_keys=False, default_flow_style=None)
+        partial.write_text(text, encoding="utf-8")
     return [path, image]
 
 
 def require_yaml(path: Path) -> None:
-    """Check the suffix of a grid.
-
-    Raises:
-        OutputError: it is not .yaml.
-    """
+    """Check the suffix of a grid."""
     if path.suffix not in (".yaml", ".yml"):
         raise OutputError(f"{path}: expected a .yaml file, such as map.yaml; the image map.pgm is written beside it")

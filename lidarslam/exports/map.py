@@ -16,14 +16,14 @@ from lidarslam.core.trajectory import read_transform
 from lidarslam.datasets.mounted_recording import recorded_axes
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
-from lidarslam.exports.source import read_run_scans, read_source
+from lidarslam.exports.source import read_map, read_run_scans, read_source
 from lidarslam.mapping.global_map import edits
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views, seen_through
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.storage.directory import CONFIG
-from lidarslam.storage.finished_run import is_run, load_map, read_summary, read_trajectory
+from lidarslam.storage.finished_run import is_run, read_summary, read_trajectory
 
 SUFFIXES = (".ply", ".pcd", ".laz", ".e57")
 _FEWEST_SAMPLES = 10
@@ -56,12 +56,7 @@ class _Map:
 
 
 def edit_map(sources: Sequence[Path], out: Path, asked: MapEdits) -> Iterator[str]:
-    """Write the edited map of run directories and clouds, in the frame of the first; lines about it.
-
-    Raises:
-        InputError: a source cannot be read, or an edit is not possible with it.
-        OutputError: the file cannot be written.
-    """
+    """Write the edited map of run directories and clouds, in the frame of the first; lines about it."""
     maps = []
     for source in sources:
         maps.append((yield from _read(source, asked.moved)))
@@ -71,9 +66,8 @@ def edit_map(sources: Sequence[Path], out: Path, asked: MapEdits) -> Iterator[st
         if asked.register:
             fit = _registered(maps[number].cloud, maps[0].cloud, T, source)
             T = fit.T_reference_map
-            how = (
-                "from everywhere" if fit.method == GLOBAL else f"moved by {fit.moved_m:.2f} m, {fit.moved_deg:.2f} deg"
-            )
+            moved = f"moved by {fit.moved_m:.2f} m, {fit.moved_deg:.2f} deg"
+            how = "from everywhere" if fit.method == GLOBAL else moved
             yield f"{source}: registered, {how}; {100.0 * fit.fitness:.0f} % of it within {fit.inlier_m:.2f} m"
         maps[number] = maps[number].moved(T)
     cloud = edits.joined([one.cloud for one in maps])
@@ -97,10 +91,8 @@ def _read(source: Path, moved: int | None) -> Generator[str, None, _Map]:
         cloud, removed = redrawn(source, moved)
         yield f"{source}: drawn again from the recording, {count(removed, 'point')} of moving objects removed"
         return _Map(cloud, positions)
-    cloud = load_map(source)
-    if not len(cloud):
-        raise InputError(f"{source}: has no map")
-    tiles = read_summary(source).get("map_tiles") if source.is_dir() else None
+    cloud, _ = read_map(source)
+    tiles = read_summary(source).get("map_tiles")
     if tiles is not None:
         yield f"{source}: the overview of a map in tiles, {len(cloud):,} of {tiles['points']:,} points"
     return _Map(cloud, positions)
@@ -158,25 +150,21 @@ def _cropped(whole: _Map, asked: MapEdits) -> Generator[str, None, PointCloud]:
 
 
 def upwards(run: Path) -> FloatArray:
-    """Unit vector (3,) upwards: the mean specific force in the world, without the change of the velocity.
-
-    Raises:
-        InputError: the recording has no IMU whose rotation is known, or is not there any more.
-    """
-    source = read_source(run, "is needed for the direction of gravity; level by the ground instead")
-    recording, trajectory = open_recording(source.path, source.reader), read_trajectory(run)
+    """Unit vector (3,) upwards: the mean specific force in the world, without the change of the velocity."""
+    of = read_source(run, "is needed for the direction of gravity; level by the ground instead")
+    recording, trajectory = open_recording(of.source, of.reader), read_trajectory(run)
     samples, instead = recording.imu, "level by the ground instead, with --level ground"
     if samples is None:
-        raise InputError(f"{source.path}: has no IMU; {instead}")
+        raise InputError(f"{of.source}: has no IMU; {instead}")
     T_lidar_imu, T_recorded_imu = samples.T_lidar_imu, load_config(run / CONFIG).odometry.T_recorded_imu
     if T_recorded_imu is not None:
         T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
     if T_lidar_imu is None:
-        raise InputError(f"{source.path}: the rotation of its IMU is not known; {instead}")
+        raise InputError(f"{of.source}: the rotation of its IMU is not known; {instead}")
     stamps = trajectory.stamps
     during = (samples.stamps >= stamps[0]) & (samples.stamps <= stamps[-1])
     if during.sum() < _FEWEST_SAMPLES or len(trajectory) < 3:
-        raise InputError(f"{source.path}: its IMU has too few samples during the run; {instead}")
+        raise InputError(f"{of.source}: its IMU has too few samples during the run; {instead}")
     R_world_imu = trajectory.at(samples.stamps[during])[:, :3, :3] @ T_lidar_imu[:3, :3]
     force = np.einsum("nij,nj->ni", R_world_imu, samples.accelerations[during]).mean(axis=0)
     velocities = np.diff(trajectory.positions, axis=0) / np.diff(stamps)[:, None]
@@ -188,9 +176,6 @@ def redrawn(run: Path, least_through: int) -> tuple[PointCloud, int]:
     """The map in one piece, and the number of points left out: those that `least_through` images see through, 0: none.
 
     Scans are deskewed along the final trajectory; those on which tracking was lost are left out.
-
-    Raises:
-        InputError: there is no run, or its recording is not there any more or cannot be read.
     """
     scans, summary = read_run_scans(run), read_summary(run)
     voxel_size_m = (summary.get("map_tiles") or {}).get("voxel_size_m") or summary.get("map_voxel_size_m")

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import cannot_write, make_directory, replacing
+from lidarslam.core.files import make_directory, written
 from lidarslam.core.geometry import FloatArray
+from lidarslam.exports.source import read_map
 from lidarslam.mapping.global_map.edits import Mesh, reconstruct
-from lidarslam.storage.finished_run import load_map, read_summary
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 _DEFAULT_CELL_M = 0.1
@@ -27,16 +27,9 @@ def export_mesh(run: Path, out: Path, cell_m: float | None) -> Iterator[str]:
     """Write the mesh of a run to a file with one of `SUFFIXES`; lines about it.
 
     Without an edge of the smallest cells, it is twice that of the map's voxels.
-
-    Raises:
-        InputError: there is no run or no map, or no surface results from it.
-        OutputError: the file cannot be written.
     """
-    cloud = load_map(run)
-    if not len(cloud):
-        raise InputError(f"{run}: has no map")
-    voxel = read_summary(run).get("map_voxel_size_m")
-    mesh = reconstruct(cloud, cell_m or (2.0 * voxel if voxel else _DEFAULT_CELL_M))
+    cloud, voxel_m = read_map(run)
+    mesh = reconstruct(cloud, cell_m or (2.0 * voxel_m if voxel_m else _DEFAULT_CELL_M))
     if not len(mesh.triangles):
         raise InputError(f"{run}: no surface comes of the {len(cloud):,} points of its map")
     _write(out, mesh)
@@ -53,32 +46,21 @@ def _write(out: Path, mesh: Mesh) -> None:
     if mesh.colours is not None:
         surface.vertex_colors = o3d.utility.Vector3dVector(mesh.colours.astype(np.float64) / 255.0)
     make_directory(out.parent)
-    try:
-        with replacing(out) as partial, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            if out.suffix == ".glb":
-                write_glb(partial, mesh, np.asarray(surface.vertex_normals))
-            elif not o3d.io.write_triangle_mesh(partial, surface):
-                raise OutputError(f"{out}: cannot be written; is the disk full?")
-    except OSError as error:
-        raise cannot_write(out, error) from error
+    with written(out) as partial, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        if out.suffix == ".glb":
+            write_glb(partial, mesh, np.asarray(surface.vertex_normals))
+        elif not o3d.io.write_triangle_mesh(partial, surface):
+            raise OutputError(f"{out}: cannot be written; is the disk full?")
 
 
 def write_glb(path: Path, mesh: Mesh, normals: FloatArray) -> None:
     """Write a mesh with normals (N, 3) of its vertices."""
-    vertices = mesh.vertices.astype("<f4")
+    vertices, vectors = mesh.vertices.astype("<f4"), {"componentType": _FLOAT, "type": "VEC3"}
+    box = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
     arrays: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         ("", mesh.triangles.astype("<u4").reshape(-1), {"componentType": _UINT32, "type": "SCALAR"}),
-        (
-            "POSITION",
-            vertices,
-            {
-                "componentType": _FLOAT,
-                "type": "VEC3",
-                "min": vertices.min(axis=0).tolist(),
-                "max": vertices.max(axis=0).tolist(),
-            },
-        ),
-        ("NORMAL", normals.astype("<f4"), {"componentType": _FLOAT, "type": "VEC3"}),
+        ("POSITION", vertices, {**vectors, **box}),
+        ("NORMAL", normals.astype("<f4"), vectors),
     ]
     if mesh.colours is not None:
         opaque = np.column_stack([mesh.colours, np.full(len(vertices), 255, np.uint8)])

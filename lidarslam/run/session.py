@@ -208,10 +208,11 @@ def open_session(
 
 def draw_report(out: Path, outcome: RunOutcome, phase: Callable[[str], None] = lambda _: None) -> None:
     """Draw report.html and its pictures; a failure is a warning."""
-    from lidarslam.viewer.run_report import Accuracy, leave_report
+    from lidarslam.evaluation.comparison.comparison import MethodResult
+    from lidarslam.viewer.run_report import leave_report
 
     phase("drawing the report")
-    leave_report(out, Accuracy(outcome.metrics))
+    leave_report(out, MethodResult(out.name, "ok", metrics=outcome.metrics))
 
 
 def write_in_utm(run: Path) -> None:

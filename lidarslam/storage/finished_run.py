@@ -1,7 +1,7 @@
 """Runs read back from disk."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,8 +91,7 @@ def is_run(path: Path) -> bool:
 def load_run(path: Path) -> FinishedRun:
     """Read a run directory; InputError where there is no run, or a file of it is damaged."""
     trajectory = read_trajectory(path)
-    statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
-    lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
+    lost, loops = read_scans(path, len(trajectory)).lost, _loops(path, len(trajectory))
     cloud, other = shown_map(path), localised_in(path)
     name, frame_of = path.resolve().name, None if other is None else other.resolve()
     return FinishedRun(name, trajectory, lost, cloud.points, loops, cloud.attributes, frame_of, path.resolve())
@@ -156,20 +155,44 @@ def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     return found[((found >= 0) & (found < scans)).all(axis=1)]
 
 
-def read_statuses(path: Path, poses: int) -> list[Status]:
-    """The status of each scan of a run, ok where no table has been kept; InputError where that does not fit."""
+@dataclass(frozen=True, eq=False)
+class ScanTable:
+    """scans.csv of a run."""
+
+    file: Path
+    rows: Sequence[Mapping[str, str]]  # of each scan; none where no table has been kept
+    statuses: Sequence[Status]  # of each scan; ok where no table has been kept
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(N,) whether tracking was lost."""
+        return np.array([status is Status.LOST for status in self.statuses], dtype=np.bool_)
+
+    def numbers(self, name: str) -> FloatArray:
+        """A column (N,), NaN where there is no number."""
+        if not self.rows:
+            return np.full(len(self.statuses), np.nan)
+        try:
+            return np.array([float(row.get(name) or "nan") for row in self.rows])
+        except ValueError as error:
+            raise InputError(f"{self.file}: not a run's table ({error}); make the run again") from error
+
+
+def read_scans(path: Path, poses: int) -> ScanTable:
+    """The table of a run; InputError where it is damaged, or has not a row for each pose."""
     file = path / files.SCANS_CSV
     if not file.is_file():
-        return [Status.OK] * poses
+        return ScanTable(file, (), [Status.OK] * poses)
     try:
-        with file.open(encoding="utf-8", newline="") as rows:
-            statuses = [Status(row["status"]) for row in csv.DictReader(rows)]
+        with file.open(encoding="utf-8", newline="") as lines:
+            rows = list(csv.DictReader(lines))
+        statuses = [Status(row["status"]) for row in rows]
     except (KeyError, ValueError, csv.Error) as error:  # not UTF-8 is a ValueError
         reason = f"{error} is missing" if isinstance(error, KeyError) else error
         raise InputError(f"{file}: not a run's table ({reason}); make the run again") from error
-    if len(statuses) != poses:
-        raise InputError(f"{file}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again")
-    return statuses
+    if len(rows) != poses:
+        raise InputError(f"{file}: has {len(rows):,} rows for {poses:,} poses; it is cut off, make the run again")
+    return ScanTable(file, rows, statuses)
 
 
 class _Stretch(TypedDict):

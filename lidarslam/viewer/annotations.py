@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.report.error_colours import viridis
+from lidarslam.evaluation.report.error_colours import ramp, viridis
 from lidarslam.viewer.view import View
 
 Quantity = Literal["height", "intensity", "error", "rgb"]
 
 UNKNOWN = (205, 205, 205)
 """Where there is no value."""
-_CLIPPED_PERCENT = 2.0
+_CLIPPED = (2.0, 98.0)  # percent
 _LEVELS = np.linspace(0.0, 1.0, 256)
 _UNITS: dict[Quantity, tuple[str, str]] = {
     "height": ("z", " m"),
@@ -32,17 +32,10 @@ _LONGEST_BAR = 0.2
 _END_WIDENING = 0.25  # of the marks of wide paths, relative to that of the paths
 _LONGEST_NAME = 32
 
-
-def _ramp(stops: list[list[int]]) -> NDArray[np.uint8]:
-    """Colours (256, 3) between even stops."""
-    places = np.linspace(0.0, 1.0, len(stops))
-    return np.stack([np.interp(_LEVELS, places, stop) for stop in np.transpose(stops)], axis=1).astype(np.uint8)
-
-
 # On white paper: light ground, dark tops; dark for little light returned; pale for small errors.
 _RAMPS: dict[Quantity, NDArray[np.uint8]] = {
-    "height": _ramp([[201, 209, 214], [140, 181, 199], [66, 138, 166], [41, 84, 135], [60, 28, 92]]),
-    "intensity": _ramp([[45, 30, 70], [120, 50, 110], [200, 85, 80], [240, 155, 60], [250, 220, 130]]),
+    "height": ramp(_LEVELS, [(201, 209, 214), (140, 181, 199), (66, 138, 166), (41, 84, 135), (60, 28, 92)]),
+    "intensity": ramp(_LEVELS, [(45, 30, 70), (120, 50, 110), (200, 85, 80), (240, 155, 60), (250, 220, 130)]),
     "error": viridis(_LEVELS)[::-1],
 }
 
@@ -78,7 +71,7 @@ def levels(values: FloatArray) -> FloatArray:
     """Values (N,) from 0 to 1, the lowest and highest 2 % clipped."""
     if not len(values):
         return values
-    low, high = np.percentile(values, [_CLIPPED_PERCENT, 100.0 - _CLIPPED_PERCENT])
+    low, high = np.percentile(values, _CLIPPED)
     return np.asarray(np.clip((values - low) / max(high - low, 1e-6), 0.0, 1.0))
 
 
@@ -87,7 +80,7 @@ def fit_scale(quantity: Quantity, values: FloatArray) -> ColourScale | None:
     known = values[np.isfinite(values)]
     if not len(known):
         return None
-    low, high = np.percentile(known, [_CLIPPED_PERCENT, 100.0 - _CLIPPED_PERCENT])
+    low, high = np.percentile(known, _CLIPPED)
     return ColourScale(quantity, 0.0 if quantity == "error" else float(low), float(high))
 
 
@@ -105,14 +98,14 @@ def draw_path(
     picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], wider: float = 1.0
 ) -> None:
     """Draw a path through positions (N, 3) above everything, in the colours of its poses, widened by a factor."""
-    pixels = _pixels(view, positions)
+    pixels = view.project(positions)
     for first, last in _stretches(colours):
         _line(picture, pixels[first : last + 1], colours[last], wider * _line_width(view))
 
 
 def draw_outline(picture: Image.Image, view: View, positions: FloatArray, colour: Colour, wider: float = 1.0) -> None:
     """Draw the outline below a path that is widened by a factor."""
-    _line(picture, _pixels(view, positions), colour, (wider + 1.0) * _line_width(view))
+    _line(picture, view.project(positions), colour, (wider + 1.0) * _line_width(view))
 
 
 def draw_end(picture: Image.Image, view: View, position: FloatArray, colour: Colour, wider: float = 1.0) -> None:
@@ -223,15 +216,11 @@ def _line_width(view: View) -> float:
     return max(2.0, view.width * _LINE)
 
 
-def _pixels(view: View, positions: FloatArray) -> list[tuple[float, float]]:
-    return [(column, row) for column, row in view.project(positions).tolist()]
-
-
-def _line(picture: Image.Image, pixels: Sequence[tuple[float, float]], colour: Colour, width: float) -> None:
-    """A line with round joints; Pillow's own leave gaps between short pieces."""
+def _line(picture: Image.Image, pixels: FloatArray, colour: Colour, width: float) -> None:
+    """A line (N, 2) with round joints; Pillow's own leave gaps between short pieces."""
     pen, radius = ImageDraw.Draw(picture), 0.5 * width
-    pen.line(pixels, fill=colour, width=round(width))
-    for column, row in pixels:
+    pen.line(pixels.ravel().tolist(), fill=colour, width=round(width))
+    for column, row in pixels.tolist():
         pen.ellipse([column - radius, row - radius, column + radius, row + radius], fill=colour)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import cannot_write, make_directory, replacing
+from lidarslam.core.files import make_directory, written
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
@@ -17,12 +17,12 @@ from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
 from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD
 from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.comparison_folder import run_directories
 from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
-from lidarslam.storage.finished_run import read_statuses, read_trajectory, shown_map
+from lidarslam.storage.finished_run import read_scans, read_trajectory, shown_map
 from lidarslam.viewer import annotations as notes
 from lidarslam.viewer.annotations import UNKNOWN, Colour, ColourScale, Entry, Quantity, fit_scale
 from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view
@@ -109,8 +109,9 @@ def fit_frame(
     turn_deg: float | None = None,
 ) -> Frame:
     """The frame that holds all runs except diverging ones; arguments as in `draw_runs` and `fit_view`."""
-    view = fit_view(*framed(runs, reference), elevation_deg, turn_deg, width)
-    return Frame(view, quantity, _fit_scale(runs, quantity))
+    found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
+    scale = fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
+    return Frame(fit_view(*framed(runs, reference), elevation_deg, turn_deg, width), quantity, scale)
 
 
 def framed(runs: Sequence[DrawnRun], reference: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
@@ -139,7 +140,8 @@ def draw_runs(
     """
     frame = frame or fit_frame(runs, elevation_deg, reference, width)
     fine = frame.view.enlarged(_SUPERSAMPLING)
-    colours = _colours(runs)
+    # A single run is coloured by its quantity.
+    colours = [_RUN_COLOURS[n % len(_RUN_COLOURS)] if len(runs) > 1 else None for n in range(len(runs))]
     image = Image.fromarray(_draw_maps(runs, colours, fine, frame))
     if reference is not None:
         notes.draw_path(image, fine, reference, [_REFERENCE] * len(reference), _REFERENCE_WIDER)
@@ -161,12 +163,7 @@ def draw_runs(
 
 
 def draw_apart(runs: Sequence[DrawnRun], folder: Path, frame: Frame) -> list[Path]:
-    """A picture of each run, FOLDER/NAME.png, all in one frame; the files.
-
-    Raises:
-        InputError: two runs have one name.
-        OutputError: they cannot be written.
-    """
+    """A picture of each run, FOLDER/NAME.png, all in one frame; the files."""
     names = [run.name for run in runs]
     if len(set(names)) < len(names):
         raise InputError(f"{folder}: several runs have one name ({', '.join(names)}); draw them in one picture")
@@ -178,30 +175,11 @@ def draw_apart(runs: Sequence[DrawnRun], folder: Path, frame: Frame) -> list[Pat
 
 
 def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture (height, width, 3) as .png, .jpg or .jpeg.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write a picture (height, width, 3) as .png, .jpg or .jpeg."""
     if path.suffix.lower() not in _SUFFIXES:
         raise OutputError(f"{path}: a picture must end in .png or .jpg")
-    try:
-        with replacing(path) as partial:
-            Image.fromarray(picture).save(partial)
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
-def _fit_scale(runs: Sequence[DrawnRun], quantity: Quantity) -> ColourScale | None:
-    found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
-    return fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
-
-
-def _colours(runs: Sequence[DrawnRun]) -> list[Colour | None]:
-    """The colour of each of several runs; None for a single one."""
-    if len(runs) == 1:
-        return [None]
-    return [_RUN_COLOURS[number % len(_RUN_COLOURS)] for number in range(len(runs))]
+    with written(path) as partial:
+        Image.fromarray(picture).save(partial)
 
 
 def _draw_maps(
@@ -296,20 +274,12 @@ def _named(run: DrawnRun, runs: Sequence[DrawnRun]) -> str:
 
 
 def load_drawn_runs(paths: Sequence[Path], truth: Trajectory | None = None) -> list[DrawnRun]:
-    """Runs, the runs of a comparison, and .ply or .pcd files; the truth of the recording gives the runs' errors.
-
-    Raises:
-        InputError: a path is none of these, or has neither a map nor a trajectory.
-    """
+    """Runs, the runs of a comparison, and .ply or .pcd files; the truth of the recording gives the runs' errors."""
     return [_load(path, truth) for given in paths for path in run_directories(given)]
 
 
 def require_quantity(run: DrawnRun, quantity: Quantity) -> None:
-    """Refuse to colour a run by a quantity that it lacks.
-
-    Raises:
-        InputError: it has no such attribute, or there is nothing to compare with.
-    """
+    """Refuse to colour a run by a quantity that it lacks."""
     known = run.cloud.attributes.rgb if quantity == "rgb" else run.point_values(quantity)
     if known is None:
         known = run.pose_values(quantity)
@@ -326,14 +296,13 @@ def _load(path: Path, truth: Trajectory | None) -> DrawnRun:
         return DrawnRun(name, cloud, distances_m=_distances_m(path, len(cloud)))
     trajectory = read_trajectory(path)
     errors_m = None if truth is None else _errors_m(trajectory, truth)
-    return DrawnRun(name, cloud, trajectory.positions, read_statuses(path, len(trajectory)), errors_m)
+    return DrawnRun(name, cloud, trajectory.positions, read_scans(path, len(trajectory)).statuses, errors_m)
 
 
 def _errors_m(trajectory: Trajectory, truth: Trajectory) -> FloatArray | None:
     """Distances (N,) of the poses to the truth, aligned as for the ATE; None where they share no instants."""
-    try:
-        association = associate(trajectory, truth)
-    except InputError:
+    association = common_instants(trajectory, truth)
+    if association is None:
         return None
     errors_m = np.full(len(trajectory), np.nan)
     errors_m[association.rows] = absolute_errors(association, align(association.estimate, association.reference))[0]

@@ -1,55 +1,38 @@
 """Errors of a map in Rerun."""
 
-from pathlib import Path
-
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lidarslam.core.files import cannot_write
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.map.metrics import CloudErrors, MapComparison
+from lidarslam.evaluation.map.metrics import MapComparison
 from lidarslam.evaluation.report.error_colours import error_colours
-from lidarslam.viewer.rerun_recording import (
-    BACKGROUND,
-    MAP_RADIUS,
-    PATH_RADIUS,
-    REFERENCE_COLOUR,
-    IncompleteRecordingError,
-    rerun_recording,
-)
+from lidarslam.viewer.rerun_output import Show
+from lidarslam.viewer.rerun_recording import BACKGROUND, MAP_RADIUS, PATH_RADIUS, REFERENCE_COLOUR
 
 
-def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | None, clip_m: float) -> None:
-    """Write a .rrd file of a map coloured by its distance to the reference, and of the reference by that to the map.
+def show_errors(comparison: MapComparison, positions: FloatArray, clip_m: float) -> Show:
+    """A map coloured by its distance to the reference, and the reference by that to the map.
 
     The clouds are shown about their middle, because the viewer counts in single precision, with the path (K, 3) of the
     sensor in the reference's frame; `clip_m` is the distance of the brightest colour.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     points = comparison.reference_errors.points
     middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
-    try:
-        with rerun_recording("map errors", path, blueprint=_blueprint()) as recording:
-            _log_errors(recording, "world/map_to_reference", comparison.map_errors, middle, clip_m)
-            _log_errors(recording, "world/reference_to_map", comparison.reference_errors, middle, clip_m)
-            if positions is not None:
-                line = rr.LineStrips3D([positions - middle], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
-                recording.log("world/path", line, static=True)
-            origin = ", ".join(f"{m:.0f}" for m in middle)
-            text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"
-            recording.log("legend", rr.TextDocument(text), static=True)
-    except (OSError, IncompleteRecordingError) as error:
-        raise cannot_write(path, error) from error
+    clouds = {"map_to_reference": comparison.map_errors, "reference_to_map": comparison.reference_errors}
 
+    def log(recording: rr.RecordingStream) -> None:
+        for entity, errors in clouds.items():
+            colours = error_colours(errors.distances_m, clip_m)
+            cloud = rr.Points3D(errors.points - middle, colors=colours, radii=MAP_RADIUS)
+            recording.log(f"world/{entity}", cloud, static=True)
+        line = rr.LineStrips3D([positions - middle], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
+        recording.log("world/path", line, static=True)
+        origin = ", ".join(f"{m:.0f}" for m in middle)
+        text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"
+        recording.log("legend", rr.TextDocument(text), static=True)
 
-def _log_errors(
-    recording: rr.RecordingStream, entity: str, errors: CloudErrors, middle: FloatArray, clip_m: float
-) -> None:
-    colours = error_colours(errors.distances_m, clip_m)
-    recording.log(entity, rr.Points3D(errors.points - middle, colors=colours, radii=MAP_RADIUS), static=True)
+    return Show("map errors", _blueprint(), log)
 
 
 def _blueprint() -> rrb.Blueprint:

@@ -36,11 +36,7 @@ class Show:
 
 
 def save(show: Show, path: Path) -> None:
-    """Write a .rrd file.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write a .rrd file."""
     try:
         with replacing(path) as partial, rerun_recording(show.name, partial, blueprint=show.blueprint) as recording:
             show.log(recording)
@@ -49,11 +45,7 @@ def save(show: Show, path: Path) -> None:
 
 
 def show_in_window(show: Show) -> None:
-    """Show it in a window.
-
-    Raises:
-        OutputError: there is no display, or the window cannot be opened.
-    """
+    """Show it in a window."""
     require_window(_INSTEAD)
     open_window(GRPC_PORT)
     with rerun_recording(show.name, None, rr.GrpcSink(), show.blueprint) as recording:
@@ -66,11 +58,7 @@ def show_in_window(show: Show) -> None:
 
 
 def show_on_page(show: Show, page: WebPage) -> None:
-    """Show it in a browser; it is in a temporary file without a name, removed with the program.
-
-    Raises:
-        OutputError: there is no room for it.
-    """
+    """Show it in a browser; it is in a temporary file without a name, removed with the program."""
     with tempfile.TemporaryFile() as file:
         path = OPEN_FILES / str(file.fileno())
         try:
@@ -81,23 +69,14 @@ def show_on_page(show: Show, page: WebPage) -> None:
 
 
 def show_file_in_window(path: Path) -> None:
-    """Show a .rrd file in a window.
-
-    Raises:
-        InputError: it is none.
-        OutputError: there is no display, or the window cannot be opened.
-    """
+    """Show a .rrd file in a window."""
     _require_recording(path)
     require_window("use --web")
     open_window(GRPC_PORT, path)
 
 
 def show_file_on_page(path: Path, page: WebPage) -> None:
-    """Show a .rrd file in a browser.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Show a .rrd file in a browser."""
     _require_recording(path)
     with page.showing(path):
         pass

@@ -40,22 +40,14 @@ def is_taken(port: int) -> bool:
 
 
 def require_window(instead: str) -> None:
-    """Check that a window can be opened, before anything is computed for it; `instead` names the alternative.
-
-    Raises:
-        OutputError: there is no display.
-    """
+    """Check that a window can be opened, before anything is computed for it; `instead` names the alternative."""
     # A viewer that runs already, perhaps at the other end of a tunnel, needs no display here.
     if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not is_taken(GRPC_PORT):
         raise OutputError(f"no display to open a window on; {instead}")
 
 
 def open_window(port: int, recording: Path | None = None) -> None:
-    """Open the viewer, which takes recordings at a port, unless it is open already, and show a file.
-
-    Raises:
-        OutputError: it cannot be opened.
-    """
+    """Open the viewer, which takes recordings at a port, unless it is open already, and show a file."""
     options = ["--port", str(port), "--memory-limit", "75%", "--expect-data-soon", "--hide-welcome-screen"]
     if recording is not None:
         options.append(str(recording.resolve()))
@@ -69,11 +61,7 @@ def open_window(port: int, recording: Path | None = None) -> None:
 
 @contextlib.contextmanager
 def served_page(announce: Callable[[str], None]) -> Iterator[WebPage]:
-    """A page for browsers on this machine, during the block; its address is announced with the first content.
-
-    Raises:
-        OutputError: it cannot be served.
-    """
+    """A page for browsers on this machine, during the block; its address is announced with the first content."""
     page = WebPage(_page_files(), announce)
     try:
         yield page
@@ -82,11 +70,7 @@ def served_page(announce: Callable[[str], None]) -> Iterator[WebPage]:
 
 
 def _page_files() -> dict[str, bytes]:
-    """The files of the viewer for browsers, by their paths on its page; they are part of the program.
-
-    Raises:
-        OutputError: they cannot be loaded.
-    """
+    """The files of the viewer for browsers, by their paths on its page; they are part of the program."""
     with socket.socket() as probe:
         probe.bind((LOCAL, 0))
         port = probe.getsockname()[1]

@@ -18,9 +18,10 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.report.error_colours import viridis
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.annotations import levels
@@ -58,13 +59,7 @@ class IncompleteRecordingError(OutputError):
 def rerun_recording(
     name: str, path: Path | None, window: rr.GrpcSink | None = None, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A recording that goes to a file, to a window or both, with a name and layout; written when the block ends.
-
-    Raises:
-        IncompleteRecordingError: it was not written to its end.
-        OutputError: it cannot be begun.
-        OSError: the file cannot be made.
-    """
+    """A recording that goes to a file, to a window or both, with a name and layout; written when the block ends."""
     recording = rr.RecordingStream("lidarslam")
     file = None if path is None else _PipedFile(path)
     try:
@@ -94,11 +89,7 @@ def rerun_recording(
 
 
 def require_complete(path: Path) -> None:
-    """Check that a recording was written to its end.
-
-    Raises:
-        IncompleteRecordingError: it was not.
-    """
+    """Check that a recording was written to its end."""
     footer = b""
     with contextlib.suppress(OSError), path.open("rb") as file:
         file.seek(-len(_FOOTER) - _FLAG_BYTES, os.SEEK_END)
@@ -134,18 +125,25 @@ def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3
     return rr.LineStrips3D(list(positions[loops]), colors=[_LOOP_COLOUR], radii=PATH_RADIUS)
 
 
+def true_path(truth: Trajectory) -> rr.LineStrips3D:
+    """The line of the ground truth."""
+    return rr.LineStrips3D([truth.positions], colors=[REFERENCE_COLOUR], labels=["ground truth"])
+
+
+def about_its_start(truth: Trajectory, least: int) -> Trajectory | None:
+    """In the world of its first pose, as the viewer counts in single precision; None of fewer than `least` poses."""
+    return truth.transformed(inverse(truth.T_world_lidar[0])) if len(truth) >= least else None
+
+
 def set_stamp(recording: rr.RecordingStream, index: int, stamp: float) -> None:
     """Set the time of the next logged data: that of the scan with this number."""
     recording.set_time(SCAN, sequence=index)
-    if _is_date(stamp):
-        recording.set_time(TIME, timestamp=stamp)
-    else:
-        recording.set_time(TIME, duration=stamp)
+    recording.set_time(TIME, **{_time_kind(stamp): stamp})
 
 
 def stamp_column(stamps: FloatArray) -> rr.TimeColumn:
     """The times of several rows that are sent at once."""
-    return rr.TimeColumn(TIME, timestamp=stamps) if _is_date(stamps[0]) else rr.TimeColumn(TIME, duration=stamps)
+    return rr.TimeColumn(TIME, **{_time_kind(stamps[0]): stamps})
 
 
 def whole_past() -> list[rr.VisibleTimeRange]:
@@ -154,8 +152,8 @@ def whole_past() -> list[rr.VisibleTimeRange]:
     return [rr.VisibleTimeRange(timeline, start=start, end=end) for timeline in (SCAN, TIME)]
 
 
-def _is_date(stamp: float) -> bool:
-    return bool(stamp >= _FIRST_DATE_S)
+def _time_kind(stamp: float) -> Any:
+    return "timestamp" if stamp >= _FIRST_DATE_S else "duration"
 
 
 def every_nth(rows: NDArray[Any], count: int) -> NDArray[Any]:

@@ -1,30 +1,30 @@
 """Finished runs in Rerun, each with a colour and an entity of its own."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.association import Association, associate
+from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer.rerun_output import Show
 from lidarslam.viewer.rerun_recording import (
     BACKGROUND,
     PATH_RADIUS,
-    REFERENCE_COLOUR,
     STATUS_COLOURS,
     TIME,
+    about_its_start,
     log_map,
     stamp_column,
+    true_path,
     whole_past,
 )
 
@@ -40,8 +40,9 @@ class _Shown:
     run: FinishedRun
     name: str  # different from those of the others
     colour: tuple[int, int, int]
-    error_stamps: FloatArray  # (M,) where there is a reference, none without
-    errors_m: FloatArray  # (M,) distance to the reference
+    # (M,) where there is a reference: distances to it, and their stamps
+    errors_m: FloatArray = field(default_factory=lambda: np.empty(0))
+    error_stamps: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @property
     def entity(self) -> str:
@@ -55,16 +56,13 @@ def show_runs(runs: Sequence[FinishedRun], reference: Trajectory | None, config:
     Runs that share instants with the reference, the true trajectory, are aligned with it; others are shown each in its
     own world, which begins at its first scan.
     """
-    if reference is not None and len(reference):
-        reference = reference.transformed(inverse(reference.T_world_lidar[0]))  # the viewer counts in single precision
-    else:
-        reference = None
+    if reference is not None:
+        reference = about_its_start(reference, least=1)
     shown = list(_in_one_world(runs, reference))
 
     def log(recording: rr.RecordingStream) -> None:
         if reference is not None:
-            line = rr.LineStrips3D([reference.positions], colors=[REFERENCE_COLOUR], labels=["ground truth"])
-            recording.log("world/ground truth", line, static=True)
+            recording.log("world/ground truth", true_path(reference), static=True)
         for one in shown:
             _log_run(recording, one, len(shown) > 1, config)
 
@@ -75,23 +73,15 @@ def _in_one_world(runs: Sequence[FinishedRun], reference: Trajectory | None) -> 
     names = [run.name for run in runs]
     for number, run in enumerate(runs):
         name = run.name if names.count(run.name) == 1 else f"{run.name} ({number + 1})"
-        shown = _Shown(run, name, _COLOURS[number % len(_COLOURS)], np.empty(0), np.empty(0))
+        shown = _Shown(run, name, _COLOURS[number % len(_COLOURS)])
         base = next((other for other in runs if other.path is not None and other.path == run.frame_of), None)
         if reference is None:
             yield shown
         elif base is not None:  # it is moved with the run in whose map it was localised
-            found = _association(base, reference)
+            found = common_instants(base.trajectory, reference)
             yield shown if found is None else _moved(shown, align(found.estimate, found.reference))
         else:
             yield _aligned(shown, reference)
-
-
-def _association(run: FinishedRun, reference: Trajectory) -> Association | None:
-    """The common instants; None where there are none, as for a run of another recording."""
-    try:
-        return associate(run.trajectory, reference)
-    except InputError:
-        return None
 
 
 def _moved(shown: _Shown, T_reference_world: FloatArray) -> _Shown:
@@ -103,7 +93,7 @@ def _moved(shown: _Shown, T_reference_world: FloatArray) -> _Shown:
 
 def _aligned(shown: _Shown, reference: Trajectory) -> _Shown:
     """With its errors; unchanged where it shares no instants with the reference."""
-    association = _association(shown.run, reference)
+    association = common_instants(shown.run.trajectory, reference)
     if association is None:
         return shown
     T_reference_world = align(association.estimate, association.reference)

@@ -10,7 +10,6 @@ import rerun.blueprint as rrb
 
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
@@ -25,6 +24,7 @@ from lidarslam.viewer.rerun_recording import (
     REFERENCE_COLOUR,
     SCAN_RADIUS,
     TIME,
+    about_its_start,
     every_nth,
     set_stamp,
 )
@@ -48,8 +48,8 @@ def show_scans(
     scans done, and the total, and `tell` is called with each fault of the recording, as a line.
     """
     truth = recording.ground_truth
-    if truth is not None:  # the viewer counts in single precision
-        truth = truth.transformed(inverse(truth.T_world_lidar[0])) if len(truth) >= 2 else None
+    if truth is not None:
+        truth = about_its_start(truth, least=2)
 
     def log(stream: rr.RecordingStream) -> None:
         if truth is not None:

@@ -17,7 +17,6 @@ from lidarslam.viewer.rerun_program import GRPC_PORT, open_window
 from lidarslam.viewer.rerun_recording import (
     BACKGROUND,
     PATH_RADIUS,
-    REFERENCE_COLOUR,
     SCAN,
     SCAN_RADIUS,
     STATUS_COLOURS,
@@ -26,6 +25,7 @@ from lidarslam.viewer.rerun_recording import (
     loop_lines,
     rerun_recording,
     set_stamp,
+    true_path,
     whole_past,
 )
 from lidarslam.viewer.viewer import Viewer
@@ -58,8 +58,7 @@ class RerunViewer(Viewer):
 
     def show_reference(self, reference: Trajectory) -> None:
         """The whole true path, at once."""
-        path = rr.LineStrips3D([reference.positions], colors=[REFERENCE_COLOUR], labels=["ground truth"])
-        self._recording.log("world/ground_truth", path, static=True)
+        self._recording.log("world/ground_truth", true_path(reference), static=True)
 
     def show_scan(self, index: int, result: ScanEstimate) -> None:
         """The scan at its pose, the next piece of the trajectory, the next value of every plot."""
@@ -106,12 +105,7 @@ class RerunViewer(Viewer):
 def rerun_viewer(
     name: str, config: ViewerConfig, path: Path, window: bool = False, page: WebPage | None = None
 ) -> Iterator[RerunViewer]:
-    """A viewer that writes the recording `path`, and shows it in a window or on a page too if asked for.
-
-    Raises:
-        IncompleteRecordingError: the recording was not written to its end.
-        OutputError: it cannot be begun, or the window cannot be opened.
-    """
+    """A viewer that writes the recording `path`, and shows it in a window or on a page too if asked for."""
     if window:
         open_window(GRPC_PORT)
     with (

@@ -1,11 +1,10 @@
 """report.html, map.png and trajectory.png of a run, drawn from the files of its directory."""
 
-import csv
 import io
 import logging
 from base64 import b64encode
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,12 @@ from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text import count, scan_span, small_length
-from lidarslam.core.trajectory import Trajectory
-from lidarslam.evaluation.comparison.comparison import MapErrors, MethodResult, ScanSeries, SequenceComparison
-from lidarslam.evaluation.report.report import RunPage, render_run
-from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
+from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult, ScanSeries, SequenceComparison
+from lidarslam.evaluation.report.report import render_run
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import MAP_TILES, SCANS_CSV, RunDirectory
-from lidarslam.storage.finished_run import read_statuses, read_summary, read_trajectory
+from lidarslam.storage.finished_run import read_scans, read_summary, read_trajectory
 from lidarslam.viewer.picture import draw_runs, fit_frame, load_drawn_runs
 
 logger = logging.getLogger(__name__)
@@ -40,22 +37,25 @@ _CAPTION = (
 _LISTED = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Accuracy:
-    """Errors of a run, as far as there are references."""
+def leave_report(run: Path, errors: MethodResult, reference: str = GROUND_TRUTH, notes: Sequence[str] = ()) -> bool:
+    """Draw the page and the pictures of a finished run; whether it could be done. A failure is a warning.
 
-    metrics: TrajectoryMetrics | None = None
-    reference: str = "ground truth"  # name of the reference trajectory
-    trajectory: Trajectory | None = None  # the poses that were compared; None: the run's own
-    map_metrics: Mapping[str, object] | None = None  # the content of metrics.json's "map"
-    map_errors: MapErrors | None = None
-    notes: tuple[str, ...] = ()  # remarks for the reader
-
-
-def leave_report(run: Path, accuracy: Accuracy) -> bool:
-    """Draw the page and the pictures of a finished run; whether it could be done. A failure is a warning."""
+    Args:
+        run: its directory.
+        errors: of the run, as far as there are references; a trajectory there is the one that was compared, if not the
+            run's own.
+        reference: name of the reference trajectory.
+        notes: remarks for the reader.
+    """
     try:
-        _draw(run, accuracy)
+        directory, (drawn,) = RunDirectory(run), load_drawn_runs([run])
+        path, truth, frame = replace(drawn, cloud=_NO_CLOUD), _true_path(errors), fit_frame([drawn])
+        alone = fit_frame([path], reference=truth, turn_deg=frame.view.turn_deg)
+        _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], reference=truth, frame=alone).pixels)
+        picture = None
+        if len(drawn.cloud):
+            picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn], frame=frame).pixels)
+        directory.write_text(files.REPORT, _page(run, errors, reference, notes, picture))
     except KeyboardInterrupt:
         logger.warning("%s: no %s was drawn: interrupted", run, files.REPORT)
     except Exception as error:
@@ -66,24 +66,12 @@ def leave_report(run: Path, accuracy: Accuracy) -> bool:
     return False
 
 
-def _draw(run: Path, accuracy: Accuracy) -> None:
-    directory, (drawn,) = RunDirectory(run), load_drawn_runs([run])
-    path, truth = replace(drawn, cloud=_NO_CLOUD), _true_path(accuracy)
-    frame = fit_frame([drawn])
-    alone = fit_frame([path], reference=truth, turn_deg=frame.view.turn_deg)
-    _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], reference=truth, frame=alone).pixels)
-    picture = None
-    if len(drawn.cloud):
-        picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn], frame=frame).pixels)
-    directory.write_text(files.REPORT, render_run(_page(run, accuracy, picture)))
-
-
-def _true_path(accuracy: Accuracy) -> FloatArray | None:
+def _true_path(errors: MethodResult) -> FloatArray | None:
     """Positions of the reference in the run's world; None without one, or in the frame of a camera."""
-    if accuracy.metrics is None or accuracy.trajectory is not None:
+    if errors.metrics is None or errors.trajectory is not None:
         return None
-    reference = accuracy.metrics.association.reference
-    return reference.transformed(inverse(accuracy.metrics.T_reference_estimate)).positions
+    reference = errors.metrics.association.reference
+    return reference.transformed(inverse(errors.metrics.T_reference_estimate)).positions
 
 
 def _write_picture(directory: RunDirectory, name: str, pixels: NDArray[np.uint8]) -> str:
@@ -95,29 +83,21 @@ def _write_picture(directory: RunDirectory, name: str, pixels: NDArray[np.uint8]
     return b64encode(content.getvalue()).decode()
 
 
-def _page(run: Path, accuracy: Accuracy, picture: str | None) -> RunPage:
+def _page(run: Path, errors: MethodResult, reference_name: str, notes: Sequence[str], picture: str | None) -> str:
     summary, settings = read_summary(run), (run / files.CONFIG).read_text(encoding="utf-8")
     described = read_yaml(run / files.CONFIG).get(files.RUN_SECTION) or {}
-    result = with_run(MethodResult(run.resolve().name, "lost" if summary["lost_scans"] else "ok"), run)
-    result = replace(
-        result,
-        trajectory=accuracy.trajectory or result.trajectory,
-        metrics=accuracy.metrics,
-        map_metrics=accuracy.map_metrics,
-        map_errors=accuracy.map_errors,
-        peak_rss_mb=summary["peak_rss_mb"],
-        series=read_series(run),
-    )
-    reference = None if accuracy.metrics is None else accuracy.metrics.association.reference
-    return RunPage(
-        title=result.name,
+    name, is_lost = run.resolve().name, bool(summary["lost_scans"])
+    result = replace(errors, name=name, status="lost" if is_lost else "ok", peak_rss_mb=summary["peak_rss_mb"])
+    result = with_run(result, run)
+    result = replace(result, trajectory=errors.trajectory or result.trajectory, series=_series(run, result.scans))
+    reference = None if errors.metrics is None else errors.metrics.association.reference
+    return render_run(
+        name,
+        SequenceComparison(name, str(described.get("source", "")), reference, reference_name, [result]),
         about=describe_source(described),
-        sequence=SequenceComparison(
-            result.name, str(described.get("source", "")), reference, accuracy.reference, [result]
-        ),
         picture=picture,
         caption=_CAPTION,
-        warnings=[*describe_warnings(summary), *accuracy.notes],
+        warnings=[*describe_warnings(summary), *notes],
         summary=describe_results(summary),
         changed=changed_settings(load_config(run / files.CONFIG)),
         settings=settings,
@@ -125,20 +105,16 @@ def _page(run: Path, accuracy: Accuracy, picture: str | None) -> RunPage:
 
 
 def with_run(result: MethodResult, run: Path) -> MethodResult:
-    """The result with the content of a run directory.
-
-    Raises:
-        InputError: a file is damaged, or lacks a quantity.
-    """
+    """The result with the content of a run directory."""
     trajectory, summary = read_trajectory(run), read_summary(run)
-    statuses = read_statuses(run, len(trajectory))
+    lost = read_scans(run, len(trajectory)).lost
     try:
         ms = {stage: values["median"] for stage, values in summary["ms_per_scan"].items()}
         return replace(
             result,
             scans=len(trajectory),
             trajectory=trajectory,
-            lost=np.array([status == "lost" for status in statuses], dtype=np.bool_),
+            lost=lost,
             lost_reasons=tuple(stretch["reason"] for stretch in summary["lost"]),
             map_entropy=summary["map_entropy"],
             elapsed_ms_per_scan=summary["elapsed_ms_per_scan"],
@@ -153,42 +129,24 @@ def with_run(result: MethodResult, run: Path) -> MethodResult:
         raise InputError(f"{run / files.SUMMARY}: not a run's summary ({error!r}); make the run again") from error
 
 
-def read_series(run: Path) -> ScanSeries | None:
-    """The registration of each scan; None where no table has been kept.
-
-    Raises:
-        InputError: the table is damaged.
-    """
-    file = run / files.SCANS_CSV
-    if not file.is_file():
+def _series(run: Path, scans: int) -> ScanSeries | None:
+    """The registration of each scan; None where no table has been kept."""
+    table = read_scans(run, scans)
+    if not table.rows:
         return None
-    try:
-        with file.open(encoding="utf-8", newline="") as lines:
-            rows = list(csv.DictReader(lines))
-        stamps = _column(rows, "stamp")
-        return ScanSeries(
-            times_s=stamps - stamps[:1],
-            statuses=read_statuses(run, len(rows)),
-            residual_m=_column(rows, "residual_m"),
-            inlier_ratio=_column(rows, "inlier_ratio"),
-            points_used=_column(rows, "points_used"),
-        )
-    except (KeyError, ValueError, csv.Error) as error:
-        raise InputError(f"{file}: not a run's table ({error!r}); make the run again") from error
-
-
-def _column(rows: list[dict[str, str]], name: str) -> FloatArray:
-    """Numbers (N,), NaN where there is none."""
-    return np.array([float(row[name] or "nan") for row in rows], dtype=np.float64)
+    stamps = table.numbers("stamp")
+    columns = (table.numbers(name) for name in ("residual_m", "inlier_ratio", "points_used"))
+    return ScanSeries(stamps - stamps[:1], table.statuses, *columns)
 
 
 def describe_source(described: Mapping[str, Any]) -> list[str]:
     """Lines that describe the run, from config.yaml's section about it."""
     chosen = {name: described.get(name) for name in ("start", "stop", "step")}
-    part = chosen != {"start": 0, "stop": None, "step": 1}
     lines = [f"Source: {described.get('source', 'unknown')}"]
-    lines += [f"Scans: {', '.join(f'{name} {value}' for name, value in chosen.items())}"] if part else []
-    lines += [f"Prior: {described['prior']}"] if described.get("prior") else []
+    if chosen != {"start": 0, "stop": None, "step": 1}:
+        lines.append(f"Scans: {', '.join(f'{name} {value}' for name, value in chosen.items())}")
+    if described.get("prior"):
+        lines.append(f"Prior: {described['prior']}")
     return [*lines, f"lidarslam {described.get('version', '')}"]
 
 

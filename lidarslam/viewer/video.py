@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.files import cannot_write, replacing
+from lidarslam.core.files import written
 from lidarslam.viewer.annotations import Quantity
 from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, fit_frame, framed
 from lidarslam.viewer.view import turning_views
@@ -25,11 +25,7 @@ _SUFFIXES = (".gif", ".mp4")
 
 
 def check_video_file(path: Path) -> None:
-    """Refuse a file that cannot be written later.
-
-    Raises:
-        OutputError: its name ends in neither .gif nor .mp4, or there is no ffmpeg for the latter.
-    """
+    """Refuse a file that cannot be written later."""
     if path.suffix.lower() not in _SUFFIXES:
         raise OutputError(f"{path}: a video must end in .gif or .mp4")
     if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
@@ -54,17 +50,10 @@ def turn_runs(
 
 
 def save_video(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
-    """Write frames (height, width, 3) as .gif or .mp4.
-
-    Raises:
-        OutputError: as `check_video_file`, or it cannot be written.
-    """
+    """Write frames (height, width, 3) as .gif or .mp4."""
     check_video_file(path)
-    try:
-        with replacing(path) as partial:
-            (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(partial, frames)
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    with written(path) as partial:
+        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(partial, frames)
 
 
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:

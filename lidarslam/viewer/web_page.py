@@ -39,11 +39,7 @@ class WebPage:
     """The page and the recording on it."""
 
     def __init__(self, files: Mapping[str, bytes], announce: Callable[[str], None] = lambda _: None) -> None:
-        """Begin to serve files by their paths, "/" is the page; the address is announced with a recording to show.
-
-        Raises:
-            OutputError: no port is free.
-        """
+        """Begin to serve files by their paths, "/" is the page; the address is announced with a recording to show."""
         self._announce = announce
         self._server = _bind()
         self._server.files = {**files, _INDEX: _LINK_ELSEWHERE.sub(b"", files[_INDEX])}
@@ -55,11 +51,7 @@ class WebPage:
 
     @contextlib.contextmanager
     def showing(self, path: Path) -> Iterator[None]:
-        """Show a recording while it is written; it is complete when the block ends, and may be renamed or removed.
-
-        Raises:
-            OSError: there is no such file.
-        """
+        """Show a recording while it is written; it is complete when the block ends, and may be renamed or removed."""
         self._server.descriptor = os.open(path, os.O_RDONLY)
         self._announce(self.address)
         try:

@@ -12,7 +12,6 @@ from lidarslam.evaluation.comparison.comparison import (
     MapErrors,
     MethodResult,
     MissingRecording,
-    PublishedRow,
     SequenceComparison,
 )
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
@@ -130,11 +129,6 @@ def comparison(random_drive, straight_drive, finished, rng) -> Comparison:
         ],
         versions={"lidarslam": "0.1.0", "commit": "0123abc"},
         machine={"processor": f"some {HOSTILE}", "cores": "8"},
-        published=[
-            PublishedRow(
-                "LOAM", {"09 translation_percent": 1.2, "10 translation_percent": "NA", "ATE": 0.345}, "Zhang, 2014"
-            )
-        ],
         tables=[Table(f"Means {HOSTILE}", columns, rows, "a note")],
         missing=[MissingRecording("03", "/data/03", "holds no scans")],
         notes=["interrupted"],

@@ -17,7 +17,7 @@ from lidarslam.evaluation.comparison.comparison import (
     SequenceComparison,
     lost_intervals,
 )
-from lidarslam.evaluation.comparison.quantities import QUANTITIES, TablePlan, find_quantity, mean_table
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, Published, TablePlan, mean_table
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
 from lidarslam.evaluation.report.tables import sequence_tables
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
@@ -93,17 +93,17 @@ def test_one_recording_has_its_own_keys_and_several_a_list(result: MethodResult)
 
 
 def test_quantities_are_read_off_the_entry(result: MethodResult) -> None:
-    assert find_quantity("kitti_translation_percent").of(result) == pytest.approx(1.0, abs=0.02)
-    assert find_quantity("segment_10_translation_percent").of(result) == pytest.approx(1.0, abs=1e-6)
-    assert find_quantity("odometry_ms_median").of(result) == 15.0
+    assert QUANTITIES["kitti_translation_percent"].of(result) == pytest.approx(1.0, abs=0.02)
+    assert QUANTITIES["segment_10_translation_percent"].of(result) == pytest.approx(1.0, abs=1e-6)
+    assert QUANTITIES["odometry_ms_median"].of(result) == 15.0
     # Errors along a line of 150 m, which is also 150 m long for the truth, are evenly spread from -0.75 to 0.75 m.
-    assert find_quantity("ate_percent_of_path").of(result) == pytest.approx(100.0 * 1.5 / 12**0.5 / 150.0, rel=0.02)
-    assert find_quantity("lost_scans").of(result) == 2.0
-    assert find_quantity("map_chamfer_m").of(result) is None
-    assert find_quantity("map_entropy").of(replace(result, map_entropy=-4.5)) == -4.5
+    assert QUANTITIES["ate_percent_of_path"].of(result) == pytest.approx(100.0 * 1.5 / 12**0.5 / 150.0, rel=0.02)
+    assert QUANTITIES["lost_scans"].of(result) == 2.0
+    assert QUANTITIES["map_chamfer_m"].of(result) is None
+    assert QUANTITIES["map_entropy"].of(replace(result, map_entropy=-4.5)) == -4.5
     mapped = replace(result, map_metrics={"f_score_percent": {"0.2": 80.0}, "coverage_percent": {"1.0": 90.0}})
-    assert find_quantity("map_f_score_percent_0.2").of(mapped) == 80.0
-    assert find_quantity("map_coverage_percent_1.0").of(mapped) == 90.0
+    assert QUANTITIES["map_f_score_percent_0.2"].of(mapped) == 80.0
+    assert QUANTITIES["map_coverage_percent_1.0"].of(mapped) == 90.0
     assert all(quantity.of(MethodResult("m", "failed")) is None for quantity in QUANTITIES.values())
 
 
@@ -117,16 +117,17 @@ def test_means_count_the_recordings_that_have_a_value() -> None:
         _sequence("01", _timed("a", 20.0), _timed("b", None, "failed")),
         _sequence("02", _timed("a", 60.0, "lost"), _timed("b", 99.0, "stopped")),
     ]
-    published = TableRow("p", [TableCell(1.0, 4), TableCell(None, 1)], "a paper")
+    published = Published(method="p", values=(1.0, None), source="a paper")
     groups = {"all": ("00", "01", "02", "03"), "01": ("01",)}
-    plan = TablePlan("Time", groups, [find_quantity("ms_per_scan_median")], [published], "note")
+    names = ("ms_per_scan_median",)
+    plan = TablePlan(title="Time", groups=groups, quantities=names, published=(published,), note="note")
     table = mean_table(plan, sequences)
     assert [column.heading for column in table.columns] == ["all", "01"]
     assert list(table.columns[0].sequences) == ["00", "01", "02", "03"]
     assert [row.method for row in table.rows] == ["a", "b", "p"]
     assert list(table.rows[0].cells) == [TableCell(30.0, 3, "over 3 of 4", ranked=False), TableCell(20.0, 1)]
     assert list(table.rows[1].cells) == [TableCell(30.0, 1, "over 1 of 4", ranked=False), TableCell(None, 0)]
-    assert table.rows[2].source == "a paper"
+    assert table.rows[2] == TableRow("p", [TableCell(1.0, 4), TableCell(None, 1)], "a paper")
     content = json.loads(json.dumps(table.to_json()))
     assert content["rows"][0]["cells"][0] == {"value": 30.0, "averaged": 3}
     assert content["columns"][0]["sequences"] == ["00", "01", "02", "03"]
@@ -137,8 +138,8 @@ def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_c
     peer = MethodResult("peer", "ok", elapsed_ms_per_scan=10.0, peak_rss_mb=5.0, times_cover="registration")
     third = MethodResult("third", "ok", elapsed_ms_per_scan=40.0, peak_rss_mb=7.0)
     sequence = _sequence("00", ours, peer, third)
-    quantities = [find_quantity("elapsed_ms_per_scan"), find_quantity("peak_rss_mb")]
-    means = mean_table(TablePlan("T", {"all": ("00",)}, quantities), [sequence])
+    plan = TablePlan(title="T", groups={"all": ("00",)}, quantities=("elapsed_ms_per_scan", "peak_rss_mb"))
+    means = mean_table(plan, [sequence])
     tables = sequence_tables(sequence)
     for table in (means, *tables["summary"], *tables["time"]):
         columns = [column.label for column in table.columns]
@@ -146,7 +147,8 @@ def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_c
         assert best == {("ours", "elapsed"), ("peer", "memory")}
         assert "Times of peer: registration alone, without reading and map" in table.note
     assert peer.to_json()["times_cover"] == "registration"
-    assert "registration alone" not in mean_table(TablePlan("T", {"all": ("00",)}, quantities[1:]), [sequence]).note
+    memory = plan.model_copy(update={"quantities": ("peak_rss_mb",)})
+    assert "registration alone" not in mean_table(memory, [sequence]).note
 
 
 def test_every_interval_has_its_own_reason() -> None:

@@ -15,13 +15,15 @@ import pytest
 
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
+from lidarslam.evaluation.comparison.comparison import MethodResult
 from lidarslam.storage.comparison_folder import run_directories
-from lidarslam.viewer.run_report import Accuracy, changed_settings, leave_report
+from lidarslam.viewer.run_report import changed_settings, leave_report
 
 from ..conftest import lidarslam
 
 PAGE = ("report.html", "map.png", "trajectory.png")
 FAST = ("--odometry", "constant-velocity")
+NO_ERRORS = MethodResult("run", "ok")
 
 
 def there(run: Path) -> list[str]:
@@ -87,7 +89,7 @@ def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(
 ) -> None:
     (finished_run / "report.html").unlink()
     (finished_run / "report.html").mkdir()
-    assert leave_report(finished_run, Accuracy()) is False
+    assert leave_report(finished_run, NO_ERRORS) is False
     assert "no report.html was drawn: " in caplog.text
     assert "is a folder" in caplog.text
     result = lidarslam("evaluate", finished_run)
@@ -100,11 +102,11 @@ def test_an_interruption_ends_the_drawing_alone(finished_run: Path, monkeypatch:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("lidarslam.viewer.run_report.render_run", interrupted)
-    assert leave_report(finished_run, Accuracy()) is False
+    assert leave_report(finished_run, NO_ERRORS) is False
 
 
 def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path, small_recording: Path) -> None:
-    assert leave_report(finished_run, Accuracy())
+    assert leave_report(finished_run, NO_ERRORS)
     assert "Absolute errors" not in figures((finished_run / "report.html").read_text())
     for option in ("--no-report", f"--out={finished_run.parent / 'elsewhere.json'}"):
         assert lidarslam("evaluate", finished_run, option).exit_code == 0
@@ -125,7 +127,7 @@ def test_evaluate_against_camera_poses_draws_these(finished_run: Path) -> None:
 
 def test_bands_show_where_tracking_was_degraded_and_lost(finished_run: Path) -> None:
     replace_statuses(finished_run, ["ok", "degraded", "degraded", "ok", "lost", "ok"])
-    assert leave_report(finished_run, Accuracy())
+    assert leave_report(finished_run, NO_ERRORS)
     (residual,) = (
         plot for plot in plots((finished_run / "report.html").read_text())
         if plot["layout"].get("shapes") and plot["data"][0]["hovertemplate"] == "%{y:.4f}"
@@ -138,7 +140,7 @@ def test_bands_show_where_tracking_was_degraded_and_lost(finished_run: Path) -> 
 def test_a_run_without_a_map_has_a_page_without_a_picture(finished_run: Path) -> None:
     for name in ("map.ply", *PAGE):
         (finished_run / name).unlink()
-    assert leave_report(finished_run, Accuracy())
+    assert leave_report(finished_run, NO_ERRORS)
     assert there(finished_run) == ["report.html", "trajectory.png"]
     assert '<img src="data:' not in (finished_run / "report.html").read_text()
 

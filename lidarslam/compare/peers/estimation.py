@@ -62,9 +62,6 @@ def execute_peer(
     First the peer takes all scans; then they are read again, chained with its poses, checked and added to the map as
     with an odometry of ours. A damaged recording ends both at the same scan. `progress` is called after every scan that
     the peer has registered, with its number from 1 and the total; `range_m` is as of `estimate`.
-
-    Raises:
-        LidarSlamError: the source, the peer or the output directory is not usable.
     """
     recording = open_recording(request.source, request.config.reader)
     chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
@@ -125,9 +122,6 @@ def estimate(
 
     `progress` is called after every scan with its number from 1; `range_m` is the maximum range by the size of the
     scene, for the peers with voxels.
-
-    Raises:
-        PeerError: it cannot run, or has no usable poses.
     """
     peer.require(lambda: imu is not None)
     samples = imu if peer.needs_imu else None
@@ -162,11 +156,7 @@ def _take_imu(estimator: Estimator, samples: ImuSamples | None, taken: int, unti
 
 
 def _at_stamps(poses: Poses, stamps: FloatArray) -> Trajectory:
-    """The trajectory at those stamps that the poses cover.
-
-    Raises:
-        PeerError: there are fewer than two poses, or they are no rigid motions.
-    """
+    """The trajectory at those stamps that the poses cover."""
     instants, T_world_lidar = poses.instants, poses.T_world_lidar
     if not np.isfinite(T_world_lidar).all():
         raise PeerError(f"some of its {len(instants)} poses are not finite")

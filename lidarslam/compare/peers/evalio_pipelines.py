@@ -36,6 +36,7 @@ class Pipeline:
     # in `elastic_instants`
     instants: Literal["middle", "before", "elastic"] = "middle"
     by_rings: bool = False  # whether it looks for features along the rings
+    needs_imu: bool = False
 
 
 PIPELINES = {
@@ -65,8 +66,9 @@ PIPELINES = {
         voxels_m={"mappingCornerLeafSize": 0.2, "mappingSurfLeafSize": 0.4, "odometrySurfLeafSize": 0.4},
         instants="before",
         by_rings=True,
+        needs_imu=True,
     ),
-    "dlio": Pipeline("DLIO", voxels_m={"vf_res": 0.25}),
+    "dlio": Pipeline("DLIO", voxels_m={"vf_res": 0.25}, needs_imu=True),
 }
 
 

@@ -3,10 +3,13 @@
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
-from typing import cast
+from typing import Any, cast
 
+from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
 from lidarslam.compare.peers.interface import MAX_RANGE_M, Estimator, PeerError, Sweep
+from lidarslam.compare.peers.libraries import KissSlamEstimator, RkoLioEstimator, SmallGicpEstimator
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.plugins import PlugPoint
 
@@ -38,11 +41,7 @@ class Peer:
         return f"{self.package} {version(self.package)}"
 
     def require(self, has_imu: Callable[[], bool]) -> None:
-        """Refuse where it cannot run.
-
-        Raises:
-            PeerError: its library is not installed, or it needs an IMU and there is none.
-        """
+        """Refuse where it cannot run."""
         if not self.is_installed:
             extra = EXTRA if self.name in PEERS else f"pip install {self.package}"
             raise PeerError(f"runs with {self.package}, which is not installed: {extra}")
@@ -50,43 +49,29 @@ class Peer:
             raise PeerError("needs an IMU, and the recording has none")
 
 
-def _evalio(name: str) -> Make:
-    def make(first: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
-        from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
-
-        return EvalioEstimator(PIPELINES[name], first, imu, range_m)
-
-    return make
+def _evalio(name: str, first: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
+    return EvalioEstimator(PIPELINES[name], first, imu, range_m)
 
 
-def _library(estimator: str) -> Make:
-    def make(_: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
-        from lidarslam.compare.peers import libraries
-
-        made: Estimator = getattr(libraries, estimator)(imu, range_m or MAX_RANGE_M)
-        return made
-
-    return make
+def _library(
+    make: Callable[[Any, float], Estimator], _: Sweep, imu: ImuSamples | None, range_m: float | None
+) -> Estimator:
+    return make(imu, range_m or MAX_RANGE_M)
 
 
 _ALL = (
     *(
-        Peer(name, "evalio", "evalio", _evalio(name), has_voxels=name not in ("mad-icp", "loam-evalio", "form"))
-        for name in ("kiss-icp-evalio", "genz-icp", "mad-icp", "ct-icp", "loam-evalio", "form")
+        Peer(name, "evalio", "evalio", partial(_evalio, name), pipeline.needs_imu, bool(pipeline.voxels_m))
+        for name, pipeline in PIPELINES.items()
     ),
-    *(Peer(name, "evalio", "evalio", _evalio(name), needs_imu=True) for name in ("lio-sam", "dlio")),
-    Peer("kiss-slam", "kiss_slam", "kiss-slam", _library("KissSlamEstimator")),
-    Peer("small-gicp", "small_gicp", "small_gicp", _library("SmallGicpEstimator")),
-    Peer("rko-lio", "rko_lio", "rko_lio", _library("RkoLioEstimator"), needs_imu=True),
+    Peer("kiss-slam", "kiss_slam", "kiss-slam", partial(_library, KissSlamEstimator)),
+    Peer("small-gicp", "small_gicp", "small_gicp", partial(_library, SmallGicpEstimator)),
+    Peer("rko-lio", "rko_lio", "rko_lio", partial(_library, RkoLioEstimator), needs_imu=True),
 )
 PEERS = {peer.name: peer for peer in _ALL}
 ALL_PEERS = PlugPoint("peer", tuple(PEERS))
 
 
 def peer_named(name: str) -> Peer:
-    """The peer of a name in `ALL_PEERS`.
-
-    Raises:
-        ConfigError: it is another package's, and cannot be loaded.
-    """
+    """The peer of a name in `ALL_PEERS`."""
     return PEERS.get(name) or cast(Peer, ALL_PEERS.load(name, Peer))
