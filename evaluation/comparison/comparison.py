@@ -12,6 +12,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.table import Table
+from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
 
 MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
@@ -41,14 +42,6 @@ _MERGED_GAP_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class MapErrors:
-    """Distances of a method's map points from the reference map, thinned for drawing."""
-
-    points: FloatArray  # (K, 3) points of the method's map, in the reference map's frame
-    distances_m: FloatArray  # (K,) to the nearest point of the reference map
-
-
-@dataclass(frozen=True, eq=False)
 class ScanSeries:
     """The registration of each scan of a run, NaN where there was none."""
 
@@ -73,7 +66,7 @@ class MethodResult:
     lost_reasons: Sequence[str] = ()  # one for each run of successive lost scans; empty when unknown
     metrics: TrajectoryMetrics | None = None  # its errors, with their association and alignment
     map_metrics: Mapping[str, object] | None = None  # the content of metrics.json's "map"
-    map_errors: MapErrors | None = None  # for the figure
+    map_errors: CloudErrors | None = None  # of its points, thinned for the figure
     map_entropy: float | None = None  # mean map entropy of its map, which needs no reference
     elapsed_ms_per_scan: float | None = None  # elapsed time of all scans over their number
     # latency_ms_median, latency_ms_p99: sum of the stages of one scan

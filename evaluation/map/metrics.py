@@ -52,18 +52,17 @@ class CloudErrors:
 
     points: FloatArray  # (N, 3) the thinned cloud, in the reference's frame
     distances_m: FloatArray  # (N,) to the nearest point of the other
-    considered: NDArray[np.bool_]  # (N,) whether the point lies where both clouds can have one
-
-    def share_within(self, threshold_m: float, considered_only: bool) -> float | None:
-        """Share of the points within the threshold, 0 to 1; None without points."""
-        distances = self.distances_m[self.considered] if considered_only else self.distances_m
-        return float(np.mean(distances <= threshold_m)) if len(distances) else None
+    considered: NDArray[np.bool_] | None = None  # (N,) whether the point lies where both clouds can have one; None: all
 
     @property
-    def mean_m(self) -> float | None:
-        """Mean distance of the points that are considered."""
-        distances = self.distances_m[self.considered]
-        return float(distances.mean()) if len(distances) else None
+    def considered_m(self) -> FloatArray:
+        """Distances of the points that are considered."""
+        return self.distances_m if self.considered is None else self.distances_m[self.considered]
+
+    def thinned(self, most: int) -> "CloudErrors":
+        """At most so many of the points, for drawing."""
+        step = max(1, -(-len(self.points) // most))
+        return CloudErrors(self.points[::step], self.distances_m[::step])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +108,9 @@ def compare_maps(
 def _metrics(mapped: CloudErrors, reference: CloudErrors) -> MapMetrics:
     # A side without points leaves the other side's distances infinite: nothing can be computed then.
     empty = not len(mapped.points) or not len(reference.points)
-    accuracy, completeness = (None, None) if empty else (mapped.mean_m, reference.mean_m)
+    accuracy, completeness = (
+        None if empty or not len(of.considered_m) else float(of.considered_m.mean()) for of in (mapped, reference)
+    )
     chamfer = None if accuracy is None or completeness is None else 0.5 * (accuracy + completeness)
     return MapMetrics(
         accuracy_mean_m=accuracy,
@@ -122,13 +123,12 @@ def _metrics(mapped: CloudErrors, reference: CloudErrors) -> MapMetrics:
 
 
 def _f_score(mapped: CloudErrors, reference: CloudErrors, threshold_m: float) -> float:
-    precision = mapped.share_within(threshold_m, considered_only=True) or 0.0
-    recall = reference.share_within(threshold_m, considered_only=True) or 0.0
+    precision, recall = (float(np.mean(of.considered_m <= threshold_m)) for of in (mapped, reference))
     return 200.0 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
 def _percent(errors: CloudErrors, tolerance_m: float) -> float:
-    return 100.0 * (errors.share_within(tolerance_m, considered_only=False) or 0.0)
+    return 100.0 * float(np.mean(errors.distances_m <= tolerance_m))
 
 
 def _distances(points: FloatArray, others: FloatArray, bound_m: float = np.inf) -> FloatArray:

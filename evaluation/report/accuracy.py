@@ -7,7 +7,8 @@ import numpy as np
 import plotly.graph_objects as go
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.evaluation.comparison.comparison import MapErrors, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.report.bulk import beyond_m, in_bulk, leaves, paths_in_bulk
 from lidarslam.evaluation.report.figure import (
     EQUAL_AXES,
@@ -309,8 +310,10 @@ def _drift_figure(
     }
     panels = []
     for part in parts:
+        if not part.places:
+            continue
         titles = (f"Translation drift{part.over} [%]", f"Rotation drift{part.over} [° per {part.per_m} m]")
-        for number, panel_title in enumerate(titles if part.places else ()):
+        for number, panel_title in enumerate(titles):
             curves = {name: np.array(part.of(name)[number], dtype=np.float64) for name in part.by_method}
             traces = [
                 line_trace(
@@ -359,7 +362,7 @@ def entropy_figure(sequence: SequenceComparison, styles: Styles) -> Figure | Non
     return Figure("Map quality without a reference", caption, [panel], list(entropies))
 
 
-def raster(errors: MapErrors, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
+def raster(errors: CloudErrors, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
     """Median distance (rows, columns) of the points in each cell; NaN where there is none."""
     from scipy.stats import binned_statistic_2d  # takes longer to load than the rest of a page
 
@@ -370,7 +373,7 @@ def raster(errors: MapErrors, x_edges: FloatArray, y_edges: FloatArray) -> Float
     return np.asarray(median, dtype=np.float64)
 
 
-def _map_panel(name: str, errors: MapErrors, low: FloatArray, high: FloatArray, worst_m: float) -> Panel:
+def _map_panel(name: str, errors: CloudErrors, low: FloatArray, high: FloatArray, worst_m: float) -> Panel:
     size = high - low
     cell_m = float(np.sqrt(size.prod() / _MAP_CELLS))
     x_edges, y_edges = (np.linspace(low[a], high[a], max(2, int(size[a] / cell_m) + 1)) for a in (0, 1))
@@ -402,7 +405,7 @@ def _colour_range(distances_m: list[FloatArray]) -> float:
     return max(float(f"{np.median(ends):.1g}"), 1e-3) if ends else 1.0
 
 
-def _box(maps: list[MapErrors]) -> tuple[FloatArray, FloatArray]:
+def _box(maps: list[CloudErrors]) -> tuple[FloatArray, FloatArray]:
     """Corners (2,) of the view, the same for all maps; a few stray points do not stretch it."""
     corners = [np.percentile(errors.points[:, :2], (0.2, 99.8), axis=0) for errors in maps]
     low, high = np.median(corners, axis=0)

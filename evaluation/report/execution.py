@@ -5,12 +5,20 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
 from lidarslam.core.tracking import Status
-from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison, lost_intervals
+from lidarslam.evaluation.comparison.comparison import ScanSeries, SequenceComparison, lost_intervals
 from lidarslam.evaluation.comparison.quantities import times_note
-from lidarslam.evaluation.report.figure import Figure, Panel, Styles, bar_panel, line_trace, plot_text, thin_curve
+from lidarslam.evaluation.report.figure import (
+    Figure,
+    Panel,
+    Styles,
+    bar_panel,
+    bar_trace,
+    line_trace,
+    plot_text,
+    thin_curve,
+)
 
 # A dashed line at the scan period is drawn up to this multiple of the longest bar.
 _PERIOD_IN_REACH = 2.5
@@ -56,32 +64,21 @@ def _time_panel(sequence: SequenceComparison, time: dict[str, float], styles: St
 
 
 def _stage_panel(sequence: SequenceComparison, styles: Styles) -> Panel | None:
-    stages = [stage for method in sequence.methods for stage, ms in method.stage_ms.items() if ms > 0.0]
-    if not stages:
-        return None
-    bars = [
-        go.Bar(
-            x=[method.stage_ms.get(stage) or None for stage in dict.fromkeys(stages)],
-            y=list(dict.fromkeys(stages)),
-            orientation="h",
-            name=plot_text(method.name),
-            legendgroup=styles[method.name].key,
-            marker={"color": styles[method.name].colour},
-            hovertemplate="%{x:.2f} ms",
-        )
-        for method in sequence.methods
-        if any(method.stage_ms.values())
-    ]
+    found = dict.fromkeys(stage for method in sequence.methods for stage, ms in method.stage_ms.items() if ms > 0.0)
+    stages, bars = list(found), []
+    for m in sequence.methods:
+        if any(m.stage_ms.values()):
+            ms = [m.stage_ms.get(stage) or None for stage in stages]
+            bars.append(bar_trace(m.name, styles[m.name], x=ms, y=stages, hovertemplate="%{x:.2f} ms"))
     layout = {"xaxis": {"title": {"text": "[ms]"}}, "yaxis": {"autorange": "reversed"}, "hovermode": "closest"}
-    return Panel("Median time of each stage [ms]", bars, layout, 70 + len(set(stages)) * (8 + 8 * len(bars)))
+    height = 70 + len(stages) * (8 + 8 * len(bars))
+    return Panel("Median time of each stage [ms]", bars, layout, height) if stages else None
 
 
 def scan_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """Residual, inlier ratio and points of each scan; None when no method kept them."""
     kept = [(method, method.series) for method in sequence.methods if method.series is not None]
-    if not kept:
-        return None
-    bands = list(_bands(kept[0][0])) if len(kept) == 1 else []
+    bands = list(_bands(kept[0][1])) if len(kept) == 1 else []
     panels = []
     for name, title, hover in _QUANTITIES:
         traces: list[Any] = []
@@ -107,11 +104,8 @@ def scan_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     return Figure("Registration over time", caption, panels, [method.name for method, _ in kept], columns=3)
 
 
-def _bands(method: MethodResult) -> Iterator[dict[str, Any]]:
+def _bands(series: ScanSeries) -> Iterator[dict[str, Any]]:
     """The stretches of time on which tracking was degraded or lost, as plotly's shapes."""
-    series = method.series
-    if series is None:
-        return
     ends_s = np.append(series.times_s[1:], series.times_s[-1:])
     stretches = [
         (status, [row for row, _ in group])
@@ -133,7 +127,7 @@ def tracking_figure(sequence: SequenceComparison, styles: Styles) -> Figure | No
     span_s = max(float(trajectory.stamps[-1]) for _, trajectory in followed) - begin_s
     traces = []
     for method, trajectory in followed:
-        style, name, start_s = styles[method.name], plot_text(method.name), float(trajectory.stamps[0]) - begin_s
+        start_s = float(trajectory.stamps[0]) - begin_s
         bars = [(0.0, trajectory.duration_s, 0.25, f"{trajectory.duration_s:.1f} s")]
         bars += [
             (i.begin_s, max(i.end_s - i.begin_s, _LEAST_SHARE * span_s), 0.8, f"lost: {i.scans} scans, {i.reason}")
@@ -141,19 +135,12 @@ def tracking_figure(sequence: SequenceComparison, styles: Styles) -> Figure | No
         ]
         begins, lengths, widths, texts = zip(*bars, strict=True)
         traces.append(
-            go.Bar(
-                base=[start_s + begin for begin in begins],
-                x=lengths,
-                y=[name] * len(bars),
-                width=widths,
-                customdata=[plot_text(text) for text in texts],
+            bar_trace(
+                method.name, styles[method.name], base=[start_s + begin for begin in begins], x=lengths,
+                y=[plot_text(method.name)] * len(bars), width=widths, customdata=[plot_text(text) for text in texts],
                 hovertemplate="%{base:.1f} s: %{customdata}",
-                orientation="h",
-                name=name,
-                legendgroup=style.key,
-                marker={"color": style.colour},
             )
-        )
+        )  # fmt: skip
     layout = {
         "xaxis": {"title": {"text": "time since the first scan [s]"}, "range": [0.0, span_s]},
         "yaxis": {"autorange": "reversed"},

@@ -113,18 +113,16 @@ def line_trace(name: str, style: Style, x: ArrayLike, y: ArrayLike, **more: Any)
     return go.Scatter(x=x, y=y, name=plot_text(name), **given)
 
 
+def bar_trace(name: str, style: Style, **given: Any) -> Any:
+    """A method's horizontal bars."""
+    own = {"name": plot_text(name), "legendgroup": style.key, "marker": {"color": style.colour}}
+    return go.Bar(orientation="h", **own, **given)
+
+
 def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles) -> Panel:
     """A horizontal bar per method."""
     bars = [
-        go.Bar(
-            x=[value],
-            y=[plot_text(name)],
-            orientation="h",
-            name=plot_text(name),
-            legendgroup=styles[name].key,
-            marker={"color": styles[name].colour},
-            hovertemplate=f"%{{x:.4g}} {unit}",
-        )
+        bar_trace(name, styles[name], x=[value], y=[plot_text(name)], hovertemplate=f"%{{x:.4g}} {unit}")
         for name, value in values.items()
     ]
     axes = {"xaxis": {"title": {"text": f"[{unit}]" if unit else ""}}, "yaxis": {"autorange": "reversed"}}

@@ -64,9 +64,17 @@ class TrajectoryMetrics:
         return absolute_errors(self.association, self.T_reference_estimate, self.T_reference_estimate_joint)
 
     def deviations(self) -> tuple[FloatArray, FloatArray]:
-        """Translation (M, 3) and roll, pitch, yaw (M, 3) of every pose, see `deviations`."""
-        translations_m, _ = deviations(self.association, self.T_reference_estimate)
-        return translations_m, deviations(self.association, self.T_reference_estimate_joint)[1]
+        """Poses of the aligned estimate in the frame of the reference's LiDAR (x forward, y left, z up).
+
+        Translation (M, 3) in metres and roll, pitch, yaw (M, 3) in degrees, R = Rz(yaw) Ry(pitch) Rx(roll).
+        """
+        T, T_true_world = self.association.estimate.T_world_lidar, inverse(self.association.reference.T_world_lidar)
+        R = (T_true_world @ self.T_reference_estimate_joint @ T)[:, :3, :3]
+        # At a pitch of 90 degrees roll and yaw are ambiguous; atan2 gives numbers without SciPy's warning.
+        pitch = np.arcsin(np.clip(-R[:, 2, 0], -1.0, 1.0))
+        roll, yaw = np.arctan2(R[:, 2, 1], R[:, 2, 2]), np.arctan2(R[:, 1, 0], R[:, 0, 0])
+        translations_m = (T_true_world @ self.T_reference_estimate @ T)[:, :3, 3]
+        return translations_m, np.rad2deg(np.stack([roll, pitch, yaw], axis=-1))
 
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json, with no map compared."""
@@ -179,21 +187,6 @@ def relative_errors(association: Association) -> tuple[FloatArray, FloatArray]:
     successive = np.diff(association.rows) == 1
     estimate = association.estimate.relative_motions()[successive]
     return _differences(estimate, association.reference.relative_motions()[successive])
-
-
-def deviations(association: Association, T_reference_estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pose of the aligned estimate in the frame of the reference's LiDAR (x forward, y left, z up), for each match.
-
-    Translation (M, 3) in metres and roll, pitch, yaw (M, 3) in degrees, R = Rz(yaw) Ry(pitch) Rx(roll).
-    """
-    T_true_estimated = (
-        inverse(association.reference.T_world_lidar) @ T_reference_estimate @ association.estimate.T_world_lidar
-    )
-    R = T_true_estimated[:, :3, :3]
-    # At a pitch of 90 degrees roll and yaw are ambiguous; atan2 gives numbers without SciPy's warning.
-    pitch = np.arcsin(np.clip(-R[:, 2, 0], -1.0, 1.0))
-    roll, yaw = np.arctan2(R[:, 2, 1], R[:, 2, 2]), np.arctan2(R[:, 1, 0], R[:, 0, 0])
-    return T_true_estimated[:, :3, 3], np.rad2deg(np.stack([roll, pitch, yaw], axis=-1))
 
 
 def disagreement(metrics: TrajectoryMetrics) -> str | None:

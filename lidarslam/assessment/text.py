@@ -2,8 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from lidarslam.assessment.evaluate import Evaluation
-from lidarslam.assessment.map_evaluation import MapEvaluation
+from lidarslam.assessment.evaluate import Evaluation, MapEvaluation
 from lidarslam.core.text import as_typed, command_line, joined
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift

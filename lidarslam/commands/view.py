@@ -97,7 +97,7 @@ def view(
 
 
 def _replay(file: Path, web: bool) -> None:
-    from lidarslam.viewer.rerun_output import show_file_in_window, show_file_on_page
+    from lidarslam.viewer.rerun_recording import show_file_in_window, show_file_on_page
 
     if web:
         _serve(lambda page: show_file_on_page(file, page))
@@ -106,7 +106,7 @@ def _replay(file: Path, web: bool) -> None:
 
 
 def _show(show: Any, web: bool, file: Path | None) -> None:
-    from lidarslam.viewer.rerun_output import save, show_in_window, show_on_page
+    from lidarslam.viewer.rerun_recording import save, show_in_window, show_on_page
 
     if file is not None:
         save(show, file)
@@ -139,7 +139,7 @@ def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, An
     config = load_config(options["config_file"], options["settings"]).viewer
     runs = [run for place in places for run in run_directories(place)]
     finished = [load_run(path) for path in runs]
-    from lidarslam.viewer.rerun_runs import show_runs
+    from lidarslam.viewer.rerun_scenes import show_runs
 
     return show_runs(finished, truth_of_run(runs[0]), config)
 
@@ -148,7 +148,7 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
     from lidarslam.datasets.intake import choose_scans
     from lidarslam.datasets.registry import open_recording
     from lidarslam.run.progress import show_count
-    from lidarslam.viewer.rerun_scans import show_scans
+    from lidarslam.viewer.rerun_scenes import show_scans
 
     config = take_config(options, source)
     recording = open_recording(source, config.reader)

@@ -58,8 +58,8 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
     (sequence,) = outcome.comparison.sequences
     runs = [out / result.run for result in sequence.methods if result.run and result.trajectory is not None]
     if runs:
-        from lidarslam.viewer.rerun_output import save
-        from lidarslam.viewer.rerun_runs import show_runs
+        from lidarslam.viewer.rerun_recording import save
+        from lidarslam.viewer.rerun_scenes import show_runs
 
         finished, truth = [load_run(run) for run in runs], truth_of_run(runs[0])
         save(show_runs(finished, truth, ViewerConfig()), out / REPLAY)

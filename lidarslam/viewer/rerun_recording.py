@@ -7,8 +7,10 @@ written here; on failure it is emptied, which frees its space, and the rest of t
 import contextlib
 import logging
 import os
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import OutputError
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
@@ -25,15 +28,17 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.report.error_colours import viridis
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.annotations import levels
+from lidarslam.viewer.rerun_program import GRPC_PORT, open_window, require_window
+from lidarslam.viewer.web_page import WebPage
 
 _log = logging.getLogger(__name__)
 
 # The end of a complete .rrd file of this version, before the four bytes of its flags.
 _FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
 # Timeouts against a writer that died; hardly anything remains to be written by then.
-FLUSH_S, _DISCONNECT_S, _PIPE_S = 20.0, 10.0, 60.0
+_FLUSH_S, _DISCONNECT_S, _PIPE_S = 20.0, 10.0, 60.0
 # Where an open file of this process has a path, and how much is written at a time.
-OPEN_FILES = Path("/dev/fd")
+_OPEN_FILES = Path("/dev/fd")
 _PIECE = 1 << 20
 
 # Okabe and Ito's palette, distinguishable under every common colour blindness.
@@ -49,6 +54,8 @@ TIME, SCAN = "time", "scan"
 _FIRST_DATE_S = 1e8
 # Negative radii are in points on the screen, whatever the zoom.
 PATH_RADIUS, SCAN_RADIUS, MAP_RADIUS = -3.0, -1.5, -1.0
+_INSTEAD = "write a file with --save FILE.rrd, or use --web"
+_MAGIC = b"RRF2"
 
 
 class IncompleteRecordingError(OutputError):
@@ -78,7 +85,7 @@ def rerun_recording(
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         yield recording
         try:
-            recording.flush(timeout_sec=FLUSH_S)
+            recording.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:  # a window that went away; whether the file is complete is checked below
             _log.info("Rerun: %s", one_line(str(error)))
             rerun_environment.abandoned = True
@@ -96,6 +103,76 @@ def require_complete(path: Path) -> None:
         footer = file.read(len(_FOOTER))
     if footer != _FOOTER:
         raise IncompleteRecordingError("the Rerun recording was not written to its end; is the disk full?")
+
+
+@dataclass(frozen=True)
+class Show:
+    """Something to show."""
+
+    name: str  # as the viewer lists it
+    blueprint: rrb.Blueprint  # the layout of the viewer
+    log: Callable[[rr.RecordingStream], None]  # writes it to a recording
+
+
+def save(show: Show, path: Path) -> None:
+    """Write a .rrd file."""
+    try:
+        with replacing(path) as partial, rerun_recording(show.name, partial, blueprint=show.blueprint) as recording:
+            show.log(recording)
+    except (OSError, IncompleteRecordingError) as error:
+        raise cannot_write(path, error, "; name another file") from error
+
+
+def show_in_window(show: Show) -> None:
+    """Show it in a window."""
+    require_window(_INSTEAD)
+    open_window(GRPC_PORT)
+    with rerun_recording(show.name, None, rr.GrpcSink(), show.blueprint) as recording:
+        show.log(recording)
+        try:
+            recording.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError as error:
+            rerun_environment.abandoned = True
+            raise OutputError(f"the Rerun window cannot be reached ({one_line(str(error))}); {_INSTEAD}") from error
+
+
+def show_on_page(show: Show, page: WebPage) -> None:
+    """Show it in a browser; it is in a temporary file without a name, removed with the program."""
+    with tempfile.TemporaryFile() as file:
+        path = _OPEN_FILES / str(file.fileno())
+        try:
+            with page.showing(path), rerun_recording(show.name, path, blueprint=show.blueprint) as recording:
+                show.log(recording)
+        except (OSError, IncompleteRecordingError) as error:
+            raise cannot_write(Path(tempfile.gettempdir()), error, f"; {_INSTEAD}") from error
+
+
+def show_file_in_window(path: Path) -> None:
+    """Show a .rrd file in a window."""
+    _require_recording(path)
+    require_window("use --web")
+    open_window(GRPC_PORT, path)
+
+
+def show_file_on_page(path: Path, page: WebPage) -> None:
+    """Show a .rrd file in a browser."""
+    _require_recording(path)
+    with page.showing(path):
+        pass
+
+
+def _require_recording(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise InputError(f"{path}: not a Rerun recording, or of a version before 0.20; make it again")
+        require_complete(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except IncompleteRecordingError:
+        raise InputError(f"{path}: is cut off, or of an earlier version of Rerun; make it again") from None
 
 
 def log_map(
@@ -176,7 +253,7 @@ class _PipedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb", buffering=0)
         self._outlet, self._inlet = os.pipe()
-        self.entrance = OPEN_FILES / str(self._inlet)
+        self.entrance = _OPEN_FILES / str(self._inlet)
         self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
         self._thread.start()
 

@@ -9,12 +9,12 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.evaluation.comparison.comparison import (
     Comparison,
-    MapErrors,
     MethodResult,
     MissingRecording,
     SequenceComparison,
 )
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
+from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \x00"
@@ -90,7 +90,7 @@ def comparison(random_drive, straight_drive, finished, rng) -> Comparison:
     street, corridor = random_drive(1, scans=900), random_drive(2, scans=300, step_m=0.2)
     lost = np.zeros(len(street), dtype=bool)
     lost[100:120] = lost[500] = True
-    walls = MapErrors(rng.uniform(-5.0, 5.0, (2000, 3)), np.abs(rng.normal(0.0, 0.1, 2000)))
+    walls = CloudErrors(rng.uniform(-5.0, 5.0, (2000, 3)), np.abs(rng.normal(0.0, 0.1, 2000)))
     map_metrics = {
         "accuracy_mean_m": 0.0312,
         "completeness_mean_m": 0.0456,

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
-from lidarslam.evaluation.comparison.comparison import Comparison, MapErrors, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
+from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.report.accuracy import raster
 from lidarslam.evaluation.report.figure import Panel, line_trace, method_styles, plot_text, thin_curve
 from lidarslam.evaluation.report.report import render_html, render_markdown
@@ -223,7 +224,7 @@ def test_a_thinned_curve_keeps_its_peaks_and_ends(rng):
 
 def test_a_cell_shows_the_median_of_its_points():
     points = np.array([[0.5, 0.5, 0.0]] * 3 + [[2.5, 1.5, 0.0], [9.0, 9.0, 0.0]])
-    errors = MapErrors(points, np.array([0.0, 0.5, 9.0, 2.0, 0.1]))
+    errors = CloudErrors(points, np.array([0.0, 0.5, 9.0, 2.0, 0.1]))
     cells = raster(errors, np.linspace(0.0, 3.0, 4), np.linspace(0.0, 2.0, 3))
     np.testing.assert_array_equal(cells, [[0.5, np.nan, np.nan], [np.nan, np.nan, 2.0]])
 

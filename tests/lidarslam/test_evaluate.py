@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
-from lidarslam.assessment.map_evaluation import MapOptions
+from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate
 from lidarslam.assessment.text import format_evaluation
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError

@@ -89,7 +89,7 @@ def test_a_name_in_a_benchmark_stays_in_the_folder(
 
 
 def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
-    rerun_output = pytest.importorskip("lidarslam.viewer.rerun_output")
+    rerun_recording = pytest.importorskip("lidarslam.viewer.rerun_recording")
     file = finished_run / "recording.rrd"
     assert lidarslam("view", finished_run, "--save", file).exit_code == 0
     whole = file.read_bytes()
@@ -98,8 +98,8 @@ def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
     for content, message in forged.items():
         file.write_bytes(content)
         with pytest.raises(InputError, match=message):
-            rerun_output.show_file_in_window(file)
+            rerun_recording.show_file_in_window(file)
         refused(lidarslam("view", file), message)
     with pytest.raises(InputError, match="no such file"):
-        rerun_output.show_file_in_window(tmp_path)
+        rerun_recording.show_file_in_window(tmp_path)
     assert lidarslam("view", finished_run, "--save", tmp_path / "view.rrd").exit_code == 0

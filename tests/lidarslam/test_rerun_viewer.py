@@ -22,11 +22,10 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment, web_page
-from lidarslam.viewer.rerun_output import save, show_file_in_window, show_in_window
 from lidarslam.viewer.rerun_program import is_taken, open_window, served_page
-from lidarslam.viewer.rerun_recording import IncompleteRecordingError
+from lidarslam.viewer.rerun_recording import IncompleteRecordingError, save, show_file_in_window, show_in_window
 from lidarslam.viewer.rerun_recording import _PipedFile as PipedFile
-from lidarslam.viewer.rerun_runs import show_runs
+from lidarslam.viewer.rerun_scenes import show_runs
 from lidarslam.viewer.rerun_viewer import rerun_viewer
 from lidarslam.viewer.web_page import WebPage
 

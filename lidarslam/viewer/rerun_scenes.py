@@ -1,28 +1,43 @@
-"""Finished runs in Rerun, each with a colour and an entity of its own."""
+"""What is shown in Rerun: finished runs, the raw scans of a recording, errors of a map."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from lidarslam.config.settings import ViewerConfig
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
+from lidarslam.datasets.recording import Recording
+from lidarslam.evaluation.map.metrics import MapComparison
+from lidarslam.evaluation.report.error_colours import error_colours, viridis
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
-from lidarslam.viewer.rerun_output import Show
+from lidarslam.viewer.annotations import levels
 from lidarslam.viewer.rerun_recording import (
     BACKGROUND,
+    MAP_RADIUS,
     PATH_RADIUS,
+    REFERENCE_COLOUR,
+    SCAN_RADIUS,
     STATUS_COLOURS,
     TIME,
+    Show,
     about_its_start,
+    every_nth,
     log_map,
+    set_stamp,
     stamp_column,
     true_path,
     whole_past,
@@ -66,7 +81,7 @@ def show_runs(runs: Sequence[FinishedRun], reference: Trajectory | None, config:
         for one in shown:
             _log_run(recording, one, len(shown) > 1, config)
 
-    return Show(" ".join(one.name for one in shown), _blueprint(shown), log)
+    return Show(" ".join(one.name for one in shown), _layout_of_runs(shown), log)
 
 
 def _in_one_world(runs: Sequence[FinishedRun], reference: Trajectory | None) -> Iterator[_Shown]:
@@ -128,7 +143,7 @@ def _log_run(recording: rr.RecordingStream, shown: _Shown, several: bool, config
         recording.send_columns(series, [stamp_column(shown.error_stamps)], values)
 
 
-def _blueprint(shown: Sequence[_Shown]) -> rrb.Blueprint:
+def _layout_of_runs(shown: Sequence[_Shown]) -> rrb.Blueprint:
     """One space for all, with the map of the first; the eye icon next to an entity's name shows and hides it."""
     overrides: dict[rr.encodings.EntityPath | str, rrb.VisibleTimeRanges | rrb.EntityBehavior] = {}
     for number, one in enumerate(shown):
@@ -144,3 +159,110 @@ def _blueprint(shown: Sequence[_Shown]) -> rrb.Blueprint:
         rrb.TimePanel(timeline=TIME, play_state="following", state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
     )
+
+
+_LIDAR = "world/lidar"
+# Where the eye begins to follow the sensor, metres.
+_BEHIND = (-40.0, 0.0, 25.0)
+
+
+def show_scans(
+    recording: Recording,
+    source: Path,
+    chosen: range,
+    config: ViewerConfig,
+    bar: Callable[[str], AbstractContextManager[Callable[[int, int], None]]],
+    tell: Callable[[str], None],
+) -> Show:
+    """Scans about the sensor, by intensity or else by height; where there is a true path, the scans on it too.
+
+    The scans are read while they are logged; `bar` makes a progress bar of a name, to be called with the number of
+    scans done, and the total, and `tell` is called with each fault of the recording, as a line.
+    """
+    truth = recording.ground_truth
+    if truth is not None:
+        truth = about_its_start(truth, least=2)
+
+    def log(stream: rr.RecordingStream) -> None:
+        if truth is not None:
+            path = rr.LineStrips3D([truth.positions], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
+            stream.log("world/ground truth", path, static=True)
+            # The eye follows only drawn entities.
+            place = rr.Points3D([[0.0, 0.0, 0.0]], colors=[REFERENCE_COLOUR], radii=2.0 * PATH_RADIUS)
+            stream.log(_LIDAR, place, static=True)
+        faults, done = Faults(), 0
+        with bar(source.name) as count:
+            for done, scan in enumerate(take_in(recording, chosen, faults), start=1):
+                _log_scan(stream, done - 1, scan, truth, config.scan_points)
+                count(done, len(chosen))
+        for warning in (*recording.warnings, *faults.warnings()):
+            tell(warning)
+        if not done:
+            raise InputError(f"{source}: no scan can be read")
+
+    return Show(source.name, _layout_of_scans(truth is not None), log)
+
+
+def _log_scan(recording: rr.RecordingStream, index: int, scan: Scan, truth: Trajectory | None, points: int) -> None:
+    set_stamp(recording, index, scan.stamp)
+    if truth is not None:  # beyond its ends its first or last pose
+        stamp = np.clip(scan.stamp, truth.stamps[0], truth.stamps[-1])
+        T_world_lidar = truth.at(np.array([stamp]))[0]
+        recording.log(_LIDAR, rr.Transform3D(translation=T_world_lidar[:3, 3], mat3x3=T_world_lidar[:3, :3]))
+    shown = every_nth(scan.points, points)
+    values = shown[:, 2]
+    if scan.intensities is not None:  # the darkest where there is none
+        values = np.nan_to_num(every_nth(scan.intensities, points).astype(np.float64))
+    recording.log(f"{_LIDAR}/scan", rr.Points3D(shown, colors=viridis(levels(values)), radii=SCAN_RADIUS))
+
+
+def _layout_of_scans(has_truth: bool) -> rrb.Blueprint:
+    """The scan in the frame of the sensor, next to the scan on the true path."""
+    scan = rrb.Spatial3DView(origin=f"/{_LIDAR}", name="Scan", background=BACKGROUND)
+    views = [scan]
+    if has_truth:
+        eye = rrb.EyeControls3D(position=_BEHIND, look_target=(0.0, 0.0, 0.0), tracking_entity=f"/{_LIDAR}")
+        on_path = rrb.Spatial3DView(origin="/world", name="On the true path", background=BACKGROUND, eye_controls=eye)
+        views.append(on_path)
+    panel = rrb.TimePanel(timeline=TIME, play_state="playing", loop_mode="all", state="collapsed")
+    return rrb.Blueprint(rrb.Horizontal(*views), panel, collapse_panels=True)
+
+
+def show_errors(comparison: MapComparison, positions: FloatArray, clip_m: float) -> Show:
+    """A map coloured by its distance to the reference, and the reference by that to the map.
+
+    The clouds are shown about their middle, because the viewer counts in single precision, with the path (K, 3) of the
+    sensor in the reference's frame; `clip_m` is the distance of the brightest colour.
+    """
+    points = comparison.reference_errors.points
+    middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
+    clouds = {"map_to_reference": comparison.map_errors, "reference_to_map": comparison.reference_errors}
+
+    def log(recording: rr.RecordingStream) -> None:
+        for entity, errors in clouds.items():
+            colours = error_colours(errors.distances_m, clip_m)
+            cloud = rr.Points3D(errors.points - middle, colors=colours, radii=MAP_RADIUS)
+            recording.log(f"world/{entity}", cloud, static=True)
+        line = rr.LineStrips3D([positions - middle], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
+        recording.log("world/path", line, static=True)
+        origin = ", ".join(f"{m:.0f}" for m in middle)
+        text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"
+        recording.log("legend", rr.TextDocument(text), static=True)
+
+    return Show("map errors", _layout_of_errors(), log)
+
+
+def _layout_of_errors() -> rrb.Blueprint:
+    """Both clouds side by side, above the legend."""
+    titles = {
+        "map_to_reference": "Map: distance to the reference",
+        "reference_to_map": "Reference: distance to the map",
+    }
+    views = [
+        rrb.Spatial3DView(
+            origin="/world", name=title, contents=["/world/path", f"/world/{entity}"], background=BACKGROUND
+        )
+        for entity, title in titles.items()
+    ]
+    legend = rrb.TextDocumentView(origin="/legend", name="Colours")
+    return rrb.Blueprint(rrb.Vertical(rrb.Horizontal(*views), legend, row_shares=[8, 1]), collapse_panels=True)
