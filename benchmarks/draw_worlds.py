@@ -15,15 +15,14 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import reference_map
 from lidarslam.simulation.world import WORLDS, build_world
-from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, save_picture
+from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, fit_frame, save_picture
 
 
 def draw_map(simulation: Simulation, path: Path, width: int) -> int:
     """Draw what a simulation sees; how many points its map has."""
     seen = reference_map(simulation, step=max(1, len(simulation) // 200))
-    save_picture(
-        path, draw_runs([DrawnRun(path.stem, PointCloud(seen.points, seen.normals))], OBLIQUE, width=width).pixels
-    )
+    runs = [DrawnRun(path.stem, PointCloud(seen.points, seen.normals))]
+    save_picture(path, draw_runs(runs, fit_frame(runs, OBLIQUE, width=width)))
     return len(seen.points)
 
 

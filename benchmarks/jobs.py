@@ -38,7 +38,7 @@ import json, os, sys
 from pathlib import Path
 out = Path(json.loads(sys.argv[-1])["out"])
 with open(sys.argv[1], "a") as file: file.write(f"{out.parent.name}/{out.name}\\n")
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", *sys.argv[2:]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_run", *sys.argv[2:]])
 """
 
 

@@ -7,8 +7,16 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from lidarslam.core.settings import Settings
-from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison, look_up
-from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
+from lidarslam.evaluation.comparison.comparison import (
+    WHOLE,
+    MethodResult,
+    SequenceComparison,
+    Table,
+    TableCell,
+    TableColumn,
+    TableRow,
+    look_up,
+)
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 
 _TRAJECTORY, _KITTI, _SEGMENTS, _MAP = (f"metrics/{part}/" for part in ("trajectory", "kitti", "segments", "map"))

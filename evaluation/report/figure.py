@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from plotly.io.json import to_json_plotly
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.comparison.table import printable
+from lidarslam.evaluation.comparison.comparison import printable
 
 # After Okabe and Ito (blue, vermilion, green, purple), then four more; contrast of 3 or more on white and on dark.
 _COLOURS = ("#1a80c4", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#3a9bd1", "#aa3377", "#7f7f7f")

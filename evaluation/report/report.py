@@ -11,8 +11,7 @@ from itertools import groupby
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 
-from lidarslam.evaluation.comparison.comparison import Comparison, SequenceComparison
-from lidarslam.evaluation.comparison.table import Table, number_text, printable
+from lidarslam.evaluation.comparison.comparison import Comparison, SequenceComparison, Table, number_text, printable
 from lidarslam.evaluation.report.accuracy import (
     deviation_figure,
     entropy_figure,

@@ -4,9 +4,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
-from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison, lost_intervals
+from lidarslam.evaluation.comparison.comparison import (
+    WHOLE,
+    MethodResult,
+    SequenceComparison,
+    Table,
+    TableCell,
+    TableColumn,
+    TableRow,
+    lost_intervals,
+)
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
-from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
 _SUMMARY = (

@@ -176,7 +176,7 @@ def _draw(runs: list[Any], picture: Path, colour: Any, oblique: bool) -> None:
 
     frame = fit_frame(runs, OBLIQUE if oblique else TOP, quantity=colour)
     if picture.suffix:
-        save_picture(picture, draw_runs(runs, frame=frame).pixels)
+        save_picture(picture, draw_runs(runs, frame))
         say(f"written to {picture}")
     else:
         say(f"written to {', '.join(map(str, draw_apart(runs, picture, frame)))}")

@@ -13,9 +13,8 @@ from pathlib import Path
 from lidarslam.assessment.evaluate import evaluate_map
 from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
 from lidarslam.compare.benchmark import fill_request, load_benchmark, make_recordings, require_data
-from lidarslam.compare.method_process import MethodRun
-from lidarslam.compare.method_run import COMMAND, PROCESS, clear, finished_before, obstacle, run_method
-from lidarslam.compare.peers.scene import scene_note
+from lidarslam.compare.method_run import COMMAND, PROCESS, MethodRun, clear, finished_before, obstacle, run_method
+from lidarslam.compare.methods import scene_note
 from lidarslam.compare.plan import CompareRequest, PlannedRecording, make_plan
 from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison, format_result

@@ -1,16 +1,24 @@
-"""One method on one recording: a run in a process of its own, and its result however it ended."""
+"""One method on one recording: a run in a process of its own, and its result however it ended.
 
+The process is this module itself. Its arguments are the working directory and the method's run as JSON. After every
+scan a line goes to standard output: its number from 1, and the total. Libraries' output goes to standard error. The
+exit status is that of `lidarslam run`.
+"""
+
+import contextlib
+import ctypes
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from pydantic import ConfigDict, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
-from lidarslam.compare.method_process import LOST, MethodRun, encode
-from lidarslam.compare.peers.estimation import describe_peer
+from lidarslam.compare.peers.estimation import describe_peer, execute_peer
 from lidarslam.compare.peers.registry import peer_named
 from lidarslam.compare.supervised import Ending, Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
@@ -20,19 +28,46 @@ from lidarslam.core.files import remove_partial_files
 from lidarslam.core.json_text import read_json
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
-from lidarslam.run.request import describe_run
+from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.results import RunOutcome
+from lidarslam.run.run import execute
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY, RunDirectory
 from lidarslam.storage.finished_run import read_summary
 
 # In addition to a run's own files: how its process ended, and its standard error.
 PROCESS, LOG = "process.json", "process.log"
-COMMAND = (sys.executable, "-m", "lidarslam.compare.method_process")
+COMMAND = (sys.executable, "-m", "lidarslam.compare.method_run")
 # The process starts here, so that no package in the user's folder is found first.
 _ROOT = Path(__file__).resolve().parents[2]
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
 _LONGEST_MESSAGE = 300
+_STOPPED, _LOST = 1, 3  # exit statuses
+_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """One method on one recording."""
+
+    request: RunRequest  # into the directory with the method's name
+    peer: str | None = None  # the peer that estimates the poses
+    range_m: float | None = None  # maximum range of the peer by the size of the scene
+
+    @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.request.out.name
+
+
+_RUN = TypeAdapter(MethodRun)
+
+
+def encode(run: MethodRun) -> tuple[str, str]:
+    """The arguments; the run overwrites, and saves no state and draws no page, which would count as its time."""
+    request = replace(run.request, overwrite=True, resumable=False, report=False)
+    return str(Path.cwd()), _RUN.dump_json(replace(run, request=request)).decode()
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -135,7 +170,7 @@ def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> tuple[Meth
         return "timed out", f"took more than {limits.timeout_s:g} s"
     if ending.cause == "interrupt":
         return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
-    if has_result and ending.status in (0, LOST):
+    if has_result and ending.status in (0, _LOST):
         return ("lost", _where_lost(folder)) if ending.status else ("ok", "")
     return _failed(ending.status, has_result, _last_words(log))
 
@@ -167,3 +202,38 @@ def _last_words(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return last.removeprefix("lidarslam: ")[:_LONGEST_MESSAGE]
+
+
+def main() -> int:
+    """Run; the exit status."""
+    folder, text = sys.argv[1:]
+    os.chdir(folder)
+    _obey_parent()
+    with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as progress:
+        os.dup2(2, 1)
+        try:
+            outcome = _run(_RUN.validate_json(text), partial(print, file=progress))
+        except LidarSlamError as error:
+            print(f"lidarslam: {error}", file=sys.stderr)
+            return _STOPPED
+    if outcome.stopped is not None:
+        print(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", file=sys.stderr)
+        return _STOPPED
+    return _LOST if outcome.summary.went_astray else 0
+
+
+def _obey_parent() -> None:
+    """End with the supervisor, however that ends (Linux), and take its Ctrl-C, which processes of Ray block."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
+
+def _run(run: MethodRun, progress: Callable[[int, int], None]) -> RunOutcome:
+    if run.peer is not None:
+        return execute_peer(run.request, peer_named(run.peer), progress, run.range_m)
+    return execute(run.request, lambda number, total, _: progress(number, total))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

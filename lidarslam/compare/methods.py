@@ -1,12 +1,17 @@
 """Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph], or PEER[@scene]."""
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 
+import numpy as np
+
+from lidarslam.compare.peers.interface import MAX_RANGE_M
 from lidarslam.compare.peers.registry import ALL_PEERS, PEERS, peer_named
-from lidarslam.compare.peers.scene import BY_SCENE
-from lidarslam.core.errors import ConfigError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.text import require_name
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import ODOMETRIES
 from lidarslam.storage.comparison_folder import RESERVED
@@ -22,6 +27,13 @@ _BASES = {
     "prior": "external",
 }
 _NO_DESKEW = "kiss-icp-no-deskew"
+# Behind a method's name, the maximum range by the size of the scene: KISS-ICP's voxels are a hundredth of its maximum
+# range, 100 m by default, which suits streets; its authors advise a shorter range indoors. One rule for KISS-ICP and
+# every peer with voxels: twice the range of 99 % of the points of the first scans, as the default is on streets.
+BY_SCENE = "scene"
+_SCANS, _PERCENT, _TIMES = 10, 99.0, 2.0
+# As KISS-ICP's authors advise for indoor data; finer voxels than a tenth of the default would hold single points.
+_SHORTEST_M = 10.0
 DEFAULT_METHODS = "learned+map,kiss-icp"
 # A peer's run: its poses as they are.
 _PEER = ("odometry.method=external", "mapping.method=off", "pose_graph.enabled=false")
@@ -116,3 +128,23 @@ def parse_methods(names: str) -> tuple[Method, ...]:
     if len(set(chosen)) < len(chosen):
         raise ConfigError(f"a method is named twice in {names!r}; name each once")
     return tuple(parse_method(name) for name in chosen)
+
+
+def scene_range_m(recording: Recording, chosen: range) -> float:
+    """Twice the range of 99 % of the points of the first ten chosen scans, within 10 and 100 m; no truth is used."""
+    ranges = [np.empty(0)]
+    with suppress(InputError):  # raised again when the methods read the scans
+        for scan in recording.scans(chosen.start, chosen[:_SCANS].stop, chosen.step, Faults()):
+            ranges.append(np.linalg.norm(scan.points, axis=1))
+    found = np.concatenate(ranges)
+    if not len(found):
+        return MAX_RANGE_M
+    return round(float(np.clip(_TIMES * np.percentile(found, _PERCENT), _SHORTEST_M, MAX_RANGE_M)), 1)
+
+
+def scene_note(range_m: float) -> str:
+    """A sentence on the meaning of the name on this recording."""
+    return (
+        f"@{BY_SCENE}: maximum range {range_m:g} m instead of {MAX_RANGE_M:g} m, and voxels in proportion, by the"
+        " ranges of the first scans"
+    )

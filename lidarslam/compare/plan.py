@@ -6,11 +6,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import ConfigDict, Field
 
-from lidarslam.compare.method_process import MethodRun
-from lidarslam.compare.method_run import PROCESS
-from lidarslam.compare.methods import Method
+from lidarslam.compare.method_run import PROCESS, MethodRun
+from lidarslam.compare.methods import Method, scene_range_m
 from lidarslam.compare.peers.interface import MAX_RANGE_M
-from lidarslam.compare.peers.scene import scene_range_m
 from lidarslam.compare.supervised import Limits
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError

@@ -4,9 +4,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.core.text import as_typed, command_line, joined
-from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.comparison import (
+    Comparison,
+    MethodResult,
+    SequenceComparison,
+    Table,
+    TableCell,
+    TableColumn,
+    TableRow,
+    number_text,
+)
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
-from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
 

@@ -92,14 +92,6 @@ class Frame:
     scale: ColourScale | None  # of its colours; None without values
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A picture, and the view that its upper part shows."""
-
-    pixels: NDArray[np.uint8]  # (height, width, 3); below the view's height, the legend
-    view: View
-
-
 def fit_frame(
     runs: Sequence[DrawnRun],
     elevation_deg: float = TOP,
@@ -108,7 +100,7 @@ def fit_frame(
     quantity: Quantity = "height",
     turn_deg: float | None = None,
 ) -> Frame:
-    """The frame that holds all runs except diverging ones; arguments as in `draw_runs` and `fit_view`."""
+    """The frame of an orthographic picture, from an elevation above the horizon, that holds all but diverging runs."""
     found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
     scale = fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
     return Frame(fit_view(*framed(runs, reference), elevation_deg, turn_deg, width), quantity, scale)
@@ -123,22 +115,12 @@ def framed(runs: Sequence[DrawnRun], reference: FloatArray | None = None) -> tup
     return np.concatenate([run.cloud.points for run in shown or runs]), np.concatenate(positions)
 
 
-def draw_runs(
-    runs: Sequence[DrawnRun],
-    elevation_deg: float = TOP,
-    reference: FloatArray | None = None,
-    width: int = WIDTH,
-    frame: Frame | None = None,
-) -> Picture:
-    """Maps and trajectories in one frame, with legend, size and scale bar.
+def draw_runs(runs: Sequence[DrawnRun], frame: Frame, reference: FloatArray | None = None) -> NDArray[np.uint8]:
+    """Maps and trajectories (height, width, 3); below the view's height, the legend, the size and the scale bar.
 
-    One run is coloured by the frame's quantity, by height without a frame, and its path by status. Several have a
-    colour each; where maps cover each other, their colours mix. Their paths are the narrower the later in order.
-
-    The projection is orthographic, from an elevation above the horizon; a true trajectory (K, 3) is drawn below the
-    others. A frame is taken instead of the one that suits the runs.
+    One run is coloured by the frame's quantity, and its path by status. Several have a colour each; where maps cover
+    each other, their colours mix. Their paths are the narrower the later in order; a true trajectory (K, 3) is below.
     """
-    frame = frame or fit_frame(runs, elevation_deg, reference, width)
     fine = frame.view.enlarged(_SUPERSAMPLING)
     # A single run is coloured by its quantity.
     colours = [_RUN_COLOURS[n % len(_RUN_COLOURS)] if len(runs) > 1 else None for n in range(len(runs))]
@@ -159,7 +141,7 @@ def draw_runs(
     for run in runs:
         notes.draw_end(image, fine, run.positions[:1], notes.START)
     entries = list(_entries(runs, colours, widths, frame, reference is not None))
-    return Picture(np.asarray(notes.with_strip(image.reduce(_SUPERSAMPLING), entries)), frame.view)
+    return np.asarray(notes.with_strip(image.reduce(_SUPERSAMPLING), entries))
 
 
 def draw_apart(runs: Sequence[DrawnRun], folder: Path, frame: Frame) -> list[Path]:
@@ -170,7 +152,7 @@ def draw_apart(runs: Sequence[DrawnRun], folder: Path, frame: Frame) -> list[Pat
     make_directory(folder)
     files = [folder / f"{name}.png" for name in names]
     for run, file in zip(runs, files, strict=True):
-        save_picture(file, draw_runs([run], frame=frame).pixels)
+        save_picture(file, draw_runs([run], frame))
     return files
 
 

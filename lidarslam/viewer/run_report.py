@@ -51,10 +51,10 @@ def leave_report(run: Path, errors: MethodResult, reference: str = GROUND_TRUTH,
         directory, (drawn,) = RunDirectory(run), load_drawn_runs([run])
         path, truth, frame = replace(drawn, cloud=_NO_CLOUD), _true_path(errors), fit_frame([drawn])
         alone = fit_frame([path], reference=truth, turn_deg=frame.view.turn_deg)
-        _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], reference=truth, frame=alone).pixels)
+        _write_picture(directory, files.TRAJECTORY_PNG, draw_runs([path], alone, truth))
         picture = None
         if len(drawn.cloud):
-            picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn], frame=frame).pixels)
+            picture = _write_picture(directory, files.MAP_PNG, draw_runs([drawn], frame))
         directory.write_text(files.REPORT, _page(run, errors, reference, notes, picture))
     except KeyboardInterrupt:
         logger.warning("%s: no %s was drawn: interrupted", run, files.REPORT)

@@ -45,7 +45,7 @@ def turn_runs(
     frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
     turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)
     for number, view in enumerate(turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
-        yield draw_runs(runs, frame=replace(frame, view=view)).pixels
+        yield draw_runs(runs, replace(frame, view=view))
         count(number, frames)
 
 

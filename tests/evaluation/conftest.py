@@ -12,8 +12,11 @@ from lidarslam.evaluation.comparison.comparison import (
     MethodResult,
     MissingRecording,
     SequenceComparison,
+    Table,
+    TableCell,
+    TableColumn,
+    TableRow,
 )
-from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 

@@ -15,10 +15,11 @@ from lidarslam.evaluation.comparison.comparison import (
     MethodStatus,
     MissingRecording,
     SequenceComparison,
+    TableCell,
+    TableRow,
     lost_intervals,
 )
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, Published, TablePlan, mean_table
-from lidarslam.evaluation.comparison.table import TableCell, TableRow
 from lidarslam.evaluation.report.tables import sequence_tables
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 

@@ -12,8 +12,16 @@ import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
-from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
-from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
+from lidarslam.evaluation.comparison.comparison import (
+    Comparison,
+    MethodResult,
+    SequenceComparison,
+    Table,
+    TableCell,
+    TableColumn,
+    TableRow,
+    number_text,
+)
 from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.report.accuracy import raster
 from lidarslam.evaluation.report.figure import Panel, line_trace, method_styles, plot_text, thin_curve

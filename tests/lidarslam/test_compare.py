@@ -31,7 +31,7 @@ METRICS = {"association", "trajectory", "kitti", "segments", "map"}
 FAULTS = """
 import json, os, sys, time
 from pathlib import Path
-name = Path(json.loads(sys.argv[-1])["out"]).name
+name = Path(json.loads(sys.argv[-1])["request"]["out"]).name
 print("1 5", flush=True)
 if name == "kiss-icp@1": os.abort()
 if name == "kiss-icp@2":
@@ -42,7 +42,7 @@ if name == "kiss-icp@4": raise RuntimeError("no such thing")
 if name == "kiss-icp@5": raise MemoryError
 if name == "kiss-icp@6": os.kill(os.getpid(), 9)
 if name == "kiss-icp@7": print("lidarslam: the recording is damaged", file=sys.stderr); sys.exit(1)
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", *sys.argv[1:]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_run", *sys.argv[1:]])
 """
 
 

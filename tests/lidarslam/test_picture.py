@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import open3d as o3d
@@ -19,7 +20,6 @@ from lidarslam.viewer.picture import (
     OBLIQUE,
     TOP,
     DrawnRun,
-    Picture,
     draw_apart,
     draw_runs,
     fit_frame,
@@ -27,10 +27,21 @@ from lidarslam.viewer.picture import (
     save_picture,
 )
 from lidarslam.viewer.video import save_video, turn_runs
-from lidarslam.viewer.view import draw_layer, fit_view, turning_views
+from lidarslam.viewer.view import View, draw_layer, fit_view, turning_views
 
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 WIDTH = 400
+
+
+class Picture(NamedTuple):
+    pixels: NDArray[np.uint8]
+    view: View
+
+
+def draw(runs: list[DrawnRun], elevation_deg: float = TOP, width: int = WIDTH, **given: Any) -> Picture:
+    """A picture and its frame's view."""
+    frame = fit_frame(runs, elevation_deg, width=width, **given)
+    return Picture(draw_runs(runs, frame, given.get("reference")), frame.view)
 
 
 def cloud(points: FloatArray, normal: tuple[float, float, float] = UP) -> PointCloud:
@@ -62,7 +73,7 @@ def is_like(colours: NDArray[np.int64], colour: tuple[int, int, int]) -> bool:
 @pytest.mark.parametrize("scale", [0.3, 30.0, 3_000.0])
 def test_every_point_is_drawn_at_its_pixel(rng: np.random.Generator, scale: float, elevation_deg: float) -> None:
     points = scale * rng.uniform(-1.0, 1.0, (60, 3)) * [1.0, 0.5, 0.2] + 5.0 * scale
-    picture = draw_runs([DrawnRun("", cloud(points))], elevation_deg, width=WIDTH)
+    picture = draw([DrawnRun("", cloud(points))], elevation_deg)
     pixels = picture.view.project(points)
     assert (pixels > 5).all()
     assert (pixels < [picture.view.width - 5, picture.view.height - 5]).all()
@@ -76,10 +87,10 @@ def test_every_point_is_drawn_at_its_pixel(rng: np.random.Generator, scale: floa
 def test_pixels_are_to_scale() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 10.0, 0.0], [0.0, 10.0, 0.0]])
     for elevation_deg in (TOP, OBLIQUE):
-        view = draw_runs([DrawnRun("", cloud(corners))], elevation_deg, width=WIDTH).view
+        view = draw([DrawnRun("", cloud(corners))], elevation_deg).view
         pixels = view.project(corners)
         np.testing.assert_allclose((pixels[1] - pixels[0]) * view.pixel_m, [30.0, 0.0], atol=1e-9)
-    view = draw_runs([DrawnRun("", cloud(corners))], TOP, width=WIDTH).view
+    view = draw([DrawnRun("", cloud(corners))], TOP).view
     pixels = view.project(corners)
     np.testing.assert_allclose((pixels[3] - pixels[0]) * view.pixel_m, [0.0, -10.0], atol=1e-9)
     np.testing.assert_allclose(view.size_m, [30.0, 10.0])
@@ -88,7 +99,7 @@ def test_pixels_are_to_scale() -> None:
 @pytest.mark.parametrize("size_m", [3.0, 47.0, 800.0])
 def test_the_scale_bar_is_as_long_as_it_says(size_m: float) -> None:
     view = fit_view(np.array([[0.0, 0.0, 0.0], [size_m, 0.3 * size_m, 0.0]]), np.empty((0, 3)), width=1600)
-    picture = draw_runs([DrawnRun("", cloud(np.array([[0.0, 0.0, 0.0], [size_m, 0.3 * size_m, 0.0]])))])
+    picture = draw([DrawnRun("", cloud(np.array([[0.0, 0.0, 0.0], [size_m, 0.3 * size_m, 0.0]])))], width=1600)
     ink = (picture.pixels[view.height :] == INK).all(axis=2)
     longest = max(len(run) for row in ink for run in "".join("x" if dark else " " for dark in row).split())
     metres = round_length(0.2 * 1600 * view.pixel_m)
@@ -115,21 +126,16 @@ def test_the_path_is_drawn_above_everything_with_its_ends_and_its_lost_stretch()
     positions = np.column_stack([np.linspace(-8.0, 8.0, 41), np.zeros((41, 2))])
     statuses = [Status.OK] * 14 + [Status.DEGRADED] * 13 + [Status.LOST] * 14
     roof = cloud(plane(5.0), UP)
-    picture = draw_runs([DrawnRun("", roof, positions, statuses)], width=800)
-    for x, colour in (
-        (-6.0, (15, 15, 15)),
-        (0.0, (255, 140, 0)),
-        (6.0, (225, 0, 60)),
-        (-8.0, START),
-        (8.0, INK),
-    ):
+    picture = draw([DrawnRun("", roof, positions, statuses)], width=800)
+    colours = {-6.0: (15, 15, 15), 0.0: (255, 140, 0), 6.0: (225, 0, 60), -8.0: START, 8.0: INK}
+    for x, colour in colours.items():
         assert is_like(near(picture, np.array([x, 0.0, 0.0])), colour), x
     assert not is_like(near(picture, np.array([0.0, 3.0, 0.0])), (255, 140, 0))
 
 
 def test_what_is_in_front_hides_what_is_behind() -> None:
     low, high = plane(0.0), plane(1.0)[20_000:]
-    picture = draw_runs([DrawnRun("", cloud(np.concatenate([low, high])))], width=WIDTH)
+    picture = draw([DrawnRun("", cloud(np.concatenate([low, high])))])
     assert near(picture, np.array([0.0, -5.0, 0.0])).mean() > near(picture, np.array([0.0, 5.0, 1.0])).mean() + 50.0
 
 
@@ -156,7 +162,7 @@ def test_a_plane_is_closed_and_evenly_lit(elevation_deg: float) -> None:
 def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:
     shifted = plane(0.0) + np.array([10.0, 0.0, 0.0])
     runs = [DrawnRun("a", cloud(plane(0.0))), DrawnRun("b", cloud(shifted))]
-    picture = draw_runs(runs, width=WIDTH)
+    picture = draw(runs)
     first, both, second = (near(picture, np.array([x, 0.0, 0.0])).mean(axis=0) for x in (-5.0, 5.0, 15.0))
     assert first[2] > first[0] + 50, "blue"
     assert second[0] > second[2] + 50, "vermilion"
@@ -165,12 +171,12 @@ def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:
 
 def test_a_run_without_a_map_or_with_one_pose_is_drawn() -> None:
     nothing = PointCloud(np.empty((0, 3)), np.empty((0, 3)))
-    assert not drawn(draw_runs([DrawnRun("", nothing)], width=WIDTH)).any()
-    assert drawn(draw_runs([DrawnRun("", nothing, np.zeros((1, 3)))], width=WIDTH)).any()
+    assert not drawn(draw([DrawnRun("", nothing)])).any()
+    assert drawn(draw([DrawnRun("", nothing, np.zeros((1, 3)))])).any()
 
 
 def test_a_picture_is_written_as_png(tmp_path: Path) -> None:
-    pixels = draw_runs([DrawnRun("", cloud(np.eye(3)))], width=WIDTH).pixels
+    pixels = draw([DrawnRun("", cloud(np.eye(3)))]).pixels
     save_picture(tmp_path / "map.png", pixels)
     np.testing.assert_array_equal(np.asarray(o3d.io.read_image(str(tmp_path / "map.png"))), pixels)
     with pytest.raises(OutputError, match=r"\.png or \.jpg"):
@@ -186,7 +192,7 @@ NOTHING = PointCloud(np.empty((0, 3)), np.empty((0, 3)))
 
 def test_paths_that_coincide_are_all_seen_and_have_no_gaps() -> None:
     arc = np.column_stack([9.0 * np.sin(a := np.linspace(-1.0, 1.0, 700)), 9.0 * np.cos(a), np.zeros(700)])
-    picture = draw_runs([DrawnRun(name, NOTHING, arc) for name in "abc"], width=1600)
+    picture = draw([DrawnRun(name, NOTHING, arc) for name in "abc"], width=1600)
     colours = [(0, 114, 178), (213, 94, 0), (0, 158, 115)]
     for place in arc[50:-50:7]:
         column, row = np.round(picture.view.project(place[None])[0]).astype(int)
@@ -204,9 +210,9 @@ def test_a_run_that_diverges_leaves_the_picture_and_is_named() -> None:
     view = fit_frame(runs).view
     assert view.size_m[0] < 25.0
     assert fit_frame([runs[0], replace(runs[2], name="near", positions=line(2.0, 20.0))]).view.size_m[0] > 35.0
-    heights = [draw_runs(of, width=WIDTH).pixels.shape[0] for of in (runs[:2], runs)]
+    heights = [draw(of).pixels.shape[0] for of in (runs[:2], runs)]
     assert heights[1] > heights[0], "a row of the legend more"
-    assert draw_runs([DrawnRun("wild", NOTHING, wild)], reference=good, width=WIDTH).view.size_m[0] < 25.0
+    assert draw([DrawnRun("wild", NOTHING, wild)], reference=good).view.size_m[0] < 25.0
 
 
 def test_pictures_of_one_frame_are_the_same_but_for_the_run(tmp_path: Path) -> None:
@@ -231,10 +237,10 @@ def test_the_map_is_coloured_by_intensity_rgb_or_error() -> None:
     run = DrawnRun("", known, line(8.0), distances_m=np.where(left, 0.0, 0.4))
     sides = [np.array([x, 0.0, 0.0]) for x in (-5.0, 5.0)]
     for quantity, brighter in (("intensity", 1), ("error", 0)):
-        picture = draw_runs([run], frame=fit_frame([run], quantity=quantity, width=WIDTH))
+        picture = draw([run], quantity=quantity)
         means = [near(picture, side).mean() for side in sides]
         assert means[brighter] > means[1 - brighter] + 40, quantity
-    red, blue = (near(draw_runs([run], frame=fit_frame([run], quantity="rgb", width=WIDTH)), side) for side in sides)
+    red, blue = (near(draw([run], quantity="rgb"), side) for side in sides)
     assert (red[:, 0] > 100).all()
     assert (blue[:, 2] > 100).all()
 
@@ -242,7 +248,7 @@ def test_the_map_is_coloured_by_intensity_rgb_or_error() -> None:
 def test_the_path_is_coloured_by_its_error_and_grey_without_one() -> None:
     errors_m = np.concatenate([np.zeros(150), np.full(150, 0.4), np.full(100, np.nan)])
     run = DrawnRun("", cloud(plane(0.0)), line(0.0), errors_m=errors_m)
-    picture = draw_runs([run], frame=fit_frame([run], quantity="error", width=800))
+    picture = draw([run], quantity="error", width=800)
     for x, colour in ((-6.0, (253, 231, 37)), (1.0, (68, 1, 84)), (7.0, (205, 205, 205))):
         assert is_like(near(picture, np.array([x, 0.0, 0.0]), 0), colour), x
 

@@ -32,12 +32,12 @@ COUNTED = """
 import json, os, signal, sys, time
 from pathlib import Path
 signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-log, request = Path(sys.argv[1]), json.loads(sys.argv[-1])
+log, request = Path(sys.argv[1]), json.loads(sys.argv[-1])["request"]
 name = Path(request["out"]).name
 with log.open("a") as file: file.write(f"{name} {os.getppid()} {os.getpid()}\\n")
 starts = sum(line.startswith(f"{name} ") for line in log.read_text().splitlines())
 if name.startswith("learned") and starts == 1 and sys.argv[2] == "wait": time.sleep(120)
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", *sys.argv[3:]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_run", *sys.argv[3:]])
 """
 
 

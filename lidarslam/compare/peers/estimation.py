@@ -160,11 +160,10 @@ def _at_stamps(poses: Poses, stamps: FloatArray) -> Trajectory:
     instants, T_world_lidar = poses.instants, poses.T_world_lidar
     if not np.isfinite(T_world_lidar).all():
         raise PeerError(f"some of its {len(instants)} poses are not finite")
-    T_world_lidar = orthonormalize(T_world_lidar)
     if len(instants) < 2:
         raise PeerError(f"has {len(instants)} poses for {len(stamps)} scans, and two or more are needed")
     covered = stamps[is_covered(instants, stamps)]
-    return Trajectory(covered, Trajectory(instants, T_world_lidar).at(covered, _EXTRAPOLATION_S))
+    return Trajectory(covered, Trajectory(instants, orthonormalize(T_world_lidar)).at(covered, _EXTRAPOLATION_S))
 
 
 def is_covered(instants: FloatArray, stamps: FloatArray) -> NDArray[np.bool_]:

@@ -92,12 +92,10 @@ class EvalioEstimator:
             changes |= {name: size_m * range_m / MAX_RANGE_M for name, size_m in pipeline.voxels_m.items()}
         # `set_params` sets only the given parameters.
         self._native.set_params({**self._native.default_params(), **changes})
-        rows, columns = self._shape
-        rate = 10.0 if first.is_compensated else 1.0 / (first.end - first.start)
-        near = _MIN_RANGE_M if pipeline.by_rings else 0.0
-        self._native.set_lidar_params(
-            LidarParams(num_rows=rows, num_columns=columns, min_range=near, max_range=range_m or MAX_RANGE_M, rate=rate)
-        )
+        (rows, columns), near = self._shape, _MIN_RANGE_M if pipeline.by_rings else 0.0
+        rate, far = 10.0 if first.is_compensated else 1.0 / (first.end - first.start), range_m or MAX_RANGE_M
+        lidar = LidarParams(num_rows=rows, num_columns=columns, min_range=near, max_range=far, rate=rate)
+        self._native.set_lidar_params(lidar)
         if imu is not None:
             self._native.set_imu_params(ImuParams.up())
         self._native.set_imu_T_lidar(SE3.from_mat(inverse(self._T_lidar_imu)))
@@ -120,9 +118,8 @@ class EvalioEstimator:
 
         def register() -> None:
             self._native.add_lidar(measured)
-            self._saved += [
-                (stamp.to_sec() + self._begin, pose.to_mat()) for stamp, pose in self._native.saved_estimates()
-            ]
+            for stamp, pose in self._native.saved_estimates():
+                self._saved.append((stamp.to_sec() + self._begin, pose.to_mat()))
             self._native.saved_features()  # they accumulate otherwise
 
         return register
@@ -164,15 +161,11 @@ def elastic_instants(starts: FloatArray, middles: FloatArray, ends: FloatArray) 
 def _image_shape(sweep: Sweep) -> tuple[int, int]:
     """Rings, and cells of a ring by the usual step of the azimuth along it."""
     order, rings = ring_order(sweep.scan)
-    azimuths = _azimuths(sweep.scan.points[order])
-    steps = np.abs(np.diff(azimuths))[np.diff(rings) == 0]
+    x, y, _ = sweep.scan.points[order].T
+    steps = np.abs(np.diff(np.arctan2(y, x)))[np.diff(rings) == 0]
     steps = steps[(steps > 0.0) & (steps < np.pi)]
     columns = 2.0 * np.pi / float(np.median(steps)) if len(steps) else 1024.0
     return int(rings.max()) + 1, int(np.clip(round(columns), 64, 4096))
-
-
-def _azimuths(points: FloatArray) -> FloatArray:
-    return np.asarray(np.arctan2(points[:, 1], points[:, 0]))
 
 
 def _by_rings(sweep: Sweep, shape: tuple[int, int]) -> list[Any]:
@@ -181,7 +174,8 @@ def _by_rings(sweep: Sweep, shape: tuple[int, int]) -> list[Any]:
 
     order, rings = ring_order(sweep.scan)
     points, times = sweep.scan.points[order], _since_start(sweep)[order]
-    columns = ((_azimuths(points) + np.pi) / (2.0 * np.pi) * shape[1]).astype(np.intp) % shape[1]
+    azimuths = np.arctan2(points[:, 1], points[:, 0])
+    columns = ((azimuths + np.pi) / (2.0 * np.pi) * shape[1]).astype(np.intp) % shape[1]
     inside = rings < shape[0]
     cells = rings[inside] * shape[1] + columns[inside]
     filled = np.zeros((shape[0] * shape[1], 4))

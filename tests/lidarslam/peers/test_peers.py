@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from lidarslam.cli import main
+from lidarslam.compare.methods import scene_range_m
 from lidarslam.compare.peers.estimation import estimate, is_covered
 from lidarslam.compare.peers.interface import PeerError, Poses, Sweep
 from lidarslam.compare.peers.registry import PEERS
-from lidarslam.compare.peers.scene import scene_range_m
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
