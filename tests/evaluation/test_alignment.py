@@ -11,25 +11,21 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 MOTIONS = [(0.0,) * 6, (0.3, -0.2, 2.5, 10.0, -4.0, 1.0), (3.1, 0.1, 0.2, -500.0, 20.0, 3.0)]
 
 
-def assert_same(T_a: np.ndarray, T_b: np.ndarray, tolerance: float = 1e-6) -> None:
-    np.testing.assert_allclose(T_a, T_b, atol=tolerance)
-
-
 @pytest.mark.parametrize("xi", MOTIONS)
 @pytest.mark.parametrize("shape", ["drive", "plane", "line", "line and turning", "still", "still and turning"])
 def test_a_known_motion_is_found_for_every_shape_of_path(xi, shape, random_drive, straight_drive):
-    estimate = {
-        "drive": lambda: random_drive(4, scans=120),
-        "plane": lambda: straight_drive(120, (0.0, 0.0, 0.02, 1.0, 0.0, 0.0)),
-        "line": lambda: straight_drive(120),
-        "line and turning": lambda: straight_drive(120, (0.05, 0.0, 0.0, 1.0, 0.0, 0.0)),
-        "still": lambda: straight_drive(120, (0.0,) * 6),
-        "still and turning": lambda: straight_drive(120, (0.0, 0.0, 0.05, 0.0, 0.0, 0.0)),
-    }[shape]()
+    steps = {
+        "plane": (0.0, 0.0, 0.02, 1.0, 0.0, 0.0),
+        "line": (0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
+        "line and turning": (0.05, 0.0, 0.0, 1.0, 0.0, 0.0),
+        "still": (0.0,) * 6,
+        "still and turning": (0.0, 0.0, 0.05, 0.0, 0.0, 0.0),
+    }
+    estimate = straight_drive(120, steps[shape]) if shape in steps else random_drive(4, scans=120)
     T_reference_estimate = exp(xi)
     found = align(estimate, estimate.transformed(T_reference_estimate))
     assert is_rigid(found, 1e-9)
-    assert_same(found, T_reference_estimate)
+    np.testing.assert_allclose(found, T_reference_estimate, atol=1e-6)
 
 
 @pytest.mark.parametrize(("step_m", "sigma_m"), [(0.1, 0.01), (2.0, 0.2)], ids=["corridor", "motorway"])
@@ -54,7 +50,7 @@ def test_a_nearly_straight_path_takes_the_rotation_about_it_from_the_orientation
 def test_a_path_that_spreads_sideways_is_fitted_by_its_positions_alone(straight_drive):
     drive = straight_drive(120, (0.0, 0.0, 0.01, 1.0, 0.0, 0.0))
     poses = drive.T_world_lidar @ exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert_same(align(drive, Trajectory(drive.stamps, poses)), np.eye(4))
+    np.testing.assert_allclose(align(drive, Trajectory(drive.stamps, poses)), np.eye(4), atol=1e-6)
 
 
 def test_a_mirrored_estimate_is_not_answered_with_a_reflection(random_drive):
@@ -67,15 +63,9 @@ def test_a_mirrored_estimate_is_not_answered_with_a_reflection(random_drive):
 def test_first_pose_and_none(random_drive):
     estimate, reference = random_drive(7), random_drive(8).transformed(exp(MOTIONS[1]))
     T_reference_estimate = align(estimate, reference, "first_pose")
-    assert_same(T_reference_estimate @ estimate.T_world_lidar[0], reference.T_world_lidar[0], 1e-12)
+    moved = T_reference_estimate @ estimate.T_world_lidar[0]
+    np.testing.assert_allclose(moved, reference.T_world_lidar[0], atol=1e-12)
     assert np.array_equal(align(estimate, reference, "none"), np.eye(4))
-
-
-def test_misuse_is_refused(random_drive):
-    with pytest.raises(ValueError, match="got 400 and 30"):
-        align(random_drive(1), random_drive(1, scans=30))
-    with pytest.raises(ValueError, match="'sim3'"):
-        align(random_drive(1), random_drive(1), "sim3")
 
 
 def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:

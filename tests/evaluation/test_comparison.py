@@ -11,6 +11,7 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import (
     Comparison,
+    LostInterval,
     MethodResult,
     MethodStatus,
     MissingRecording,
@@ -152,23 +153,14 @@ def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_c
     assert "registration alone" not in mean_table(memory, [sequence]).note
 
 
-def test_every_interval_has_its_own_reason() -> None:
+def test_intervals_have_reasons_and_losses_less_than_a_second_apart_are_one() -> None:
     first, second = lost_intervals(LOST)
-    assert (first.first, first.last, first.scans, first.begin_s, first.end_s) == (1, 2, 2, 1.0, 2.0)
-    assert (first.reason, second.reason) == ("covered", "kidnapped")
-
-
-def test_without_reasons_the_message_has_to_do() -> None:
+    assert first == LostInterval(1, 2, 1.0, 2.0, 2, "covered")
+    assert second.reason == "kidnapped"
     assert [interval.reason for interval in lost_intervals(replace(LOST, lost_reasons=()))] == [LOST.message] * 2
-
-
-def test_losses_less_than_a_second_apart_are_one_interval() -> None:
     fast = Trajectory(0.1 * np.arange(6.0), np.tile(np.eye(4), (6, 1, 1)))
     (interval,) = lost_intervals(replace(LOST, trajectory=fast))
     assert (interval.first, interval.last, interval.scans) == (1, 5, 3)
     assert interval.reason == "covered, and 1 more"
-
-
-def test_nothing_lost_is_no_interval() -> None:
     assert lost_intervals(replace(LOST, lost=np.zeros(6, dtype=np.bool_))) == []
     assert lost_intervals(replace(LOST, trajectory=None)) == []

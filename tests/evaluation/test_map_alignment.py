@@ -24,14 +24,12 @@ print(found.T_reference_map.tobytes().hex())
 """
 
 
-def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 25.0) -> FloatArray:
+def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 15.0) -> FloatArray:
     """Points on the faces of a box."""
-    low_, high_ = np.array(low), np.array(high)
     faces = []
-    for axis in range(3):
-        area = float(np.prod(np.delete(high_ - low_, axis)))
-        for side in (low_[axis], high_[axis]):
-            face = rng.uniform(low_, high_, (int(per_m2 * area), 3))
+    for axis, sides in enumerate(zip(low, high, strict=True)):
+        for side in sides:
+            face = rng.uniform(low, high, (int(per_m2 * np.prod(np.delete(np.subtract(high, low), axis))), 3))
             face[:, axis] = side
             faces.append(face)
     return np.concatenate(faces)
@@ -54,18 +52,22 @@ def _error(T_a: FloatArray, T_b: FloatArray, points: FloatArray) -> float:
 
 
 @pytest.mark.parametrize(
-    ("xi", "origin"),
-    [([0.0, 0.0, 1.8, 3.0, -20.0, 1.0], np.zeros(3)), ([0.02, -0.03, -2.9, 0.0, 7.0, 0.0], UTM)],
+    ("xi", "origin", "guesses"),
+    [
+        ([0.0, 0.0, 1.8, 3.0, -20.0, 1.0], np.zeros(3), {}),
+        ([0.02, -0.03, -2.9, 0.0, 7.0, 0.0], UTM, {"none": np.eye(4)}),
+    ],
+    ids=["without a guess", "far away, with a wrong one"],
 )
-def test_a_turned_map_is_found_without_a_guess(
-    building: FloatArray, rng: np.random.Generator, xi: list[float], origin: FloatArray
+def test_a_turned_map_is_found(
+    building: FloatArray, rng: np.random.Generator, xi: list[float], origin: FloatArray, guesses: dict[str, FloatArray]
 ) -> None:
     part = building[building[:, 0] < 16.0]
     T_reference_map = exp(xi)
     T_reference_map[:3, 3] += origin
     seen = transform_points(inverse(T_reference_map), part + origin + rng.normal(0.0, 0.01, part.shape))
     # Only half of the cloud is the same points, so that no point meets itself by design.
-    found = align_map(seen[::2], building + origin, {}, search=True)
+    found = align_map(seen[::2], building + origin, guesses, search=True)
     assert found.method == "global"
     assert found.is_trustworthy
     assert found.fitness > 0.99
@@ -92,13 +94,9 @@ def test_without_refinement_the_guess_stands(building: FloatArray) -> None:
     assert (found.moved_m, found.refined, found.method) == (0.0, False, "none")
 
 
-def test_a_wrong_guess_gives_way_to_the_search(building: FloatArray) -> None:
+def test_a_guess_that_fits_needs_no_search(building: FloatArray) -> None:
     T_true = exp([0.0, 0.0, 2.0, 30.0, 0.0, 0.0])
     seen = transform_points(inverse(T_true), building[::2])
-    found = align_map(seen, building, {"none": np.eye(4)}, search=True)
-    assert found.method == "global"
-    again = align_map(seen, building, {}, search=True)
-    np.testing.assert_allclose(again.T_reference_map, found.T_reference_map, atol=1e-6)
     assert align_map(seen, building, {"trajectory": T_true}, search=True).method == "trajectory"
 
 
@@ -126,7 +124,7 @@ def test_the_pose_is_the_same_for_any_number_of_threads() -> None:
     root = str(Path(__file__).parents[2])
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     poses = set()
-    for threads in ("1", "3", "4"):
+    for threads in ("1", "3"):
         environment = os.environ | {"PYTHONPATH": root} | dict.fromkeys(names, threads)
         done = subprocess.run(
             [sys.executable, "-c", THREADS], env=environment, capture_output=True, text=True, check=True

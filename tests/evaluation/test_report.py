@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from typing import Any
 from xml.etree import ElementTree
 
@@ -30,21 +29,6 @@ from lidarslam.evaluation.report.report import render_html, render_markdown
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \ufffd"
 
 
-@pytest.fixture(scope="module")
-def elements() -> type[HTMLParser]:
-    """A parser as lenient as a browser's, which lists all elements with their attributes."""
-
-    class Elements(HTMLParser):
-        def __init__(self) -> None:
-            super().__init__()
-            self.found: list[tuple[str, dict[str, str | None]]] = []
-
-        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-            self.found.append((tag, dict(attrs)))
-
-    return Elements
-
-
 def page_of(comparison: Comparison) -> ElementTree.Element:
     """The page as XML, which it is but for the style sheet and the two scripts."""
     html = re.sub(r"(<script>).*?(</script>)", r"\1\2", render_html(comparison), flags=re.DOTALL)
@@ -67,21 +51,18 @@ def plots(page: ElementTree.Element, title: str) -> list[dict[str, Any]]:
     return [json.loads(div.find("script").text) for div in found]
 
 
-def test_the_page_is_well_formed_and_fetches_nothing(comparison, elements):
+def test_the_page_is_well_formed_and_fetches_nothing(comparison):
     html = render_html(comparison)
-    page_of(comparison)
-    parser = elements()
-    parser.feed(html)
-    tags = {tag for tag, _ in parser.found}
-    assert not tags & {"link", "iframe", "object", "embed", "base", "form", "img"}
-    scripts = [attributes for tag, attributes in parser.found if tag == "script"]
+    elements = list(page_of(comparison).iter())
+    assert not {each.tag for each in elements} & {"link", "iframe", "object", "embed", "base", "form", "img"}
+    scripts = [each.attrib for each in elements if each.tag == "script"]
     assert scripts.count({}) == 2
     assert all(attributes in ({}, {"type": "application/json"}) for attributes in scripts)
     assert html.count(get_plotlyjs()) == 1
-    addresses = [v for _, attributes in parser.found for k, v in attributes.items() if k in ("src", "href")]
+    addresses = [value for each in elements for key, value in each.items() if key in ("src", "href")]
     assert addresses
     assert all(address.startswith("#") for address in addresses)
-    assert not [key for _, attributes in parser.found for key in attributes if key.startswith("on")]
+    assert not [key for each in elements for key in each.attrib if key.startswith("on")]
     written = html.replace(get_plotlyjs(), "")
     assert "url(" not in written
     assert "@import" not in written
@@ -122,18 +103,15 @@ def test_the_best_of_each_column_is_bold_and_starred(comparison):
     assert "★" in text_of(best[1])
     assert "★" not in text_of(other[1])
     assert other[1].find("b") is None
-    markdown = render_markdown(comparison)
     ate = comparison.sequences[0].methods[1].metrics.errors.ate_rmse_m
-    assert f"**{ate:.3f}** ★" in markdown
+    assert f"**{ate:.3f}** ★" in render_markdown(comparison)
 
 
 def test_what_ended_early_wins_nothing(comparison):
     sequence = comparison.sequences[1]
     first, second, _ = sequence.methods
-    best_but_stopped = replace(first, status="stopped")
-    changed = replace(
-        sequence, methods=[best_but_stopped, replace(second, status="ok"), second.__class__("x", "failed")]
-    )
+    methods = [replace(first, status="stopped"), replace(second, status="ok"), MethodResult("x", "failed")]
+    changed = replace(sequence, methods=methods)
     rows = table_rows(page_of(replace(comparison, sequences=[changed])), "corridor: all methods")
     assert not any("★" in text_of(cell) for cell in rows["kiss-icp"])
 

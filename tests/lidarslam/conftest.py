@@ -3,7 +3,8 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from lidarslam.cli import main
+from lidarslam.compare.comparison import Counter, Narrator
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
@@ -56,6 +58,27 @@ def scan_estimate(stamp: float, T_world_lidar: FloatArray, status: Status = Stat
         "points_dropped": 1,
     }
     return ScanEstimate(stamp=stamp, T_world_lidar=T_world_lidar, status=status, **given | values)
+
+
+class Told:
+    """Keeps what a comparison tells: a line for each method, and how many scans of which were counted."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.counts: list[tuple[str, int, int]] = []
+
+    @contextmanager
+    def counting(self, name: str) -> Iterator[Counter]:
+        yield lambda number, total: self.counts.append((name, number, total))
+
+    @property
+    def narrator(self) -> Narrator:
+        return Narrator(self.counting, self.lines.append)
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
 
 
 @pytest.fixture(scope="session")

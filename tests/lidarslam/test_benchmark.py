@@ -1,12 +1,11 @@
 """Methods as the command line names them, and benchmark files."""
 
 import json
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.compare.benchmark import Benchmark, fill_request, load_benchmark
 from lidarslam.compare.methods import parse_method, parse_methods
 from lidarslam.compare.plan import CompareRequest
@@ -15,6 +14,8 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS
+
+from ..conftest import lidarslam
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "benchmarks").glob("*.yaml"))
 RECORDINGS = "title: t\nmethods: [kiss-icp]\nrecordings: [{name: a, source: a}]\n"
@@ -103,6 +104,7 @@ def test_mistakes_are_named_with_the_file(tmp_path: Path, text: str, message: st
     assert message in str(error.value)
 
 
+@pytest.mark.slow
 def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
     file.write_text(
@@ -112,8 +114,7 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
         "  - {name: gone, source: gone}\n"
         "tables: [{title: T, groups: {all: [office, gone]}, quantities: [ate_rmse_m]}]\n"
     )
-    command = ["compare", "--benchmark", str(file), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(main, command, catch_exceptions=False)
+    result = lidarslam("compare", "--benchmark", file, "--out", tmp_path / "out")
     assert result.exit_code == 0
     assert "(over 1 of 2)" in result.stdout
     assert "left out: gone" in result.stdout
@@ -140,34 +141,33 @@ def test_the_name_decides_the_mapping(name: str, method: str, closes_loops: bool
     assert (config.mapping.method, config.pose_graph.enabled) == (method, closes_loops)
 
 
-@pytest.mark.parametrize(("name", "size_m"), [("kiss-icp@0.5", 0.5), ("kiss-icp@1", 1.0), ("kiss-icp@0.25+map", 0.25)])
-def test_a_voxel_size_stands_behind_the_at(name: str, size_m: float) -> None:
-    assert load_config(None, parse_method(name).settings).odometry.kiss_icp.voxel_size_m == size_m
-
-
-@pytest.mark.parametrize("name", ["kiss-icp@scene", "kiss-icp-no-deskew@scene", "kiss-icp@scene+map"])
-def test_scene_is_a_range_by_the_size_of_the_scene_and_voxels_of_a_hundredth(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("kiss-icp@0.5", {"odometry.kiss_icp.voxel_size_m": 0.5}),
+        ("kiss-icp@1", {"odometry.kiss_icp.voxel_size_m": 1.0}),
+        ("kiss-icp@0.25+map", {"odometry.kiss_icp.voxel_size_m": 0.25}),
+        ("kiss-icp-no-deskew", {"odometry.kiss_icp.deskew": False}),
+        ("prior+map", {"odometry.method": "external"}),
+        *(
+            (f"{name}@scene{rest}", {"odometry.kiss_icp.voxel_size_m": None, "odometry.kiss_icp.max_range_m": 13.5})
+            for name, rest in (("kiss-icp", ""), ("kiss-icp-no-deskew", ""), ("kiss-icp", "+map"))
+        ),
+    ],
+)
+def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> None:
     method = parse_method(name)
-    before = ("odometry.kiss_icp.voxel_size_m=0.5", "odometry.kiss_icp.max_range_m=70")
-    kiss = load_config(None, [*before, *method.settings_at(13.5)]).odometry.kiss_icp
-    assert (method.by_scene, kiss.max_range_m, kiss.voxel_size_m) == (True, 13.5, None)
-    assert parse_method("kiss-icp").settings_at(13.5) == parse_method("kiss-icp").settings
-
-
-def test_prior_is_the_external_odometry() -> None:
-    method = parse_method("prior+map")
-    assert method.needs_prior
-    assert load_config(None, method.settings).odometry.method == "external"
-    assert not parse_method("kiss-icp").needs_prior
+    before = ("odometry.kiss_icp.voxel_size_m=0.7", "odometry.kiss_icp.max_range_m=70")
+    config = load_config(None, [*before, *method.settings_at(13.5)])
+    assert {path: attrgetter(path)(config) for path in values} == values
+    assert method.by_scene == ("@scene" in name)
+    assert method.needs_prior == name.startswith("prior")
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (
-            "loam",
-            r"no method is called 'loam'; there are: learned, kiss-icp, kiss-icp-no-deskew, .*prior;",
-        ),
+        ("loam", r"no method is called 'loam'; there are: learned, kiss-icp, kiss-icp-no-deskew, .*prior;"),
         ("kiss-icp+graph+map", "no method is called"),
         ("kiss-icp+map+loam", r"no method is called .* each with \+map or \+loam, with \+graph, or"),
         ("", "no method is called ''"),

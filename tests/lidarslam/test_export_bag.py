@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
-from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
@@ -55,8 +54,7 @@ def run(tmp_path: Path, landmarks: FloatArray) -> Path:
     write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
     drift = exp(np.multiply.outer(np.arange(SCANS), [0.0, 0.0, 0.01, 0.02, 0.0, 0.0]))
     write_tum(folder / "odometry.tum", Trajectory(stamps, T @ drift))
-    intensity = np.arange(len(landmarks), dtype=np.float32)
-    write_cloud(folder / "map.ply", PointCloud(landmarks, np.zeros((500, 3)), PointAttributes(intensity=intensity)))
+    write_cloud(folder / "map.ply", PointCloud(landmarks, np.zeros((500, 3))))
     about = {"source": str(recording), "start": 0, "stop": None, "step": 1}
     (folder / "config.yaml").write_text(dump_yaml(Config(), about))
     names = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
@@ -159,15 +157,15 @@ def test_covariance_and_velocity_are_in_the_frames_of_ros(run: Path, tmp_path: P
 
 
 def test_path_and_map_are_latched(run: Path, tmp_path: Path) -> None:
+    latched = {}
     for name in ("slam.mcap", "slam.bag"):
         lidarslam("export-bag", run, "--out", tmp_path / name, "--no-clouds")
-    with AnyReader([tmp_path / "slam.mcap"]) as reader:
-        durable = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
-    assert durable == dict.fromkeys(("/path", "/map_points"), "TRANSIENT_LOCAL") | dict.fromkeys(
-        ("/tf", "/odometry"), "VOLATILE"
-    )
-    with AnyReader([tmp_path / "slam.bag"]) as reader:
-        assert {c.topic for c in reader.connections if c.ext.latching} == {"/path", "/map_points"}
+        with AnyReader([tmp_path / name]) as reader:
+            latched[name] = {c.topic: c.ext for c in reader.connections}
+    assert {topic for topic, ext in latched["slam.bag"].items() if ext.latching} == {"/path", "/map_points"}
+    durable = {topic: ext.offered_qos_profiles[0].durability.name for topic, ext in latched["slam.mcap"].items()}
+    kinds = {"/path": "TRANSIENT_LOCAL", "/map_points": "TRANSIENT_LOCAL", "/tf": "VOLATILE", "/odometry": "VOLATILE"}
+    assert durable == kinds
 
 
 def test_the_bag_is_a_recording(run: Path, landmarks: FloatArray, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Maps that are joined, cleaned, levelled, cropped: clouds whose points are known."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -98,17 +99,10 @@ def test_floaters_are_removed_and_nothing_else(tmp_path: Path, method: tuple[obj
 
 def l_shaped(rng: np.random.Generator) -> PointCloud:
     """The floor and walls of an L-shaped room with boxes, which looks alike from no two sides."""
-    corners = [
-        ((0, 0), (9, 0)),
-        ((9, 0), (9, 4)),
-        ((9, 4), (4, 4)),
-        ((4, 4), (4, 7)),
-        ((4, 7), (0, 7)),
-        ((0, 7), (0, 0)),
-    ]
-    walls = [np.add(a, rng.random((4000, 1)) * np.subtract(b, a)) for a, b in corners]
+    corners = [(0, 0), (9, 0), (9, 4), (4, 4), (4, 7), (0, 7), (0, 0)]
+    walls = [np.add(a, rng.random((1500, 1)) * np.subtract(b, a)) for a, b in pairwise(corners)]
     parts = [np.column_stack([wall, rng.uniform(0.0, 2.5, len(wall))]) for wall in walls]
-    floor = rng.uniform([0.0, 0.0], [9.0, 7.0], (8000, 2))
+    floor = rng.uniform([0.0, 0.0], [9.0, 7.0], (3000, 2))
     floor = floor[(floor[:, 0] < 4.0) | (floor[:, 1] < 4.0)]
     points = np.concatenate([*parts, np.column_stack([floor, np.zeros(len(floor))])])
     return PointCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))

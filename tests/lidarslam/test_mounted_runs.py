@@ -25,8 +25,6 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 from lidarslam.storage.finished_run import load_map
 
-STREET_SCANS = 17  # of which the guess looks at every fourth
-
 SCANS = 22  # of which the guess looks at every fourth
 TURNS = {
     "upright": np.eye(3),
@@ -35,72 +33,6 @@ TURNS = {
 }
 FAST = ["--no-report", "--set", "mapping.keypoints=800", "--set", "global_map.voxel_size_m=0.2"]
 CONSTANT = ["--odometry", "constant-velocity"]
-
-
-@pytest.fixture(scope="module")
-def streets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A street as an HDL-32E sees it, upright and rolled by 90 degrees."""
-    world = build_world("street", 3)
-    motion = motion_along_route("car", world, 3)
-    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
-    simulation = Simulation(world, find_sensor("hdl-32e"), motion, T_body_lidar, STREET_SCANS, 3)
-    folders = {"upright": np.eye(3), "rolled": TURNS["rolled"]}
-    paths = {name: tmp_path_factory.mktemp(name) for name in folders}
-    truth = simulation.ground_truth
-    for number, scan in enumerate(simulation.scans()):
-        for name, R in folders.items():
-            np.save(paths[name] / f"{number:06d}.npy", scan.points @ R.T)
-    for name, R in folders.items():
-        T = make_transform(R.T, np.zeros(3))
-        write_tum(paths[name] / "ground_truth.tum", Trajectory(truth.stamps, truth.T_world_lidar @ T))
-    return paths
-
-
-def begun(source: Path, out: Path, mounting: str = "auto", stop_after: int | None = None, **how: bool) -> Path:
-    settings = [f"reader.mounting={mounting}", "odometry.method=constant-velocity", "checkpoints.every_scans=3"]
-
-    def progress(done: int, *_: object) -> None:
-        if done == stop_after:
-            raise KeyboardInterrupt
-
-    execute(RunRequest(source, out, load_config(settings=settings), **how), progress)
-    return out
-
-
-def files(run: Path) -> dict[str, bytes]:
-    return {name: (run / name).read_bytes() for name in ("trajectory.tum", "odometry.tum", "map.ply")}
-
-
-@pytest.fixture(scope="module")
-def upright_street(streets, tmp_path_factory) -> Path:
-    return begun(streets["upright"], tmp_path_factory.mktemp("runs") / "upright")
-
-
-@pytest.mark.parametrize("mounting", ["auto", "left"])
-def test_results_are_those_of_the_upright_recording(streets, upright_street, tmp_path, mounting):
-    run = begun(streets["rolled"], tmp_path / "run", mounting)
-    assert files(run) == files(upright_street)
-    metrics, expected = (json.loads((one / "metrics.json").read_text())["trajectory"] for one in (run, upright_street))
-    assert metrics == pytest.approx(expected, abs=1e-6)
-    warned = any("reader.mounting=left" in one for one in json.loads((run / "summary.json").read_text())["warnings"])
-    assert warned == (mounting == "auto")
-    # What reads the recording again finds the same axes.
-    truth, own = truth_of_run(run), truth_of_run(upright_street)
-    np.testing.assert_allclose(truth.T_world_lidar, own.T_world_lidar, atol=1e-6)
-    exported, scans = (next(read_run_scans(one).deskewed())[1].points for one in (run, upright_street))
-    np.testing.assert_array_equal(exported, scans)
-
-
-def test_nothing_is_said_of_an_upright_recording(streets, upright_street, tmp_path):
-    assert "mounting" not in (upright_street / "summary.json").read_text()
-    assert files(begun(streets["upright"], tmp_path / "run", "upright")) == files(upright_street)
-
-
-def test_a_resumed_run_guesses_the_same(streets, upright_street, tmp_path):
-    out = tmp_path / "run"
-    begun(streets["rolled"], out, stop_after=10)
-    assert len(read_tum(out / "trajectory.tum")) < STREET_SCANS
-    assert files(begun(streets["rolled"], out, resume=True)) == files(upright_street)
 
 
 @pytest.fixture(scope="module")
@@ -129,13 +61,15 @@ def recordings(tmp_path_factory: pytest.TempPathFactory, simulation: Simulation)
                 table["x"], table["y"], table["z"] = (scan.points @ R.T).T
                 table["time"] = scan.time_offsets
                 np.save(paths[name + again] / f"{number:06d}.npy", table)
-        imu = made.imu
+        imu, truth = made.imu, made.ground_truth
         rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])
         for name, R in TURNS.items():
             T_recorded_imu = make_transform(R, np.zeros(3)) @ imu.T_lidar_imu
             header = "T_lidar_imu: " + " ".join(map(str, T_recorded_imu[:3].ravel()))
             np.savetxt(paths[name + again] / "imu.csv", rows, delimiter=",", header=header)
             np.savetxt(paths[name + again] / "timestamps.txt", stamps, fmt="%.9f")
+            T_world_recorded = truth.T_world_lidar @ make_transform(R.T, np.zeros(3))
+            write_tum(paths[name + again] / "ground_truth.tum", Trajectory(truth.stamps, T_world_recorded))
     return paths
 
 
@@ -161,6 +95,46 @@ def points(directory: Path) -> FloatArray:
 @pytest.fixture(scope="module")
 def upright(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(recordings["upright"], tmp_path_factory.mktemp("runs") / "upright", *CONSTANT)
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    return {name: (directory / name).read_bytes() for name in ("trajectory.tum", "odometry.tum", "map.ply")}
+
+
+@pytest.fixture(scope="module")
+def rolled(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run(recordings["rolled"], tmp_path_factory.mktemp("runs") / "rolled", *CONSTANT)
+
+
+def test_results_are_those_of_the_upright_recording(recordings, upright, rolled, tmp_path):
+    told = run(recordings["rolled"], tmp_path / "told", *CONSTANT, "--set", "reader.mounting=left")
+    for directory in (rolled, told):
+        assert files(directory) == files(upright)
+        warnings = json.loads((directory / "summary.json").read_text())["warnings"]
+        assert any("reader.mounting=left" in one for one in warnings) == (directory is rolled)
+    assert "mounting" not in (upright / "summary.json").read_text()
+    # What reads the recording again finds the same axes.
+    truth, own = truth_of_run(rolled), truth_of_run(upright)
+    np.testing.assert_allclose(truth.T_world_lidar, own.T_world_lidar, atol=1e-6)
+    metrics, expected = (json.loads((one / "metrics.json").read_text())["trajectory"] for one in (rolled, upright))
+    assert metrics == pytest.approx(expected, abs=1e-6)
+    exported, scans = (next(read_run_scans(one).deskewed())[1].points for one in (rolled, upright))
+    np.testing.assert_array_equal(exported, scans)
+
+
+def test_a_resumed_run_guesses_the_same(recordings, upright, tmp_path):
+    words = [word for word in (*FAST, *CONSTANT) if "=" in word]
+    config = load_config(settings=[*words, "odometry.method=constant-velocity", "checkpoints.every_scans=3"])
+    request = RunRequest(recordings["rolled"], tmp_path / "run", config)
+
+    def progress(done: int, *_: object) -> None:
+        if done == 10:
+            raise KeyboardInterrupt
+
+    execute(request, progress)
+    assert len(read_tum(request.out / "trajectory.tum")) < SCANS
+    execute(replace(request, resume=True), lambda *_: None)
+    assert files(request.out) == files(upright)
 
 
 @pytest.mark.parametrize(
@@ -199,15 +173,12 @@ def test_localisation(recordings, upright, tmp_path):
     np.testing.assert_allclose(found["rolled again"], found["upright again"], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("command", "file"), [("export-bag", "run.mcap"), ("export-mesh", "mesh.ply"), ("export-grid", "grid.yaml")]
-)
-def test_exports(recordings, upright, tmp_path, command, file):
-    turned = run(recordings["rolled"], tmp_path / "turned", *CONSTANT)
-    written = {}
-    for one in (turned, upright):
+def test_exports(upright, rolled, tmp_path):
+    written = []
+    for one in (rolled, upright):
         folder = tmp_path / f"of_{one.name}"
         folder.mkdir()
-        call(command, one, "-o", folder / file)
-        written[one] = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert written[turned] == written[upright]
+        for command, file in (("export-bag", "run.mcap"), ("export-mesh", "mesh.ply"), ("export-grid", "grid.yaml")):
+            call(command, one, "-o", folder / file)
+        written.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert written[0] == written[1]

@@ -34,6 +34,7 @@ import os, socket, sys, time
 from pathlib import Path
 given = dict(zip(sys.argv[1::2], sys.argv[2::2]))
 Path(__file__).with_name("pid").write_text(str(os.getpid()))
+Path(__file__).with_name("told").write_text(repr(dict(os.environ)))
 with socket.create_server((given["--bind"], int(given["--port"]))):
     time.sleep(60)
 """
@@ -147,7 +148,13 @@ def pretend(monkeypatch: pytest.MonkeyPatch, program: Path, text: str) -> None:
     monkeypatch.setattr("lidarslam.viewer.rerun_program._program", lambda: str(program))
 
 
-def test_a_window_listens_on_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
+def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int
+) -> None:
+    """It asks for a newer version by way of a proxy: one that is not there."""
+    proxies = ("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy")
+    for name in proxies[::2]:
+        monkeypatch.setenv(name, "http://elsewhere.example:3128")
     pretend(monkeypatch, tmp_path / "rerun", LISTENER)
     open_window(port)
     try:
@@ -159,19 +166,8 @@ def test_a_window_listens_on_this_machine_alone(tmp_path: Path, monkeypatch: pyt
         assert (tmp_path / "pid").read_text() == before
     finally:
         os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
-
-
-def test_the_window_is_kept_from_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
-    """It asks for a newer version by way of a proxy: one that is not there."""
-    for name in ("ALL_PROXY", "HTTPS_PROXY", "https_proxy"):
-        monkeypatch.setenv(name, "http://elsewhere.example:3128")
-    told = 'Path(__file__).with_name("told").write_text(repr(dict(os.environ)))\n'
-    pretend(monkeypatch, tmp_path / "rerun", LISTENER.replace("with socket", told + "with socket"))
-    open_window(port)
-    os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
     environment = ast.literal_eval((tmp_path / "told").read_text())
-    for name in ("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy"):
-        assert environment[name] == "http://127.0.0.1:1"
+    assert {environment[name] for name in proxies} == {"http://127.0.0.1:1"}
 
 
 def test_a_window_that_never_listens_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:

@@ -52,9 +52,8 @@ def test_a_run_leaves_a_page_with_its_picture_its_errors_and_what_was_changed(wh
         assert pixels.shape[1] == 1600
         assert (pixels < 250).any()
     html = (whole_run / "report.html").read_text()
-    embedded = re.findall(r'<img src="data:image/png;base64,([\w+/=]+)"', html)
-    assert len(embedded) == 1
-    assert b64decode(embedded[0]) == (whole_run / "map.png").read_bytes()
+    (embedded,) = re.findall(r'<img src="data:image/png;base64,([\w+/=]+)"', html)
+    assert b64decode(embedded) == (whole_run / "map.png").read_bytes()
     assert figures(html)[:3] == ["Map and trajectory", "Trajectories", "Absolute errors"]
     assert "Registration over time" in figures(html)
     text = unescape(re.sub(r"<script.*?</script>|<[^>]+>", "", html, flags=re.DOTALL))
@@ -75,13 +74,10 @@ def test_the_page_runs_its_own_scripts_alone_and_fetches_nothing(whole_run: Path
     assert not re.findall(r"(?:src|href)=\"(?!data:|#)", outside)
 
 
-def test_a_run_can_do_without_and_takes_an_earlier_page_away(tmp_path: Path, small_recording: Path) -> None:
-    out = tmp_path / "run"
-    assert lidarslam("run", small_recording, "--out", out, *FAST).exit_code == 0
-    assert there(out) == list(PAGE)
-    command = ("run", small_recording, "--out", out, *FAST, "--no-report", "--overwrite")
+def test_a_run_can_do_without_and_takes_an_earlier_page_away(finished_run: Path, small_recording: Path) -> None:
+    command = ("run", small_recording, "--out", finished_run, *FAST, "--no-report", "--overwrite")
     assert lidarslam(*command).exit_code == 0
-    assert there(out) == []
+    assert there(finished_run) == []
 
 
 def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(
@@ -89,11 +85,10 @@ def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(
 ) -> None:
     (finished_run / "report.html").unlink()
     (finished_run / "report.html").mkdir()
-    assert leave_report(finished_run, NO_ERRORS) is False
-    assert "no report.html was drawn: " in caplog.text
-    assert "is a folder" in caplog.text
     result = lidarslam("evaluate", finished_run)
     assert result.exit_code == 0
+    assert "no report.html was drawn: " in caplog.text
+    assert "is a folder" in caplog.text
     assert json.loads((finished_run / "metrics.json").read_text())["trajectory"] is not None
 
 
@@ -105,12 +100,11 @@ def test_an_interruption_ends_the_drawing_alone(finished_run: Path, monkeypatch:
     assert leave_report(finished_run, NO_ERRORS) is False
 
 
-def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path, small_recording: Path) -> None:
-    assert leave_report(finished_run, NO_ERRORS)
-    assert "Absolute errors" not in figures((finished_run / "report.html").read_text())
+def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path) -> None:
+    (finished_run / "report.html").unlink()
     for option in ("--no-report", f"--out={finished_run.parent / 'elsewhere.json'}"):
         assert lidarslam("evaluate", finished_run, option).exit_code == 0
-        assert "Absolute errors" not in figures((finished_run / "report.html").read_text())
+    assert not (finished_run / "report.html").exists()
     assert lidarslam("evaluate", finished_run, "--reference-map", finished_run / "map.ply").exit_code == 0
     shown = figures((finished_run / "report.html").read_text())
     assert {"Absolute errors", "Error components", "Map errors"} <= set(shown)
@@ -125,24 +119,21 @@ def test_evaluate_against_camera_poses_draws_these(finished_run: Path) -> None:
     assert "truth.txt" in html
 
 
-def test_bands_show_where_tracking_was_degraded_and_lost(finished_run: Path) -> None:
+def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_map(finished_run: Path) -> None:
+    for name in ("map.ply", *PAGE):
+        (finished_run / name).unlink()
     replace_statuses(finished_run, ["ok", "degraded", "degraded", "ok", "lost", "ok"])
     assert leave_report(finished_run, NO_ERRORS)
+    assert there(finished_run) == ["report.html", "trajectory.png"]
+    html = (finished_run / "report.html").read_text()
+    assert '<img src="data:' not in html
+    assert "Absolute errors" not in figures(html)
     (residual,) = (
-        plot for plot in plots((finished_run / "report.html").read_text())
-        if plot["layout"].get("shapes") and plot["data"][0]["hovertemplate"] == "%{y:.4f}"
-    )  # fmt: skip
+        plot for plot in plots(html) if plot["layout"].get("shapes") and plot["data"][0]["hovertemplate"] == "%{y:.4f}"
+    )
     bands = [(shape["fillcolor"], shape["x0"], shape["x1"]) for shape in residual["layout"]["shapes"]]
     assert [colour for colour, _, _ in bands] == ["#e69f00", "#d4003c"]
     np.testing.assert_allclose([band[1:] for band in bands], [[0.1, 0.3], [0.4, 0.5]], atol=1e-6)
-
-
-def test_a_run_without_a_map_has_a_page_without_a_picture(finished_run: Path) -> None:
-    for name in ("map.ply", *PAGE):
-        (finished_run / name).unlink()
-    assert leave_report(finished_run, NO_ERRORS)
-    assert there(finished_run) == ["report.html", "trajectory.png"]
-    assert '<img src="data:' not in (finished_run / "report.html").read_text()
 
 
 def test_settings_that_differ_from_the_defaults_are_listed_with_these() -> None:
@@ -158,9 +149,8 @@ def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path: Path, whol
     expected = [tmp_path / "room" / "a", tmp_path / "room" / "b"]
     assert run_directories(tmp_path) == expected
     assert run_directories(whole_run) == [whole_run]
-    drawn = lidarslam("view", tmp_path, "--picture", tmp_path / "maps.png")
-    assert drawn.exit_code == 0
-    assert np.asarray(o3d.io.read_image(str(tmp_path / "maps.png"))).shape[1] == 1600
+    assert lidarslam("view", tmp_path, "--picture", tmp_path / "maps.png").exit_code == 0
+    assert (tmp_path / "maps.png").is_file()
     # One of several recordings: its folder has the same content, and its runs lie in it.
     shutil.move(tmp_path / "comparison.json", tmp_path / "room" / "comparison.json")
     assert run_directories(tmp_path / "room") == expected

@@ -7,8 +7,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +14,12 @@ import pytest
 from click.testing import CliRunner
 
 from lidarslam.cli import main
-from lidarslam.compare.comparison import CompareOutcome, Counter, Narrator, compare
+from lidarslam.compare.comparison import CompareOutcome, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.core.tasks import SERIAL, Where
+
+from .conftest import Told
 
 pytest.importorskip("ray")
 
@@ -39,22 +39,6 @@ starts = sum(line.startswith(f"{name} ") for line in log.read_text().splitlines(
 if name.startswith("learned") and starts == 1 and sys.argv[2] == "wait": time.sleep(120)
 os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_run", *sys.argv[3:]])
 """
-
-
-class Told:
-    """Keeps what is told."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.counts: list[tuple[int, int]] = []
-
-    @contextmanager
-    def counting(self, _name: str) -> Iterator[Counter]:
-        yield lambda number, total: self.counts.append((number, total))
-
-    @property
-    def narrator(self) -> Narrator:
-        return Narrator(self.counting, self.lines.append)
 
 
 def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str, **changes: Any) -> CompareOutcome:
@@ -109,12 +93,11 @@ def _wait_for(condition: Any, seconds: float = 60.0) -> None:
 
 @pytest.mark.slow
 def test_side_by_side_is_the_same_as_one_after_another(
-    small_recording: Path, tmp_path: Path, serial: dict[str, Any]
+    small_recording: Path, tmp_path: Path, serial: dict[str, Any], told: Told
 ) -> None:
-    told = Told()
     _compare(small_recording, tmp_path / "out", Where(2), told)
     assert _contents(tmp_path / "out") == serial
-    assert told.counts[-1] == (18, 18)
+    assert told.counts[-1][1:] == (18, 18)
     assert len(told.lines) == 3
     again = Told()
     none = (sys.executable, "-c", "raise SystemExit('was run again')")
@@ -162,10 +145,8 @@ def test_a_node_that_dies_costs_only_its_tasks(
 @pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_all_methods_and_writes_what_there_is(
-    small_recording: Path, tmp_path: Path, counted: tuple[str, ...]
+    small_recording: Path, tmp_path: Path, counted: tuple[str, ...], told: Told
 ) -> None:
-    told = Told()
-
     def interrupt() -> None:
         _wait_for(lambda: any("prior" in line for line in told.lines) and len(_starts(tmp_path)) == 3)
         time.sleep(0.5)

@@ -35,18 +35,12 @@ def test_lines_come_through_and_standard_error_is_kept(run: Run, lines: list[str
     assert (tmp_path / "log").read_text() == "oh\n"
 
 
-def test_time_and_memory_are_measured(run: Run) -> None:
-    ending = run("import time; held = bytearray(100_000_000); held[::4096] = b'x' * len(held[::4096]); time.sleep(0.6)")
-    assert 0.6 < ending.wall_s < 10.0
-    assert ending.peak_rss_mb is not None
-    assert 95.0 < ending.peak_rss_mb < 200.0
-
-
-def test_the_memory_of_children_counts(run: Run) -> None:
+def test_time_and_the_memory_of_all_processes_are_measured(run: Run) -> None:
     child = "import time; held = bytearray(100_000_000); held[::4096] = b'x' * len(held[::4096]); time.sleep(0.8)"
     ending = run(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])")
+    assert 0.8 < ending.wall_s < 10.0
     assert ending.peak_rss_mb is not None
-    assert ending.peak_rss_mb > 100.0
+    assert 100.0 < ending.peak_rss_mb < 300.0
 
 
 def test_one_that_hangs_is_ended_with_its_children(
