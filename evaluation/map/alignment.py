@@ -144,10 +144,8 @@ class _Clouds:
             mapped, reference = thin(mapped, cell_m), thin(reference, cell_m)
         for cloud, name in ((mapped, "the map"), (reference, "its reference")):
             if len(cloud) < _FEWEST_POINTS:
-                raise InputError(
-                    f"{name} has points in {len(cloud)} cells of {cell_m:g} m; expected {_FEWEST_POINTS} or more to"
-                    " align by; name a whole map"
-                )
+                few = f"{name} has points in {len(cloud)} cells of {cell_m:g} m"
+                raise InputError(f"{few}; expected {_FEWEST_POINTS} or more to align by; name a whole map")
         middle_map, middle_reference = np.median(mapped, axis=0), np.median(reference, axis=0)
         mapped, reference = mapped - middle_map, reference - middle_reference
         inlier_m = max(_LEAST_INLIER_M, 2.0 * cell_m)
@@ -263,19 +261,13 @@ def _register(source: FloatArray, target: FloatArray, cell_m: float) -> FloatArr
         described.append((cloud, registration.compute_fpfh_feature(cloud, neighbourhood)))  # type: ignore[call-arg]
     (moving, features), (still, target_features) = described
     inlier_m = _INLIER_CELLS * cell_m
+    checkers = [
+        registration.CorrespondenceCheckerBasedOnEdgeLength(_LEAST_EDGE_RATIO),
+        registration.CorrespondenceCheckerBasedOnDistance(inlier_m),
+    ]
+    estimation = registration.TransformationEstimationPointToPoint(False)
+    end = registration.RANSACConvergenceCriteria(_ITERATIONS, _CONFIDENCE)
     found = registration.registration_ransac_based_on_feature_matching(
-        moving,
-        still,
-        features,
-        target_features,
-        True,
-        inlier_m,
-        registration.TransformationEstimationPointToPoint(False),
-        3,
-        [
-            registration.CorrespondenceCheckerBasedOnEdgeLength(_LEAST_EDGE_RATIO),
-            registration.CorrespondenceCheckerBasedOnDistance(inlier_m),
-        ],
-        registration.RANSACConvergenceCriteria(_ITERATIONS, _CONFIDENCE),
+        moving, still, features, target_features, True, inlier_m, estimation, 3, checkers, end
     )
     return np.array(found.transformation, dtype=np.float64)

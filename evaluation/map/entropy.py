@@ -39,12 +39,8 @@ class MapEntropy:
 
     def to_json(self) -> dict[str, float | int]:
         """The entropy in metrics.json."""
-        return {
-            "mean_map_entropy": self.mean,
-            "radius_m": self.radius_m,
-            "spacing_m": self.spacing_m,
-            "points": self.points,
-        }
+        sizes = {"radius_m": self.radius_m, "spacing_m": self.spacing_m, "points": self.points}
+        return {"mean_map_entropy": self.mean, **sizes}
 
 
 def map_entropy(

@@ -79,15 +79,10 @@ def segment_errors(
     divided by the length asked for, or, with `over_travelled`, by the distance travelled to that pose.
     """
     distances = association.reference.distances
-    starts = np.arange(0, len(distances), step)
-    firsts, lasts, lengths = [], [], []
-    for length_m in lengths_m:
-        ends = np.searchsorted(distances, distances[starts] + length_m, side="right")
-        inside = ends < len(distances)
-        firsts.append(starts[inside])
-        lasts.append(ends[inside])
-        lengths.append(np.full(int(inside.sum()), float(length_m)))
-    first, last, asked = np.concatenate(firsts), np.concatenate(lasts), np.concatenate(lengths)
+    starts, asked = np.arange(0, len(distances), step), np.array([*lengths_m], dtype=np.float64)
+    ends = np.searchsorted(distances, distances[starts] + asked[:, None], side="right")  # a row for each length
+    row, column = np.nonzero(ends < len(distances))
+    first, last, asked = starts[column], ends[row, column], asked[row]
     T_estimate = association.estimate.T_world_lidar
     T_reference = association.reference.T_world_lidar
     error = inverse(inverse(T_estimate[first]) @ T_estimate[last]) @ inverse(T_reference[first]) @ T_reference[last]

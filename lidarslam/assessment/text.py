@@ -46,10 +46,8 @@ def _row(label: str, text: str) -> str:
 
 def _trajectory(metrics: TrajectoryMetrics) -> Iterator[str]:
     association, errors = metrics.association, metrics.errors
-    counts = (
-        f"{len(association):,} of {association.estimate_count:,} ({association.reference_count:,} in the reference)"
-    )
-    yield _row("poses matched", f"{counts}, {errors.length_m:.1f} m")
+    counts = f"{len(association):,} of {association.estimate_count:,}"
+    yield _row("poses matched", f"{counts} ({association.reference_count:,} in the reference), {errors.length_m:.1f} m")
     yield from ("", _row("TRAJECTORY", f"{'translation':>12}{'rotation':>14}"))
     rows = (
         ("ATE, RMSE", errors.ate_rmse_m, errors.ate_rotation_rmse_deg, _ALIGNED[metrics.alignment]),
@@ -60,10 +58,9 @@ def _trajectory(metrics: TrajectoryMetrics) -> Iterator[str]:
         yield _row(label, f"{_number(metres, 'm'):>12}{_number(degrees, 'deg'):>14}    {how}")
     if metrics.kitti is not None:
         lengths = {f"{m} m": drift for m, drift in metrics.kitti.by_length.items()}
+        speeds = {f"{3.6 * v:.0f} km/h": drift for v, drift in metrics.kitti.by_speed.items()}
         yield from _drifts("KITTI DRIFT", {"all": metrics.kitti.overall, **lengths}, 100)
-        yield from _drifts(
-            "BY SPEED", {f"{3.6 * v:.0f} km/h": drift for v, drift in metrics.kitti.by_speed.items()}, 100
-        )
+        yield from _drifts("BY SPEED", speeds, 100)
     yield from _drifts("SHORT SEGMENTS", {f"{m} m": drift for m, drift in metrics.segments.items()}, 10)
     yield from ("",) if metrics.plugins else ()
     yield from (_row(f"{name} ", text) for name, text in metrics.plugin_lines())

@@ -62,11 +62,8 @@ def open_window(port: int, recording: Path | None = None) -> None:
 @contextlib.contextmanager
 def served_page(announce: Callable[[str], None]) -> Iterator[WebPage]:
     """A page for browsers on this machine, during the block; its address is announced with the first content."""
-    page = WebPage(_page_files(), announce)
-    try:
+    with contextlib.closing(WebPage(_page_files(), announce)) as page:
         yield page
-    finally:
-        page.close()
 
 
 def _page_files() -> dict[str, bytes]:
@@ -113,7 +110,10 @@ def _start(port: int, *options: str) -> "subprocess.Popen[bytes] | None":
             listens = is_taken(port)
     finally:
         if not listens:
-            _end(process)
+            if process.poll() is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)  # with its children
+            process.wait()
     return process if listens else None
 
 
@@ -127,11 +127,3 @@ def _launch(*options: str) -> "subprocess.Popen[bytes]":
         env=os.environ | {"PYTHONSAFEPATH": "1", "RERUN_APP_ONLY": "true"} | _NO_NETWORK,
         start_new_session=True,  # Ctrl-C is not meant for it
     )
-
-
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Kill the program with its children, and wait for its end."""
-    if process.poll() is None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.wait()

@@ -50,11 +50,6 @@ class View:
     size_m: FloatArray  # (2,) of the scene along right and up; the picture shows a margin around it
 
     @property
-    def area_m2(self) -> float:
-        """The area of the scene that the picture shows."""
-        return self.width * self.height * self.pixel_m**2
-
-    @property
     def turn_deg(self) -> float:
         """Of the picture about z."""
         return float(np.rad2deg(np.arctan2(self.axes[0, 1], self.axes[0, 0])))
@@ -65,15 +60,9 @@ class View:
         middle = 0.5 * np.array([self.width, self.height]) - 0.5
         return np.asarray(across * [1.0, -1.0] + middle, dtype=np.float64)
 
-    def depth(self, points: FloatArray) -> FloatArray:
-        """Distance (N,) of points (N, 3) towards the camera, m."""
-        depth: FloatArray = points @ self.axes[2]
-        return depth
-
     def enlarged(self, factor: int) -> "View":
         """The same part of the scene on more pixels."""
-        width, height = self.width * factor, self.height * factor
-        return replace(self, pixel_m=self.pixel_m / factor, width=width, height=height)
+        return replace(self, pixel_m=self.pixel_m / factor, width=self.width * factor, height=self.height * factor)
 
 
 def view_axes(turn_deg: float, elevation_deg: float) -> FloatArray:
@@ -94,7 +83,8 @@ def fit_view(
     """
     if turn_deg is None:
         sample = points[:: max(1, len(points) // _SAMPLED)]
-        areas = {turn: _fit(view_axes(turn, 90.0), sample, path, width).area_m2 for turn in _TURNS_DEG}
+        views = {turn: _fit(view_axes(turn, 90.0), sample, path, width) for turn in _TURNS_DEG}
+        areas = {turn: view.width * view.height * view.pixel_m**2 for turn, view in views.items()}
         best = min(areas, key=lambda turn: areas[turn])
         turn_deg = float(best) if areas[0] > _WORTH_TURNING * areas[best] else 0.0
     return _fit(view_axes(turn_deg, elevation_deg), points, path, width)
@@ -127,17 +117,11 @@ def _view(axes: FloatArray, centre: FloatArray, size_m: FloatArray, width: int) 
 
 def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:
     """Lower and upper corner (2, 2) along right and up."""
-    corners = []
-    if len(points):
-        corners.append(_occupied(points @ axes[:2].T))
-    if len(path):
-        across = path @ axes[:2].T
-        corners.append(np.stack([across.min(axis=0), across.max(axis=0)]))
-    if not corners:
-        return np.array([[-0.5, -0.5], [0.5, 0.5]]) * _LEAST_SIZE_M
-    box = np.stack([np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]])
-    short = np.maximum(_LEAST_SIZE_M - (box[1] - box[0]), 0.0) / 2.0
-    return np.stack([box[0] - short, box[1] + short])
+    parts = [path @ axes[:2].T] + ([_occupied(points @ axes[:2].T)] if len(points) else [])
+    across = np.concatenate(parts) if len(points) or len(path) else np.zeros((1, 2))
+    low, high = across.min(axis=0), across.max(axis=0)
+    short = np.maximum(_LEAST_SIZE_M - (high - low), 0.0) / 2.0
+    return np.stack([low - short, high + short])
 
 
 def _occupied(across: FloatArray) -> FloatArray:
@@ -165,7 +149,7 @@ class Layer:
 def draw_layer(points: FloatArray, normals: FloatArray, view: View) -> Layer:
     """Draw points (N, 3) with normals (N, 3); surfaces that face away are left out."""
     splat = int(np.clip(np.ceil(_GAPS_CLOSED * spacing_m(points) / view.pixel_m), 1, _LARGEST_SPLAT * view.width))
-    towards = view.depth(points)
+    towards = points @ view.axes[2]
     facing = np.flatnonzero(normals @ view.axes[2] > _LEAST_FACING)
     index = _rasterise(view.project(points), facing[np.argsort(towards[facing])], view, splat)
     pixels = np.flatnonzero(index >= 0)

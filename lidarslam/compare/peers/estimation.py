@@ -3,7 +3,8 @@
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,7 @@ _EXTRAPOLATION_S = 0.25
 _LONGEST_GAP_S, _LONGEST_GAP_STEPS = 1.0, 5.0
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(NamedTuple):
     """The poses and times of a peer on a recording."""
 
     trajectory: Trajectory  # at the stamps of the scans that its poses cover
