@@ -24,7 +24,7 @@ print(found.T_reference_map.tobytes().hex())
 """
 
 
-def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 15.0) -> FloatArray:
+def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 25.0) -> FloatArray:
     """Points on the faces of a box."""
     faces = []
     for axis, sides in enumerate(zip(low, high, strict=True)):
