@@ -62,5 +62,5 @@ def test_pruning_cuts_what_hangs_into_the_way_and_nothing_else():
     part.cylinder(np.array([10.0, 4.0, 3.0]), np.array([10.0, 0.5, 4.0]), 0.05)
     kept = paths.prune(part, route)
     np.testing.assert_allclose(kept.boxes.centres[:, 1:], [[0.5, 4.0], [3.0, 1.0]])
-    np.testing.assert_allclose(kept.cylinders.starts[:, 2], [3.0])
+    np.testing.assert_allclose(kept.solids[1].starts[:, 2], [3.0])
     assert len(paths.prune(Builder(), route).boxes) == 0

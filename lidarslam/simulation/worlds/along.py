@@ -4,7 +4,7 @@ Everything keeps its distance from all of the path, also where it crosses itself
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -17,10 +17,10 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor
-from lidarslam.simulation.worlds.building import Builder, heading, left_of, smooth_noise
+from lidarslam.simulation.worlds.building import heading, left_of, smooth_noise
 from lidarslam.simulation.worlds.houses import house
-from lidarslam.simulation.worlds.outdoor import on_slope, upright
-from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along, prune
+from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
+from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along
 from lidarslam.simulation.worlds.street import (
     KERB_WIDTH_M,
     RISE_M,
@@ -75,9 +75,14 @@ def build_along(path: FloatArray, seed: int, fullness: float | None = None) -> W
     route = Route(on_ground(np.concatenate([there, there[-2:0:-1]]), ground), 2.0, FREE_SIDE_M, 4.0, 11.0)
     fullness = min(1.0, _FULL_M / course.length_m) if fullness is None else fullness
     taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
-    rows = _Rows(rng, course, ground, fullness, taken)
-    rows.build(replace(route, free_height_m=1e3))
-    return World("street", seed, route, *rows.solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
+    rows = _Rows(Grounds(rng, course.points[:, :2], ground), course, fullness, taken)
+    for place in (rows.houses, rows.cars_and_pavement):  # houses first, which need most room
+        for side in course.sides():
+            place(side)
+    solid = rows.grounds.solid
+    rows.grounds.prune(replace(route, free_height_m=1e3), margin_m=0.02)
+    lay_kerbs(solid, rows.kerb_stones(), ground)
+    return World("street", seed, route, *solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,41 +145,29 @@ def _ground(rng: np.random.Generator, course: Course) -> HeightField:
     return HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Rows:
     """Places things next to a course, none on another, none near any part of the course."""
 
-    rng: np.random.Generator
+    grounds: Grounds
     course: Course
-    ground: HeightField
     fullness: float
     taken: NDArray[np.bool_]  # (X, Y) cells of one metre of the ground
-    solid: Builder = field(default_factory=Builder)
-    _loose: Builder = field(default_factory=Builder)  # may reach into the free space, and is pruned
-
-    def build(self, free: Route) -> None:
-        """Add everything; houses first, which need most room."""
-        for side in self.course.sides():
-            self._houses(side)
-        for side in self.course.sides():
-            self._cars(side)
-            self._pavement(side)
-        self.solid.place(prune(self._loose, free, margin_m=0.02), np.eye(4))
-        lay_kerbs(self.solid, self._kerb_stones(), self.ground)
 
     def _claim(self, footprint: FloatArray, nearest_m: float) -> bool:
         """Take the cells of points (M, 2) if they are free and keep that distance from the course; whether they did."""
-        x, y = np.floor(footprint - self.ground.origin_xy).astype(int).T
+        x, y = np.floor(footprint - self.grounds.ground.origin_xy).astype(int).T
         # Most are refused by their first point, which saves the search for all.
         is_free = self.course.distance(footprint[:1])[0] >= nearest_m and not self.taken[x, y].any()
         is_free = is_free and self.course.distance(footprint).min() >= nearest_m
         self.taken[x, y] |= is_free
         return bool(is_free)
 
-    def _houses(self, side: Course) -> None:
-        at = 0.0
+    def houses(self, side: Course) -> None:
+        """Houses along the left of a course, or one time in eight a gap with a tree."""
+        rng, ground, at = self.grounds.rng, self.grounds.ground, 0.0
         while at < side.length_m:
-            wide, depth = self.rng.uniform(7.5, 15.0), self.rng.uniform(8.0, 11.0)
+            wide, depth = rng.uniform(7.5, 15.0), rng.uniform(8.0, 11.0)
             for width, setback in product((wide, 6.5), (0.0, 1.5, 3.5)):
                 start, end = side.beside(np.array([at, at + width]), _FRONT_M + setback)
                 front = float(np.linalg.norm(end - start))
@@ -183,47 +176,43 @@ class _Rows:
                 along = (end - start) / front
                 # Fronts are straight where the road bends, and may be a metre closer.
                 if self._claim(_rectangle(start, along, front, depth), _FRONT_M - 1.0):
-                    self._house(start, along, front - 0.02, depth)
-                    at += width
                     break
             else:
                 at += 2.0
-
-    def _house(self, origin: FloatArray, along: FloatArray, width: float, depth: float) -> None:
-        """A house, or one time in eight a gap with a tree."""
-        if self.rng.random() < 0.12:
-            tree = outdoor.broadleaf(self.rng, self.rng.uniform(6.0, 9.0), 0.16, 24)
-            where = origin + 0.5 * width * along + 4.0 * left_of(along)
-            self._loose.place(tree, upright(self.ground, where, 0.0))
-            return
-        is_plain = bool(self.rng.random() > self.fullness)
-        part = house(self.rng, width, depth, (not is_plain, not is_plain), is_plain=is_plain)
-        self.solid.place(part, house_pose(self.ground, origin, along, width))
-
-    def _cars(self, side: Course) -> None:
-        taken = self.fullness * self.rng.uniform(0.45, 0.8)
-        for at in np.arange(4.0, side.length_m - 4.0, 6.0):
-            if self.rng.random() > taken:
                 continue
-            where = side.beside(at, HALF_WIDTH_M - 1.15 + self.rng.uniform(-0.08, 0.08))
+            at += width
+            if rng.random() < 0.12:
+                tree = outdoor.broadleaf(rng, rng.uniform(6.0, 9.0), 0.16, 24)
+                where = start + 0.5 * (front - 0.02) * along + 4.0 * left_of(along)
+                self.grounds.put(tree, where, 0.0, is_green=True)
+                continue
+            is_plain = bool(rng.random() > self.fullness)
+            part = house(rng, front - 0.02, depth, (not is_plain, not is_plain), is_plain=is_plain)
+            self.grounds.solid.place(part, house_pose(ground, start, along, front - 0.02))
+
+    def cars_and_pavement(self, side: Course) -> None:
+        """Parked cars along the left of a course, and what stands on its pavement."""
+        rng, ground, green = self.grounds.rng, self.grounds.ground, self.grounds.green
+        taken = self.fullness * rng.uniform(0.45, 0.8)
+        for at in np.arange(4.0, side.length_m - 4.0, 6.0):
+            if rng.random() > taken:
+                continue
+            where = side.beside(at, HALF_WIDTH_M - 1.15 + rng.uniform(-0.08, 0.08))
             ahead = -left_of(side.lefts[min(round(at / _STEP_M), len(side.points) - 1)])
             footprint = _rectangle(where - 0.5 * (_CAR_M[0] * ahead + _CAR_M[1] * left_of(ahead)), ahead, *_CAR_M)
             # Not on the pavement behind a bend, nor where another part of the path has its lane.
             on_road = self.course.distance(footprint).max() <= HALF_WIDTH_M + 0.3
             if on_road and self._claim(footprint, FREE_SIDE_M + 0.2):
-                yaw = heading(ahead) + np.pi * (self.rng.random() < 0.85)
-                self.solid.place(outdoor.car(self.rng), on_slope(self.ground, where, yaw, 3.0, 1.6))
-
-    def _pavement(self, side: Course) -> None:
-        for k, at in enumerate(np.arange(self.rng.uniform(1.0, 7.0), side.length_m, 8.0)):
+                yaw = heading(ahead) + np.pi * (rng.random() < 0.85)
+                self.grounds.solid.place(outdoor.car(rng), on_slope(ground, where, yaw, 3.0, 1.6))
+        for k, at in enumerate(np.arange(rng.uniform(1.0, 7.0), side.length_m, 8.0)):
             where = side.beside(at, HALF_WIDTH_M + 0.9)
             if self._claim(where[None], HALF_WIDTH_M + 0.7):
-                pose = upright(self.ground, where, heading(where - side.beside(at, HALF_WIDTH_M + 1.9)))
-                lamp_height = self.rng.uniform(5.0, 7.5) if k % 4 == 0 else 0.0
-                has_tree = bool(self.rng.random() < 0.45 * self.fullness)
-                furnish_pavement(self._loose, self._loose, self.rng, pose, lamp_height, has_tree)
+                pose = upright(ground, where, heading(where - side.beside(at, HALF_WIDTH_M + 1.9)))
+                lamp_height = rng.uniform(5.0, 7.5) if k % 4 == 0 else 0.0
+                furnish_pavement(green, green, rng, pose, lamp_height, bool(rng.random() < 0.45 * self.fullness))
 
-    def _kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+    def kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Stones along the edges of the road, but not where another part of the path has its road."""
         middle = HALF_WIDTH_M + RISE_M - 0.5 * KERB_WIDTH_M
         laid: set[tuple[int, ...]] = set()
@@ -239,14 +228,14 @@ class _Rows:
 
     def people(self) -> Iterator[Mover]:
         """Pedestrians who walk up and down the pavement."""
-        rng = self.rng
+        rng = self.grounds.rng
         for side in self.course.sides():
             apart = max(40.0, side.length_m / 12.0)
             for start in np.arange(rng.uniform(5.0, 20.0), side.length_m - 40.0, apart):
                 at = np.arange(start, start + rng.uniform(20.0, 35.0), 1.0)
                 there = side.beside(at, HALF_WIDTH_M + rng.uniform(1.9, 2.4))
                 if self._claim(there, HALF_WIDTH_M + 1.4):
-                    waypoints = on_ground(np.concatenate([there, there[-2:0:-1]]), self.ground)
+                    waypoints = on_ground(np.concatenate([there, there[-2:0:-1]]), self.grounds.ground)
                     yield Mover(outdoor.pedestrian(rng).boxes, waypoints, rng.uniform(0.9, 1.5), 0.0)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Mover, Route, World
 from lidarslam.simulation.worlds import interior, outdoor, paths
-from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Spot, glazed_wall, left_of, rotation_z
-from lidarslam.simulation.worlds.interior import Furnisher, Room
+from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Room, left_of, rotation_z
+from lidarslam.simulation.worlds.interior import Furnisher
 from lidarslam.simulation.worlds.office import draw_room_ceiling
 from lidarslam.simulation.worlds.paths import Clearance
 
@@ -42,16 +42,14 @@ def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Gene
     """Floor, ceiling with lamps, and walls with windows on two sides."""
     low, high = room.low - OUTER_WALL_M, room.high + OUTER_WALL_M
     for z in (-0.2, height):
-        builder.block((*low, z), (*high, z + 0.2))
+        builder.block((low[0], high[0]), (low[1], high[1]), (z, z + 0.2))
     draw_room_ceiling(room, height, builder, rng)
-    corners = [room.low, np.array([room.high[0], room.low[1]]), room.high, np.array([room.low[0], room.high[1]])]
-    for side, corner in enumerate(corners):
-        length = float((room.high - room.low)[side % 2])
+    for side in range(4):
+        wall, length = room.at_wall(side, builder)
         wide = rng.uniform(1.6, 3.0)
         places = np.arange(1.5, length - wide - 1.0, wide + 1.2)[: 20 * (side < 2)]
         windows = [Opening((float(x), float(x) + wide), (0.8, height - 0.7)) for x in places]
-        spot = Spot(builder, np.append(corner, 0.0), 0.5 * np.pi * side)
-        glazed_wall(spot, (-OUTER_WALL_M, length + OUTER_WALL_M), height, windows)
+        wall.glazed_wall((-OUTER_WALL_M, length + OUTER_WALL_M), height, windows)
 
 
 def _furnish(room: Room, height: float, put: Furnisher) -> None:
@@ -75,7 +73,8 @@ def draw_people(route: Route, rng: np.random.Generator) -> tuple[Mover, ...]:
     Those who walk along stay at a distance from the route. Those who cross it to and fro are at one end of their path
     when the carrier passes on its first lap.
     """
-    loop = _from_start(route)
+    xy = route.waypoints[:, :2]
+    loop = np.concatenate([[0.5 * (xy[0] + xy[1])], xy[1:], xy[:1]])  # from where a lap begins
     ahead = (loop[1] - loop[0]) / np.linalg.norm(loop[1] - loop[0])
     slots = [(lane, slot) for lane in _LANES_M for slot in _SLOTS_M]
     people = []
@@ -91,12 +90,6 @@ def draw_people(route: Route, rng: np.random.Generator) -> tuple[Mover, ...]:
         speed = rng.uniform(0.9, 1.4)
         people.append(_person(rng, ends, speed, -speed * (along + _HEAD_START_M) / SPEED_MPS))
     return tuple(people)
-
-
-def _from_start(route: Route) -> FloatArray:
-    """The route (M, 2) from the middle of its first and longest leg, where a lap begins."""
-    xy = route.waypoints[:, :2]
-    return np.concatenate([[0.5 * (xy[0] + xy[1])], xy[1:], xy[:1]])
 
 
 def _person(rng: np.random.Generator, line: FloatArray, speed_mps: float, start_m: float) -> Mover:

@@ -8,16 +8,13 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
 from lidarslam.simulation.worlds.building import UP, Builder, smooth_noise
-from lidarslam.simulation.worlds.outdoor import SUNK_M, upright
+from lidarslam.simulation.worlds.outdoor import SUNK_M, Grounds, beside
 
 _CELL_M = 0.75
 _MARGIN_M = 70.0
 _ROAD_HALF_M = 2.8
 _KEEP_OFF_M = 4.5
-_FREE_SIDE_M = 2.4
-_SPEED_LIMIT_MPS = 28.0  # 100 km/h
 _POINT_M = 0.5  # between the points of the road
-_WAYPOINT_SPACING_M = 2.0
 
 
 def build(seed: int) -> World:
@@ -27,22 +24,17 @@ def build(seed: int) -> World:
     low = np.floor(road.min(axis=0) - _MARGIN_M)
     distance = paths.distance_to_loop(paths.grid_nodes(low, road.max(axis=0) + _MARGIN_M, _CELL_M), road, 12.0)
     ground = _ground(rng, low, distance)
-    solid, green = Builder(), Builder()
-    _poles(solid, rng, road, ground)
-    _fences(solid, rng, road, ground)
-    _barn(solid, rng, road, ground)
-    _bales(solid, rng, road, ground)
-    _hedges(green, rng, road, ground)
-    _trees(green, rng, road, ground)
+    grounds = Grounds(rng, road, ground)
+    for things in (_poles, _fences, _barn, _bales, _hedges, _trees):
+        things(grounds)
     # Without the first there is a leg of twice the length: a lap begins in its middle.
-    waypoints = paths.resample_loop(road, _WAYPOINT_SPACING_M)[1:]
-    route = Route(paths.on_ground(waypoints, ground), 3.0, _FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
-    solid.place(paths.prune(green, route), np.eye(4))
+    route = Route(paths.on_ground(paths.resample_loop(road, 2.0)[1:], ground), 3.0, 2.4, 4.0, 28.0)  # 100 km/h
+    grounds.prune(route)
     # Stubble, meadow or crops in parcels, a mown strip along the road.
     kind = np.digitize(smooth_noise(rng, distance.shape, 40.0 / _CELL_M), [-0.4, 0.5])
     tall = np.where(distance < _ROAD_HALF_M + 2.0, 0.12, np.array([0.06, 0.22, 0.4])[kind])
     grass = outdoor.grass(rng, ground, tall, distance - _ROAD_HALF_M)
-    return World("fields", seed, route, *solid.solids, (ground,), map_spacing_m=0.1, grass=grass)
+    return World("fields", seed, route, *grounds.solid.solids, (ground,), map_spacing_m=0.1, grass=grass)
 
 
 def _road(rng: np.random.Generator) -> FloatArray:
@@ -71,90 +63,90 @@ def _ground(rng: np.random.Generator, low: FloatArray, distance: FloatArray) -> 
     return HeightField(low, _CELL_M, heights)
 
 
-def _poles(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
+def _poles(grounds: Grounds) -> None:
     """A line of telegraph poles with cross-arms along a third of the road."""
-    left, spacing = rng.choice([-1.0, 1.0]) * rng.uniform(6.0, 9.0), rng.uniform(45.0, 60.0)
+    rng, road = grounds.rng, grounds.path
+    left, spacing = beside(rng, 6.0, 9.0), rng.uniform(45.0, 60.0)
     first = int(rng.integers(len(road)))
     part = Builder()
     part.pole((0.0, 0.0), (-1.0, 7.2), 0.12)
-    part.block((-0.05, -0.8, 6.7), (0.05, 0.8, 6.82))
+    part.block((-0.05, 0.05), (-0.8, 0.8), (6.7, 6.82))
     for at in np.arange(0.0, len(road) * _POINT_M / 3.0, spacing):
-        where, yaw = paths.beside_loop(road, (first + round(at / _POINT_M)) % len(road), left)
-        solid.place(part, upright(ground, where, yaw))
+        grounds.put(part, *grounds.beside(first + round(at / _POINT_M), left))
 
 
-def _fences(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
+def _fences(grounds: Grounds) -> None:
     """Posts and two rails along a few stretches of the road, as far from it as a verge is wide."""
-    step = round(3.0 / _POINT_M)
-    for at in rng.integers(0, len(road), 4):
-        left, count = rng.choice([-1.0, 1.0]) * rng.uniform(5.0, 7.0), int(rng.integers(15, 30))
-        feet = np.stack([paths.beside_loop(road, (at + k * step) % len(road), left)[0] for k in range(count)])
-        posts = paths.on_ground(feet, ground)
+    rng, step = grounds.rng, round(3.0 / _POINT_M)
+    for at in rng.integers(0, len(grounds.path), 4):
+        left, count = beside(rng, 5.0, 7.0), int(rng.integers(15, 30))
+        feet = np.stack([grounds.beside(at + k * step, left)[0] for k in range(count)])
+        posts = paths.on_ground(feet, grounds.ground)
         for foot in posts:
-            solid.pole(foot[:2], (foot[2] - SUNK_M, foot[2] + 1.25), 0.06)
+            grounds.solid.pole(foot[:2], (foot[2] - SUNK_M, foot[2] + 1.25), 0.06)
         for a, b in pairwise(posts):
             for high in (0.55, 1.05):
-                solid.beam(a + high * UP, b + high * UP, 0.04, 0.12)
+                grounds.solid.beam(a + high * UP, b + high * UP, 0.04, 0.12)
 
 
-def _barn(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
+def _barn(grounds: Grounds) -> None:
     """One barn with a pitched roof, at some distance from the road."""
+    rng, road = grounds.rng, grounds.path
     where, yaw = road[0], 0.0
-    while paths.distance_to_loop(where[None], road)[0] < 22.0:
-        index, side = int(rng.integers(len(road))), rng.choice([-1.0, 1.0])
-        where, yaw = paths.beside_loop(road, index, side * rng.uniform(25.0, 40.0))
+    while grounds.off_path(where) < 22.0:
+        where, yaw = grounds.beside(int(rng.integers(len(road))), beside(rng, 25.0, 40.0))
     part = Builder()
     long, wide, high = rng.uniform(7.0, 10.0), rng.uniform(4.5, 6.0), rng.uniform(3.8, 5.0)  # half, half, all
-    part.block((-long, -wide, -2.0), (long, wide, high))
+    part.block((-long, long), (-wide, wide), (-2.0, high))
     ridge = high + 0.5 * wide
     for eave in (-wide - 0.4, wide + 0.4):
         part.beam((0.0, eave, high - 0.2), (0.0, 0.0, ridge), 2.0 * long + 0.8, 0.15)
     for fraction in (0.15, 0.4, 0.65):  # the gables, in steps
         inset = fraction * wide
-        part.block((-long, -wide + inset, high), (long, wide - inset, high + fraction * (ridge - high)))
-    solid.place(part, upright(ground, where, yaw + rng.normal(0.0, 0.2)))
+        part.block((-long, long), (-wide + inset, wide - inset), (high, high + fraction * (ridge - high)))
+    grounds.put(part, where, yaw + rng.normal(0.0, 0.2))
 
 
-def _bales(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
+def _bales(grounds: Grounds) -> None:
     """Round bales, lying about two parcels."""
-    for at in rng.integers(0, len(road), 2):
-        middle, _ = paths.beside_loop(road, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(25.0, 35.0))
+    rng = grounds.rng
+    for at in rng.integers(0, len(grounds.path), 2):
+        middle, _ = grounds.beside(at, beside(rng, 25.0, 35.0))
         for where in middle + rng.uniform(-35.0, 35.0, (int(rng.integers(6, 11)), 2)):
-            if paths.distance_to_loop(where[None], road)[0] < _KEEP_OFF_M + 1.0:
-                continue
-            angle = rng.uniform(0.0, np.pi)
-            axis = 0.6 * np.array([np.cos(angle), np.sin(angle), 0.0])
-            centre = paths.on_ground(where[None], ground)[0] + 0.55 * UP
-            solid.cylinder(centre - axis, centre + axis, 0.65)
+            if grounds.off_path(where) >= _KEEP_OFF_M + 1.0:
+                angle = rng.uniform(0.0, np.pi)
+                axis = 0.6 * np.array([np.cos(angle), np.sin(angle), 0.0])
+                centre = paths.on_ground(where[None], grounds.ground)[0] + 0.55 * UP
+                grounds.solid.cylinder(centre - axis, centre + axis, 0.65)
 
 
-def _hedges(green: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
+def _hedges(grounds: Grounds) -> None:
     """Hedges between parcels, from the verge away from the road."""
-    for at in rng.integers(0, len(road), 6):
+    rng = grounds.rng
+    for at in rng.integers(0, len(grounds.path), 6):
         side = rng.choice([-1.0, 1.0])
-        begin, yaw = paths.beside_loop(road, int(at), side * rng.uniform(7.0, 10.0))
+        begin, yaw = grounds.beside(at, side * rng.uniform(7.0, 10.0))
         heading = yaw + side * 0.5 * np.pi + rng.normal(0.0, 0.15)
         away = np.array([np.cos(heading), np.sin(heading)])
         high, wide, length = rng.uniform(1.2, 1.9), rng.uniform(0.8, 1.3), 4.0
         for k in range(int(rng.integers(6, 12))):
             where = begin + k * length * away
-            if paths.distance_to_loop(where[None] + np.array([[0.0], [length]]) * away, road).min() > _KEEP_OFF_M + 1.5:
-                green.place(outdoor.hedge(rng, length, high, wide), upright(ground, where, heading))
+            if grounds.off_path(where + np.array([[0.0], [length]]) * away) > _KEEP_OFF_M + 1.5:
+                grounds.put(outdoor.hedge(rng, length, high, wide), where, heading, is_green=True)
 
 
-def _trees(green: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
+def _trees(grounds: Grounds) -> None:
     """Single trees far from one another, and some bushes."""
+    rng, road = grounds.rng, grounds.path
     low, high = road.min(axis=0) - 0.7 * _MARGIN_M, road.max(axis=0) + 0.7 * _MARGIN_M
     stands = np.empty((0, 2))
     darts = rng.uniform(low, high, (150, 2))
     for where, distance in zip(darts, paths.distance_to_loop(darts, road), strict=True):
         apart = np.linalg.norm(stands - where, axis=1).min(initial=np.inf)
-        if not _KEEP_OFF_M + 2.0 < distance < 0.8 * _MARGIN_M or apart < 55.0:
-            continue
-        tree = outdoor.broadleaf(rng, rng.uniform(7.0, 13.0), rng.uniform(0.18, 0.4), 80)
-        green.place(tree, upright(ground, where, rng.uniform(0.0, 2.0 * np.pi)))
-        stands = np.concatenate([stands, where[None]])
+        if _KEEP_OFF_M + 2.0 < distance < 0.8 * _MARGIN_M and apart >= 55.0:
+            grounds.put(outdoor.old_tree(rng), where, is_green=True)
+            stands = np.concatenate([stands, where[None]])
     for at in rng.integers(0, len(road), 14):
-        where, _ = paths.beside_loop(road, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(6.5, 25.0))
-        if paths.distance_to_loop(where[None], road)[0] > _KEEP_OFF_M + 1.5:
-            green.place(outdoor.bush(rng, rng.uniform(0.5, 1.2), 24), upright(ground, where, 0.0))
+        where, _ = grounds.beside(at, beside(rng, 6.5, 25.0))
+        if grounds.off_path(where) > _KEEP_OFF_M + 1.5:
+            grounds.put(outdoor.bush(rng, rng.uniform(0.5, 1.2), 24), where, 0.0, is_green=True)

@@ -7,13 +7,12 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import Builder, smooth_noise
-from lidarslam.simulation.worlds.outdoor import on_slope, upright
+from lidarslam.simulation.worlds.building import UP, smooth_noise
+from lidarslam.simulation.worlds.outdoor import Grounds, on_slope
 
 _CELL_M = 0.4
 _MARGIN_M = 32.0
 _FREE_SIDE_M = 1.3
-_TREES = (320, 400)
 
 
 def build(seed: int) -> World:
@@ -21,11 +20,12 @@ def build(seed: int) -> World:
     rng = np.random.default_rng(seed)
     track = paths.winding_loop(rng, rng.uniform(160.0, 290.0), 6, 0.6, 4.0)
     ground = _ground(rng, track)
-    part = Builder()
-    _trees(part, rng, track, ground)
-    _floor(part, rng, track, ground)
+    grounds = Grounds(rng, track, ground)
+    _trees(grounds)
+    _floor(grounds)
     route = Route(paths.on_ground(paths.resample_loop(track, 1.5), ground), 1.5, _FREE_SIDE_M, 2.6, 3.0)
-    return World("forest", seed, route, *paths.prune(part, route).solids, (ground,), map_spacing_m=0.1)
+    grounds.prune(route)
+    return World("forest", seed, route, *grounds.solid.solids, (ground,), map_spacing_m=0.1)
 
 
 def _ground(rng: np.random.Generator, track: FloatArray) -> HeightField:
@@ -40,24 +40,23 @@ def _ground(rng: np.random.Generator, track: FloatArray) -> HeightField:
     return HeightField(low, _CELL_M, heights)
 
 
-def _scatter(
-    rng: np.random.Generator, track: FloatArray, count: int, from_track_m: tuple[float, float], apart_m: float
-) -> FloatArray:
+def _scatter(grounds: Grounds, count: int, from_track_m: tuple[float, float], apart_m: float) -> FloatArray:
     """Up to `count` places (N, 2) at that distance from the track and no closer to one another than `apart_m`."""
+    track = grounds.path
     low, high = track.min(axis=0) - _MARGIN_M + 2.0, track.max(axis=0) + _MARGIN_M - 2.0
-    darts = rng.uniform(low, high, (12 * count, 2))
+    darts = grounds.rng.uniform(low, high, (12 * count, 2))
     distance = paths.distance_to_loop(darts, track)
     darts = darts[(distance > from_track_m[0]) & (distance < from_track_m[1])]
-    near = cKDTree(darts).query_ball_point(darts, apart_m)
     is_kept = np.zeros(len(darts), dtype=bool)
-    for k, others in enumerate(near):
+    for k, others in enumerate(cKDTree(darts).query_ball_point(darts, apart_m)):
         is_kept[k] = not is_kept[others].any()
     return darts[is_kept][:count]
 
 
-def _trees(part: Builder, rng: np.random.Generator, track: FloatArray, ground: HeightField) -> None:
+def _trees(grounds: Grounds) -> None:
     """Spruces and beeches, thick ones and saplings, in shares that differ from forest to forest."""
-    places = _scatter(rng, track, int(rng.integers(*_TREES)), (_FREE_SIDE_M + 1.1, 30.0), 2.1)
+    rng = grounds.rng
+    places = _scatter(grounds, int(rng.integers(320, 400)), (_FREE_SIDE_M + 1.1, 30.0), 2.1)
     beeches = rng.uniform(0.15, 0.6)
     for where in places:
         radius = float(np.clip(rng.lognormal(-1.65, 0.4), 0.1, 0.5))
@@ -66,29 +65,27 @@ def _trees(part: Builder, rng: np.random.Generator, track: FloatArray, ground: H
             tree = outdoor.broadleaf(rng, 0.8 * height, radius, 17)
         else:
             tree = outdoor.conifer(rng, height, radius, 15)
-        part.place(tree, upright(ground, where, rng.uniform(0.0, 2.0 * np.pi)))
+        grounds.put(tree, where, is_green=True)
 
 
-def _floor(part: Builder, rng: np.random.Generator, track: FloatArray, ground: HeightField) -> None:
+def _floor(grounds: Grounds) -> None:
     """Fallen trunks, boulders, bushes, stumps and piles of logs under the trees."""
-    for where in _scatter(rng, track, 26, (_FREE_SIDE_M + 0.8, 25.0), 6.0):
+    rng, ground, green = grounds.rng, grounds.ground, grounds.green
+    for where in _scatter(grounds, 26, (_FREE_SIDE_M + 0.8, 25.0), 6.0):
         length, radius, yaw = rng.uniform(4.0, 11.0), rng.uniform(0.14, 0.38), rng.uniform(0.0, np.pi)
         ends = where + np.outer([-0.5, -0.25, 0.25, 0.5], length * np.array([np.cos(yaw), np.sin(yaw)]))
-        if paths.distance_to_loop(ends, track).min() > _FREE_SIDE_M + 4.0 * radius:
-            pose = on_slope(ground, where, yaw, 0.7 * length, 1.0)
-            part.place(outdoor.fallen_trunk(rng, length, radius), pose)
-    for where in _scatter(rng, track, 45, (_FREE_SIDE_M + 1.5, 25.0), 3.0):
+        if grounds.off_path(ends) > _FREE_SIDE_M + 4.0 * radius:
+            green.place(outdoor.fallen_trunk(rng, length, radius), on_slope(ground, where, yaw, 0.7 * length, 1.0))
+    for where in paths.on_ground(_scatter(grounds, 45, (_FREE_SIDE_M + 1.5, 25.0), 3.0), ground):
         size = rng.uniform(0.5, 1.7)
-        level = float(ground.height_at(where[None])[0])
         for _ in range(int(rng.integers(2, 5))):  # boxes through one another make a boulder of many faces
             turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-            centre = np.append(where, level + 0.1 * size) + rng.normal(0.0, 0.12 * size, 3)
-            part.box(centre, size * rng.uniform(0.55, 0.9, 3), R=turn)
-    for where in _scatter(rng, track, 60, (_FREE_SIDE_M + 0.9, 25.0), 2.5):
-        part.place(outdoor.bush(rng, rng.uniform(0.35, 0.9), 20), upright(ground, where, 0.0))
-    for where in _scatter(rng, track, 30, (_FREE_SIDE_M + 0.6, 20.0), 4.0):
-        level = float(ground.height_at(where[None])[0])
-        part.pole(where, (level - 0.4, level + rng.uniform(0.2, 0.6)), rng.uniform(0.12, 0.35))  # stumps
-    for where in _scatter(rng, track, 3, (_FREE_SIDE_M + 3.0, 8.0), 25.0):
+            centre = where + 0.1 * size * UP + rng.normal(0.0, 0.12 * size, 3)
+            green.box(centre, size * rng.uniform(0.55, 0.9, 3), R=turn)
+    for where in _scatter(grounds, 60, (_FREE_SIDE_M + 0.9, 25.0), 2.5):
+        grounds.put(outdoor.bush(rng, rng.uniform(0.35, 0.9), 20), where, 0.0, is_green=True)
+    for x, y, level in paths.on_ground(_scatter(grounds, 30, (_FREE_SIDE_M + 0.6, 20.0), 4.0), ground):  # stumps
+        green.pole((x, y), (level - 0.4, level + rng.uniform(0.2, 0.6)), rng.uniform(0.12, 0.35))
+    for where in _scatter(grounds, 3, (_FREE_SIDE_M + 3.0, 8.0), 25.0):
         pile = outdoor.log_pile(rng, int(rng.integers(3, 6)))
-        part.place(pile, on_slope(ground, where, rng.uniform(0.0, np.pi), 2.0, 1.0))
+        green.place(pile, on_slope(ground, where, rng.uniform(0.0, np.pi), 2.0, 1.0))

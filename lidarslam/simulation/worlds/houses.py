@@ -70,13 +70,13 @@ def house(
     if passage:  # a way through to the yard in place of the door
         middle = float(openings[door].mean())
         a, b = max(middle - 1.4, 0.4), min(middle + 1.4, width - 0.4)
-        part.block((x0, recess, -_FOUNDATION_M), (a, depth, 3.0))
-        part.block((b, recess, -_FOUNDATION_M), (x1, depth, 3.0))
-        part.block((x0, recess, 3.0), (x1, depth, top))
+        part.block((x0, a), (recess, depth), (-_FOUNDATION_M, 3.0))
+        part.block((b, x1), (recess, depth), (-_FOUNDATION_M, 3.0))
+        part.block((x0, x1), (recess, depth), (3.0, top))
         before, after = openings[openings[:, 1] < a - 0.1], openings[openings[:, 0] > b + 0.1]
         openings, door = np.concatenate([before, [[a, b]], after]), len(before)
     else:
-        part.block((x0, recess, -_FOUNDATION_M), (x1, depth, top))
+        part.block((x0, x1), (recess, depth), (-_FOUNDATION_M, top))
     _facade(part, style, width, openings, door, passage)
     if not is_plain:
         _ornaments(part, rng, style, openings, door)
@@ -113,16 +113,16 @@ def _facade(
     back, top = style.recess_m + _OFFSET_M, style.top_m
     for x0, x1 in np.concatenate([[0.0], openings.ravel(), [width]]).reshape(-1, 2):
         if x1 - x0 > 0.05:
-            part.block((x0, 0.0, -_FOUNDATION_M), (x1, back, top))
+            part.block((x0, x1), (0.0, back), (-_FOUNDATION_M, top))
     sills = [style.ground_sill_m, *(style.storey_m * k + style.sill_m for k in range(1, style.storeys)), top]
     lintels = [style.ground_lintel_m, *(style.storey_m * k + style.lintel_m for k in range(1, style.storeys))]
     for low, high in zip(lintels, sills[1:], strict=True):
-        part.block((0.01, _OFFSET_M, low), (width - 0.01, back, high))
+        part.block((0.01, width - 0.01), (_OFFSET_M, back), (low, high))
     ends = [0.01, width - 0.01] if door < 0 else [0.01, *openings[door], width - 0.01]
     for x0, x1 in zip(ends[::2], ends[1::2], strict=True):
-        part.block((x0, _OFFSET_M, -_FOUNDATION_M), (x1, back, sills[0]))
+        part.block((x0, x1), (_OFFSET_M, back), (-_FOUNDATION_M, sills[0]))
     if door >= 0 and not is_passage:
-        part.block((openings[door, 0], -0.32, -0.6), (openings[door, 1], back, 0.14))
+        part.block((openings[door, 0], openings[door, 1]), (-0.32, back), (-0.6, 0.14))
 
 
 def _ornaments(part: Builder, rng: np.random.Generator, style: _Style, openings: FloatArray, door: int) -> None:
@@ -144,36 +144,36 @@ def _bay(part: Builder, style: _Style, opening: FloatArray, reach: float) -> Non
     """A box with windows of its own before the upper floors of one column."""
     x0, x1 = opening[0] - 0.25, opening[1] + 0.25
     low, high = style.storey_m - 0.05, style.top_m - 0.4
-    part.block((x0 + 0.1, -reach + 0.12, low), (x1 - 0.1, 0.1, high))
+    part.block((x0 + 0.1, x1 - 0.1), (-reach + 0.12, 0.1), (low, high))
     for x in (x0, x1 - 0.16):
-        part.block((x, -reach, low), (x + 0.16, -reach + 0.2, high))
+        part.block((x, x + 0.16), (-reach, -reach + 0.2), (low, high))
     for k in range(1, style.storeys + 1):
         z0 = low if k == 1 else (k - 1) * style.storey_m + style.lintel_m
         z1 = high if k == style.storeys else k * style.storey_m + style.sill_m
         if z1 - z0 > 0.05:
-            part.block((x0 + _OFFSET_M, -reach + _OFFSET_M, z0), (x1 - _OFFSET_M, 0.1, z1))
+            part.block((x0 + _OFFSET_M, x1 - _OFFSET_M), (-reach + _OFFSET_M, 0.1), (z0, z1))
 
 
 def _balcony(part: Builder, opening: FloatArray, floor: float, reach: float) -> None:
     """A slab with a railing of bars."""
     x0, x1 = opening[0] - 0.3, opening[1] + 0.3
-    part.block((x0, -reach, floor - 0.16), (x1, 0.1, floor))
-    part.block((x0, -reach, floor + 0.95), (x1, -reach + 0.05, floor + 1.0))
+    part.block((x0, x1), (-reach, 0.1), (floor - 0.16, floor))
+    part.block((x0, x1), (-reach, -reach + 0.05), (floor + 0.95, floor + 1.0))
     for x in (x0, x1 - 0.05):
-        part.block((x, -reach + 0.06, floor + 0.1), (x + 0.04, 0.05, floor + 1.0))
+        part.block((x, x + 0.04), (-reach + 0.06, 0.05), (floor + 0.1, floor + 1.0))
     for x in np.linspace(x0, x1 - 0.04, max(3, round((x1 - x0) / 0.5))):
-        part.block((x, -reach + 0.01, floor - 0.02), (x + 0.04, -reach + 0.04, floor + 0.96))
+        part.block((x, x + 0.04), (-reach + 0.01, -reach + 0.04), (floor - 0.02, floor + 0.96))
 
 
 def _roof(part: Builder, rng: np.random.Generator, width: float, depth: float, top: float) -> None:
     """A cornice, and a flat roof behind a parapet or a pitched one with its eaves to the street; a chimney."""
-    part.block((-0.01, -0.22, top - 0.05), (width + 0.01, 0.3, top + 0.18))
+    part.block((-0.01, width + 0.01), (-0.22, 0.3), (top - 0.05, top + 0.18))
     if rng.random() < 0.45:
         high = top + rng.uniform(0.5, 0.9)
         for y in (0.0, depth - 0.3):
-            part.block((0.0, y, top), (width, y + 0.28, high))
+            part.block((0.0, width), (y, y + 0.28), (top, high))
         x = rng.uniform(0.2, 0.6) * width
-        part.block((x, 0.4 * depth, top), (x + 2.4, 0.4 * depth + 3.0, top + 2.4))
+        part.block((x, x + 2.4), (0.4 * depth, 0.4 * depth + 3.0), (top, top + 2.4))
     else:
         ridge = top + rng.uniform(0.5, 1.0) * 0.5 * depth
         for eave in (-0.35, depth + 0.35):
@@ -181,6 +181,6 @@ def _roof(part: Builder, rng: np.random.Generator, width: float, depth: float, t
         for fraction in (0.2, 0.5, 0.8):
             inset = 0.5 * depth * fraction
             high = top + fraction * (ridge - top)
-            part.block((0.05, inset, top - 0.1), (width - 0.05, depth - inset, high))
+            part.block((0.05, width - 0.05), (inset, depth - inset), (top - 0.1, high))
     x, y = rng.uniform(0.1, 0.85) * width, rng.uniform(0.55, 0.8) * depth
-    part.block((x, y, top - 0.1), (x + 0.9, y + 0.5, top + rng.uniform(2.0, 4.0)))
+    part.block((x, x + 0.9), (y, y + 0.5), (top - 0.1, top + rng.uniform(2.0, 4.0)))

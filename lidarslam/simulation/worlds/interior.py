@@ -12,180 +12,179 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import HAIR_M, Builder, Limits, Spot, rotation_z
+from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room
 from lidarslam.simulation.worlds.paths import Clearance
 
 Size = tuple[float, float, float]  # width, depth, height
-Piece = Callable[[Spot, Size, np.random.Generator], None]
+Piece = Callable[[Builder, Size, np.random.Generator], None]
 WALL_M = 0.12  # between rooms
 
 # --- at walls
 
 
-def desk(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def desk(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A desk with legs, a drawer unit, and a screen or two."""
     top, half, depth = rng.uniform(0.70, 0.76), 0.5 * size[0], size[1]
-    spot.box((-half, half), (0.0, depth), (top, top + 0.035))
+    spot.block((-half, half), (0.0, depth), (top, top + 0.035))
     for x in (-half + 0.04, half - 0.04):
-        spot.box((x - 0.025, x + 0.025), (0.06, depth - 0.06), (0.0, top))
+        spot.block((x - 0.025, x + 0.025), (0.06, depth - 0.06), (0.0, top))
     side = rng.choice([-1.0, 1.0])
-    spot.box((side * (half - 0.5), side * (half - 0.08)), (0.08, depth - 0.1), (0.0, 0.58))
+    spot.block((side * (half - 0.5), side * (half - 0.08)), (0.08, depth - 0.1), (0.0, 0.58))
     for k in range(int(rng.integers(1, 3))):
         x = (k - 0.5) * 0.58 + rng.uniform(-0.05, 0.05)
-        spot.box((x - 0.27, x + 0.27), (0.16, 0.19), (top + 0.14, top + 0.48))
-        spot.box((x - 0.1, x + 0.1), (0.12, 0.28), (top + 0.035, top + 0.05))
-        spot.box((x - 0.03, x + 0.03), (0.19, 0.21), (top + 0.05, top + 0.2))
-    spot.box((-0.22, 0.22), (0.42, 0.56), (top + 0.035, top + 0.06))
+        spot.block((x - 0.27, x + 0.27), (0.16, 0.19), (top + 0.14, top + 0.48))
+        spot.block((x - 0.1, x + 0.1), (0.12, 0.28), (top + 0.035, top + 0.05))
+        spot.block((x - 0.03, x + 0.03), (0.19, 0.21), (top + 0.05, top + 0.2))
+    spot.block((-0.22, 0.22), (0.42, 0.56), (top + 0.035, top + 0.06))
 
 
-def workplace(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def workplace(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A desk and a chair before it."""
     depth = size[1] - 0.75
     desk(spot, (size[0], depth, size[2]), rng)
     chair(spot.shifted(rng.uniform(-0.2, 0.2), depth + 0.35, yaw=rng.uniform(-0.25, 0.25)), rng)
 
 
-def spare_chair(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+def spare_chair(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A chair with its back to the wall."""
     chair(spot.shifted(0.0, 0.3, yaw=np.pi), rng)
 
 
-def shelf(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def shelf(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """An open shelf with a back, boards, and rows of books and boxes."""
     half, depth, height = 0.5 * size[0], size[1], size[2]
-    spot.box((-half, half), (0.0, 0.02), (0.0, height))
+    spot.block((-half, half), (0.0, 0.02), (0.0, height))
     for x in (-half, half - 0.03):
-        spot.box((x, x + 0.03), (0.02, depth), (0.0, height))
+        spot.block((x, x + 0.03), (0.02, depth), (0.0, height))
     boards = np.linspace(0.06, height - 0.03, max(2, round(height / 0.38) + 1))
     for z, above in pairwise(boards):
-        spot.box((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (z, z + 0.025))
+        spot.block((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (z, z + 0.025))
         _goods(spot, (-half + 0.05, half - 0.05), depth, (z + 0.025, above - 0.03), rng)
-    spot.box((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (boards[-1], boards[-1] + 0.025))
+    spot.block((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (boards[-1], boards[-1] + 0.025))
 
 
-def _goods(spot: Spot, x: Limits, depth: float, z: Limits, rng: np.random.Generator) -> None:
+def _goods(spot: Builder, x: Limits, depth: float, z: Limits, rng: np.random.Generator) -> None:
     """Blocks of books or boxes in a row, with gaps."""
     at = x[0]
     while at < x[1] - 0.15:
         length = min(rng.uniform(0.15, 0.5), x[1] - at)
         if rng.random() < 0.75:
             y = (0.03, depth * rng.uniform(0.55, 0.95))
-            spot.box((at, at + length), y, (z[0], z[0] + (z[1] - z[0]) * rng.uniform(0.5, 0.95)))
+            spot.block((at, at + length), y, (z[0], z[0] + (z[1] - z[0]) * rng.uniform(0.5, 0.95)))
         at += length + rng.choice([0.01, 0.12])
 
 
-def cabinet(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def cabinet(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A closed cabinet on a plinth, with doors or drawers that protrude a little."""
     (width, depth, height), half = size, 0.5 * size[0]
-    spot.box((-half + 0.02, half - 0.02), (0.0, depth - 0.05), (0.0, 0.08))
-    spot.box((-half, half), (0.0, depth - 0.02), (0.08, height))
+    spot.block((-half + 0.02, half - 0.02), (0.0, depth - 0.05), (0.0, 0.08))
+    spot.block((-half, half), (0.0, depth - 0.02), (0.08, height))
     columns = max(1, round(width / 0.45))
     rows = 1 if rng.random() < 0.5 else max(2, round(height / 0.4))
     for x0, x1 in pairwise(np.linspace(-half, half, columns + 1)):
         for z0, z1 in pairwise(np.linspace(0.08, height, rows + 1)):
-            spot.box((x0 + 0.01, x1 - 0.01), (depth - 0.02, depth), (z0 + 0.01, z1 - 0.01))
+            spot.block((x0 + 0.01, x1 - 0.01), (depth - 0.02, depth), (z0 + 0.01, z1 - 0.01))
 
 
-def counter(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def counter(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A kitchen counter 0.6 m deep with cupboards over it, a sink's tap and a machine on it."""
     width, half = size[0], 0.5 * size[0]
     cabinet(spot, (width, 0.58, 0.86), rng)
-    spot.box((-half, half), (0.0, 0.62), (0.86, 0.9))
+    spot.block((-half, half), (0.0, 0.62), (0.86, 0.9))
     cabinet(spot.shifted(0.0, 0.0, 1.4), (width, 0.34, 0.7), rng)
-    spot.pillar(-0.3 * width, 0.12, (0.9, 1.18), 0.015)
-    spot.rod((-0.3 * width, 0.12, 1.17), (-0.3 * width, 0.3, 1.15), 0.012)
+    spot.pole((-0.3 * width, 0.12), (0.9, 1.18), 0.015)
+    spot.cylinder((-0.3 * width, 0.12, 1.17), (-0.3 * width, 0.3, 1.15), 0.012)
     x = rng.uniform(0.0, 0.25 * width)
-    spot.box((x, x + 0.3), (0.1, 0.45), (0.9, rng.uniform(1.15, 1.3)))
+    spot.block((x, x + 0.3), (0.1, 0.45), (0.9, rng.uniform(1.15, 1.3)))
 
 
-def sofa(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def sofa(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A sofa, 0.85 m deep."""
     half, seat = 0.5 * size[0], rng.uniform(0.38, 0.44)
-    spot.box((-half, half), (0.04, 0.85), (0.06, seat - 0.1))
-    spot.box((-half, half), (0.0, 0.22), (0.06, seat + 0.4))
+    spot.block((-half, half), (0.04, 0.85), (0.06, seat - 0.1))
+    spot.block((-half, half), (0.0, 0.22), (0.06, seat + 0.4))
     for x in (-half, half - 0.16):
-        spot.box((x, x + 0.16), (0.1, 0.83), (0.06, seat + 0.18))
+        spot.block((x, x + 0.16), (0.1, 0.83), (0.06, seat + 0.18))
     cushions = max(1, round((size[0] - 0.32) / 0.65))
     for x0, x1 in pairwise(np.linspace(-half + 0.16, half - 0.16, cushions + 1)):
-        spot.box((x0 + 0.01, x1 - 0.01), (0.2, 0.84), (seat - 0.1, seat))
+        spot.block((x0 + 0.01, x1 - 0.01), (0.2, 0.84), (seat - 0.1, seat))
 
 
-def plant(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def plant(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A pot with leaves to all sides, about 0.35 m around its middle."""
     spot = spot.shifted(0.0, 0.5 * size[1] - 0.005)
-    pot, height = rng.uniform(0.28, 0.42), size[2]
-    spot.pillar(0.0, 0.0, (0.0, pot), rng.uniform(0.14, 0.19))
-    spot.pillar(0.0, 0.0, (pot, 0.75 * height), 0.02)
-    turn = rotation_z(spot.yaw)
+    pot, high = rng.uniform(0.28, 0.42), size[2]
+    spot.pole((0.0, 0.0), (0.0, pot), rng.uniform(0.14, 0.19))
+    spot.pole((0.0, 0.0), (pot, 0.75 * high), 0.02)
     for _ in range(int(rng.integers(9, 15))):
         angle, rise = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 1.2)
         direction = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         side = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        R = turn @ np.stack([direction, side, np.cross(direction, side)], axis=1)
         length = rng.uniform(0.22, 0.34)
-        root = np.array([0.0, 0.0, rng.uniform(pot, 0.78 * height)])
-        centre = spot.origin + turn @ (root + 0.5 * length * direction)
-        spot.builder.box(centre, (length, rng.uniform(0.06, 0.14), 0.012), R=R)
+        root = np.array([0.0, 0.0, rng.uniform(pot, 0.78 * high)])
+        leaf = (length, rng.uniform(0.06, 0.14), 0.012)
+        R = np.stack([direction, side, np.cross(direction, side)], axis=1)
+        spot.box(root + 0.5 * length * direction, leaf, R=R)
 
 
-def board(spot: Spot, size: Size, rng: np.random.Generator, low: float = 0.1) -> None:  # noqa: ARG001
+def board(spot: Builder, size: Size, rng: np.random.Generator, low: float = 0.1) -> None:  # noqa: ARG001
     """A white board, notice board or picture with a frame, 0.2 m less high than its space."""
     half, high = 0.5 * size[0], low + size[2] - 0.2
-    spot.box((-half, half), (0.0, 0.02), (low, high))
+    spot.block((-half, half), (0.0, 0.02), (low, high))
     for z in (low, high - 0.03):
-        spot.box((-half, half), (0.02, 0.035), (z, z + 0.03))
+        spot.block((-half, half), (0.02, 0.035), (z, z + 0.03))
 
 
-def pilaster(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+def pilaster(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A pillar that stands out of the wall."""
-    spot.box((-0.5 * size[0], 0.5 * size[0]), (-HAIR_M, size[1]), (0.0, size[2]))
+    spot.block((-0.5 * size[0], 0.5 * size[0]), (-HAIR_M, size[1]), (0.0, size[2]))
 
 
-def extinguisher(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+def extinguisher(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A fire extinguisher on its bracket."""
-    spot.pillar(0.0, 0.1, (0.05, 0.6), 0.075)
-    spot.box((-0.04, 0.04), (0.0, 0.1), (0.3, 0.36))
+    spot.pole((0.0, 0.1), (0.05, 0.6), 0.075)
+    spot.block((-0.04, 0.04), (0.0, 0.1), (0.3, 0.36))
 
 
-def radiator(spot: Spot, width: float) -> None:
+def radiator(spot: Builder, width: float) -> None:
     """A ribbed radiator a hand's breadth above the floor, 0.12 m deep."""
     for x in np.arange(-0.5 * width, 0.5 * width - 0.05, 0.12):
-        spot.box((x, x + 0.09), (0.04, 0.12), (0.12, 0.68))
+        spot.block((x, x + 0.09), (0.04, 0.12), (0.12, 0.68))
     for z in (0.17, 0.62):
-        spot.rod((-0.5 * width, 0.07, z), (0.5 * width, 0.07, z), 0.02)
+        spot.cylinder((-0.5 * width, 0.07, z), (0.5 * width, 0.07, z), 0.02)
 
 
 # --- on floors
 
 
-def chair(spot: Spot, rng: np.random.Generator) -> None:
+def chair(spot: Builder, rng: np.random.Generator) -> None:
     """A chair on five castors or four legs, its back towards +y of the spot."""
     seat = rng.uniform(0.43, 0.5)
-    spot.box((-0.23, 0.23), (-0.23, 0.23), (seat, seat + 0.06))
-    spot.box((-0.21, 0.21), (0.2, 0.26), (seat + 0.12, seat + 0.52))
-    spot.box((-0.03, 0.03), (0.2, 0.24), (seat - 0.02, seat + 0.3))
+    spot.block((-0.23, 0.23), (-0.23, 0.23), (seat, seat + 0.06))
+    spot.block((-0.21, 0.21), (0.2, 0.26), (seat + 0.12, seat + 0.52))
+    spot.block((-0.03, 0.03), (0.2, 0.24), (seat - 0.02, seat + 0.3))
     if rng.random() < 0.6:
-        spot.pillar(0.0, 0.0, (0.08, seat), 0.03)
+        spot.pole((0.0, 0.0), (0.08, seat), 0.03)
         for angle in np.arange(5) * 0.4 * np.pi:
-            spot.rod((0.0, 0.0, 0.09), (0.29 * np.cos(angle), 0.29 * np.sin(angle), 0.04), 0.022)
+            spot.cylinder((0.0, 0.0, 0.09), (0.29 * np.cos(angle), 0.29 * np.sin(angle), 0.04), 0.022)
     else:
         for x, y in ((-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2), (0.2, 0.2)):
-            spot.pillar(x, y, (0.0, seat), 0.017)
+            spot.pole((x, y), (0.0, seat), 0.017)
 
 
-def table(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def table(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A long table on two trestles, with a few things on it."""
     a, b = 0.5 * size[0], 0.5 * size[1]
-    spot.box((-a, a), (-b, b), (0.72, 0.76))
+    spot.block((-a, a), (-b, b), (0.72, 0.76))
     for x in (-a + 0.3, a - 0.3):
-        spot.box((x - 0.04, x + 0.04), (-b + 0.15, b - 0.15), (0.0, 0.72))
+        spot.block((x - 0.04, x + 0.04), (-b + 0.15, b - 0.15), (0.0, 0.72))
     for _ in range(int(rng.integers(0, 4))):
         x, y = rng.uniform(-a + 0.2, a - 0.2), rng.uniform(-b + 0.2, b - 0.2)
-        thing = spot.shifted(x, y, 0.76, rng.uniform(0.0, 3.0))
-        thing.box((-0.15, 0.15), (-0.11, 0.11), (0.0, rng.uniform(0.02, 0.25)))
+        thing = spot.shifted(x, y, 0.76, yaw=rng.uniform(0.0, 3.0))
+        thing.block((-0.15, 0.15), (-0.11, 0.11), (0.0, rng.uniform(0.02, 0.25)))
 
 
-def conference(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def conference(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A long table with chairs along both sides."""
     width, depth = size[0], size[1] - 1.1
     table(spot, (width, depth, size[2]), rng)
@@ -196,15 +195,15 @@ def conference(spot: Spot, size: Size, rng: np.random.Generator) -> None:
                 chair(turned.shifted(x, 0.5 * depth + 0.22, yaw=rng.uniform(-0.2, 0.2)), rng)
 
 
-def round_table(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+def round_table(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A round table on one foot, with a margin of 5 cm."""
     radius = 0.5 * size[0] - 0.05
-    spot.pillar(0.0, 0.0, (0.72, 0.75), radius)
-    spot.pillar(0.0, 0.0, (0.02, 0.72), 0.045)
-    spot.pillar(0.0, 0.0, (0.0, 0.02), 0.55 * radius)
+    spot.pole((0.0, 0.0), (0.72, 0.75), radius)
+    spot.pole((0.0, 0.0), (0.02, 0.72), 0.045)
+    spot.pole((0.0, 0.0), (0.0, 0.02), 0.55 * radius)
 
 
-def round_table_with_chairs(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+def round_table_with_chairs(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A round table and three chairs."""
     radius = 0.5 * size[0] - 0.45
     round_table(spot, (2.0 * radius + 0.1, 2.0 * radius + 0.1, size[2]), rng)
@@ -212,32 +211,41 @@ def round_table_with_chairs(spot: Spot, size: Size, rng: np.random.Generator) ->
         chair(spot.shifted(0.0, 0.0, yaw=angle).shifted(0.0, radius + 0.12), rng)
 
 
-def screened_workplace(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+def screened_workplace(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A workplace behind a free-standing screen with feet."""
     screen, height = spot.shifted(0.0, -0.77), rng.uniform(1.2, 1.5)
-    screen.box((-0.75, 0.75), (-0.025, 0.025), (0.04, height))
+    screen.block((-0.75, 0.75), (-0.025, 0.025), (0.04, height))
     for x in (-0.6, 0.6):
-        screen.box((x - 0.03, x + 0.03), (-0.2, 0.2), (0.0, 0.04))
+        screen.block((x - 0.03, x + 0.03), (-0.2, 0.2), (0.0, 0.04))
     workplace(spot.shifted(0.0, -0.72), (1.4, 1.5, 1.3), rng)
 
 
-def crate(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+def crate(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A closed box."""
-    spot.box((-0.5 * size[0], 0.5 * size[0]), (-0.5 * size[1], 0.5 * size[1]), (0.0, size[2]))
+    spot.block((-0.5 * size[0], 0.5 * size[0]), (-0.5 * size[1], 0.5 * size[1]), (0.0, size[2]))
+
+
+def _corridor_plant(spot: Builder, size: Size, rng: np.random.Generator) -> None:
+    plant(spot, (size[0], 0.45, 1.1), rng)
+
+
+def _gas_bottle(spot: Builder, size: Size, rng: np.random.Generator, height: float, radius: float) -> None:  # noqa: ARG001
+    spot.pole((0.0, 0.28), (0.0, height), radius)
+    spot.pole((0.0, 0.28), (height, height + 0.1), 0.3 * radius)
+
+
+def draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
+    """Posts every 1.5 m or so, a hand rail and a knee rail, from a to b (3,)."""
+    length = float(np.linalg.norm(b - a))
+    for t in np.linspace(0.0, 1.0, max(2, round(length / 1.6) + 1)):
+        foot = a + t * (b - a)
+        builder.cylinder(foot, foot + 1.1 * UP, 0.025)
+    for z in (0.55, 1.1):
+        builder.cylinder(a + z * UP, b + z * UP, 0.025)
 
 
 Measure = float | tuple[float, float]  # a length, or the limits it is drawn between
-_SHELF = (0.8, 1.4), (0.28, 0.42)
-_CABINET = (0.5, 1.2), (0.4, 0.5)
-_PLANT = 0.75, 0.75, (0.8, 1.6)
-
-
-@dataclass(frozen=True)
-class Room:
-    """A rectangular room between the middle lines of its walls, (2,) corners low and high."""
-
-    low: FloatArray
-    high: FloatArray
+Measures = tuple[Measure, Measure, Measure]
 
 
 @dataclass(frozen=True)
@@ -248,17 +256,26 @@ class Furnisher:
     clearance: Clearance
     rng: np.random.Generator
 
+    def at(self, middle: FloatArray, size: Size, turned: bool, piece: Piece, gap_m: float) -> bool:
+        """Draw a piece of that length, width and height with its middle at (3,); whether there was room for it."""
+        reach = 0.5 * np.array([size[1], size[0]] if turned else [size[0], size[1]])
+        low = np.append(middle[:2] - reach, middle[2] + 0.01)
+        if not self.clearance.claim(low, np.append(middle[:2] + reach, middle[2] + size[2]), gap_m):
+            return False
+        yaw = 0.5 * np.pi * turned + np.pi * float(self.rng.integers(2))
+        piece(self.builder.shifted(*middle, yaw=yaw), size, self.rng)
+        return True
+
     def at_wall(self, room: Room, size: Size, piece: Piece, z: float = 0.0, tries: int = 12) -> bool:
         """Draw a piece of that width, depth and height at some wall, its bottom at z; whether there was room."""
         inner = 0.5 * WALL_M + HAIR_M
         for _ in range(tries):
-            side = int(self.rng.integers(4))
-            free = float((room.high - room.low)[side % 2]) - 2.0 * inner - size[0]
+            wall, length = room.at_wall(int(self.rng.integers(4)), self.builder)
+            free = length - 2.0 * inner - size[0]
             if free < 0.0:
                 continue
             along = inner + 0.5 * size[0] + free * float(self.rng.choice([0.0, 1.0, self.rng.random()]))
-            corner = np.where([side in (1, 2), side in (2, 3)], room.high, room.low)
-            spot = Spot(self.builder, np.append(corner, 0.0), 0.5 * np.pi * side).shifted(along, inner, z)
+            spot = wall.shifted(along, inner, z)
             if self.clearance.claim(*spot.bounds((-0.5 * size[0], 0.5 * size[0]), (0.0, size[1]), (0.0, size[2]))):
                 piece(spot, size, self.rng)
                 return True
@@ -273,20 +290,24 @@ class Furnisher:
             low, high = room.low + WALL_M + half, room.high - WALL_M - half
             if (low > high).any():
                 continue
-            spot = Spot(self.builder, np.append(self.rng.uniform(low, high), 0.0), 0.5 * np.pi * turned)
+            spot = self.builder.shifted(*self.rng.uniform(low, high), yaw=0.5 * np.pi * turned)
             if self.clearance.claim(*spot.bounds((-a, a), (-b, b), (0.0, size[2]))):
                 piece(spot, size, self.rng)
                 return True
         return False
 
     def some(
-        self, room: Room, piece: Piece, count: int | tuple[int, int], size: tuple[Measure, Measure, Measure]
+        self, room: Room, piece: Piece, count: int | tuple[int, int], size: Measures, z: float = 0.0, tries: int = 12
     ) -> None:
         """A number of pieces at the walls, each of its own size."""
-        for _ in range(count if isinstance(count, int) else int(self.rng.integers(*count))):
-            self.at_wall(room, self.drawn(size), piece)
+        for _ in self.number(count):
+            self.at_wall(room, self.drawn(size), piece, z, tries)
 
-    def drawn(self, size: tuple[Measure, Measure, Measure]) -> Size:
+    def number(self, count: int | tuple[int, int]) -> range:
+        """A range of that length, or of one within limits."""
+        return range(count if isinstance(count, int) else int(self.rng.integers(*count)))
+
+    def drawn(self, size: Measures) -> Size:
         """A size within limits."""
         width, depth, height = (self.rng.uniform(*one) if isinstance(one, tuple) else one for one in size)
         return width, depth, height
@@ -294,8 +315,12 @@ class Furnisher:
 
 def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
     """Fill a room after its kind, then hang a few boards or pictures."""
-    KINDS[kind](room, put)
-    for _ in range(int(put.rng.integers(1, 4))):
+    for pieces in KINDS[kind]:
+        if isinstance(pieces, tuple):
+            put.some(room, *pieces)
+        else:
+            pieces(room, put)
+    for _ in put.number((1, 4)):
         width, low = put.rng.uniform(0.6, 1.8), put.rng.uniform(0.95, 1.3)
         put.at_wall(room, (width, 0.04, 1.0), board, z=low - 0.1)
 
@@ -303,90 +328,83 @@ def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
 def furnish_corridor(corridor: Room, height: float, put: Furnisher) -> None:
     """Pillars, lockers, plants, extinguishers and notice boards, as far as the route allows."""
     area = float((corridor.high - corridor.low).prod())
+    put.some(corridor, pilaster, int(area / 6.0), (0.35, (0.12, 0.2), height), tries=6)
     for _ in range(int(area / 6.0)):
-        put.at_wall(corridor, put.drawn((0.35, (0.12, 0.2), height)), pilaster, tries=6)
-    for _ in range(int(area / 6.0)):
-        depth, width, tall = put.rng.uniform(0.25, 0.45), put.rng.uniform(0.6, 1.8), put.rng.uniform(0.8, 2.0)
+        depth, width, tall = put.drawn(((0.25, 0.45), (0.6, 1.8), (0.8, 2.0)))
         put.at_wall(corridor, (width, depth, tall), cabinet, tries=8)
     for _ in range(int(area / 9.0)):
         put.at_wall(corridor, (0.2, 0.2, 0.7), extinguisher, z=0.3, tries=6)
-        size = put.drawn(((0.5, 1.6), 0.05, 1.0))
-        put.at_wall(corridor, size, partial(board, low=0.05), z=1.0, tries=6)
+        put.some(corridor, partial(board, low=0.05), 1, ((0.5, 1.6), 0.05, 1.0), z=1.0, tries=6)
         put.at_wall(corridor, (0.5, 0.5, 1.2), _corridor_plant, tries=6)
 
 
-def _office(room: Room, put: Furnisher) -> None:
-    put.some(room, workplace, (2, 5), ((1.3, 1.8), (1.45, 1.6), 1.3))
-    put.some(room, shelf, (1, 3), (*_SHELF, (1.7, 2.2)))
-    put.some(room, cabinet, (1, 3), (*_CABINET, (0.7, 1.5)))
-    put.some(room, plant, (0, 3), _PLANT)
-
-
-def _meeting(room: Room, put: Furnisher) -> None:
+def _conference(room: Room, put: Furnisher) -> None:
     longest = max(1.5, float((room.high - room.low).max()) - 2.4)
     for _ in range(3):
         if put.on_floor(room, put.drawn(((1.4, longest), (2.0, 2.4), 1.0)), conference):
             break
     put.at_wall(room, (1.7, 0.4, 0.75), cabinet)
     put.at_wall(room, (2.0, 0.05, 1.4), board, z=0.7)
-    put.some(room, spare_chair, 2, (0.6, 0.6, 1.1))
-    put.some(room, plant, 2, _PLANT)
 
 
-def _storage(room: Room, put: Furnisher) -> None:
-    put.some(room, shelf, 6, (*_SHELF, (2.0, 2.4)))
-    for _ in range(int(put.rng.integers(4, 9))):
+def _crates(room: Room, put: Furnisher) -> None:
+    for _ in put.number((4, 9)):
         put.on_floor(room, put.drawn(((0.3, 0.8), (0.3, 0.8), (0.3, 0.8))), crate)
 
 
 def _kitchen(room: Room, put: Furnisher) -> None:
-    put.at_wall(room, (0.62, 0.64, 1.85), cabinet)
-    put.at_wall(room, put.drawn(((1.6, 2.6), 0.64, 2.2)), counter, tries=30)
-    for _ in range(int(put.rng.integers(1, 4))):
+    put.some(room, counter, 1, ((1.6, 2.6), 0.64, 2.2), tries=30)
+    for _ in put.number((1, 4)):
         span = put.rng.uniform(1.6, 2.0)
         put.on_floor(room, (span, span, 1.0), round_table_with_chairs)
-    put.some(room, plant, 1, _PLANT)
 
 
 def _laboratory(room: Room, put: Furnisher) -> None:
-    put.some(room, counter, 3, ((1.4, 2.4), 0.64, 2.2))
     put.on_floor(room, (1.8, 0.9, 1.1), table)
-    for _ in range(int(put.rng.integers(1, 4))):
+    for _ in put.number((1, 4)):
         bottle = partial(_gas_bottle, height=put.rng.uniform(0.7, 1.6), radius=put.rng.uniform(0.12, 0.25))
         put.at_wall(room, (0.55, 0.55, 1.7), bottle)
-    put.some(room, cabinet, 2, (*_CABINET, (1.8, 2.1)))
 
 
-def _lounge(room: Room, put: Furnisher) -> None:
-    put.some(room, sofa, (1, 4), ((1.3, 2.3), 0.9, 0.9))
-    put.on_floor(room, (0.9, 0.9, 0.8), round_table)
-    put.some(room, shelf, 1, (*_SHELF, (1.2, 1.9)))
-    put.some(room, plant, 4, _PLANT)
-
-
-def _open_plan(room: Room, put: Furnisher) -> None:
-    for _ in range(int(put.rng.integers(2, 5))):
+def _screens(room: Room, put: Furnisher) -> None:
+    for _ in put.number((2, 5)):
         put.on_floor(room, (1.5, 1.6, 1.5), screened_workplace, tries=25)
-    put.some(room, workplace, 2, (1.5, 1.5, 1.3))
-    put.some(room, cabinet, 3, (*_CABINET, (0.9, 1.4)))
-    put.some(room, plant, 1, _PLANT)
 
 
-KINDS: dict[str, Callable[[Room, Furnisher], None]] = {
-    "office": _office,
-    "meeting": _meeting,
-    "storage": _storage,
-    "kitchen": _kitchen,
-    "laboratory": _laboratory,
-    "lounge": _lounge,
-    "open_plan": _open_plan,
+def _coffee_table(room: Room, put: Furnisher) -> None:
+    put.on_floor(room, (0.9, 0.9, 0.8), round_table)
+
+
+_SHELF = (0.8, 1.4), (0.28, 0.42)
+_CABINET = (0.5, 1.2), (0.4, 0.5)
+_PLANT = 0.75, 0.75, (0.8, 1.6)
+# What stands in a room of each kind, in the order of placing: pieces at the walls, their number and size, or a step.
+_Pieces = tuple[Piece, int | tuple[int, int], Measures]
+KINDS: dict[str, tuple[_Pieces | Callable[[Room, Furnisher], None], ...]] = {
+    "office": (
+        (workplace, (2, 5), ((1.3, 1.8), (1.45, 1.6), 1.3)),
+        (shelf, (1, 3), (*_SHELF, (1.7, 2.2))),
+        (cabinet, (1, 3), (*_CABINET, (0.7, 1.5))),
+        (plant, (0, 3), _PLANT),
+    ),
+    "meeting": (_conference, (spare_chair, 2, (0.6, 0.6, 1.1)), (plant, 2, _PLANT)),
+    "storage": ((shelf, 6, (*_SHELF, (2.0, 2.4))), _crates),
+    "kitchen": ((cabinet, 1, (0.62, 0.64, 1.85)), _kitchen, (plant, 1, _PLANT)),
+    "laboratory": (
+        (counter, 3, ((1.4, 2.4), 0.64, 2.2)),
+        _laboratory,
+        (cabinet, 2, (*_CABINET, (1.8, 2.1))),
+    ),
+    "lounge": (
+        (sofa, (1, 4), ((1.3, 2.3), 0.9, 0.9)),
+        _coffee_table,
+        (shelf, 1, (*_SHELF, (1.2, 1.9))),
+        (plant, 4, _PLANT),
+    ),
+    "open_plan": (
+        _screens,
+        (workplace, 2, (1.5, 1.5, 1.3)),
+        (cabinet, 3, (*_CABINET, (0.9, 1.4))),
+        (plant, 1, _PLANT),
+    ),
 }
-
-
-def _corridor_plant(spot: Spot, size: Size, rng: np.random.Generator) -> None:
-    plant(spot, (size[0], 0.45, 1.1), rng)
-
-
-def _gas_bottle(spot: Spot, size: Size, rng: np.random.Generator, height: float, radius: float) -> None:  # noqa: ARG001
-    spot.pillar(0.0, 0.28, (0.0, height), radius)
-    spot.pillar(0.0, 0.28, (height, height + 0.1), 0.3 * radius)

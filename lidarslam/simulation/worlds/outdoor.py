@@ -1,16 +1,51 @@
 """Cars, people, poles, trees, hedges, grass; each thing drawn in its own frame, the origin on the ground, z up."""
 
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.simulation.world import Grass, HeightField
+from lidarslam.simulation.world import Grass, HeightField, Route
+from lidarslam.simulation.worlds import paths
 from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise
 
 # Feet extend this far down, so that nothing hovers on a slope.
 SUNK_M = 0.3
+
+
+def beside(rng: np.random.Generator, nearest_m: float, farthest_m: float) -> float:
+    """A distance to either side, positive to the left."""
+    return float(rng.choice([-1.0, 1.0]) * rng.uniform(nearest_m, farthest_m))
+
+
+@dataclass(frozen=True)
+class Grounds:
+    """What stands and grows on the ground beside a closed path; what is green is pruned along the route."""
+
+    rng: np.random.Generator
+    path: FloatArray  # (M, 2)
+    ground: HeightField
+    solid: Builder = field(default_factory=Builder)
+    green: Builder = field(default_factory=Builder)
+
+    def put(self, part: Builder, xy: FloatArray, yaw: float | None = None, is_green: bool = False) -> None:
+        """Add a part that stands upright at (2,); without a yaw it is turned at random."""
+        yaw = self.rng.uniform(0.0, 2.0 * np.pi) if yaw is None else yaw
+        (self.green if is_green else self.solid).place(part, upright(self.ground, xy, yaw))
+
+    def beside(self, index: int, left_m: float) -> tuple[FloatArray, float]:
+        """A place (2,) to the left of a point of the path, counted round and round, and the path's heading there."""
+        return paths.beside_loop(self.path, index % len(self.path), left_m)
+
+    def off_path(self, xy: FloatArray) -> float:
+        """Distance of the nearest of points (..., 2) from the path."""
+        return float(paths.distance_to_loop(np.atleast_2d(xy), self.path).min())
+
+    def prune(self, route: Route, margin_m: float = 0.1) -> None:
+        """Add what is green to what is solid, without what reaches into the route's free space."""
+        self.solid.place(paths.prune(self.green, route, margin_m), np.eye(4))
 
 
 def upright(ground: HeightField, xy: FloatArray, yaw: float) -> FloatArray:
@@ -37,24 +72,22 @@ def car(rng: np.random.Generator, round_wheels: bool = True) -> Builder:
     a, b = 0.5 * length, 0.5 * width
     waist, roof = (1.05, rng.uniform(1.9, 2.3)) if is_van else (rng.uniform(0.82, 0.95), rng.uniform(1.4, 1.55))
     bonnet, boot = rng.uniform(0.26, 0.32) * length, rng.uniform(0.06, 0.2) * length
-    if is_van:
-        bonnet, boot = 0.25 * length, 0.02
-    part.block((-a, -b, 0.22), (a, b, waist - 0.12))
-    part.block((-a + 0.1, -b + 0.05, waist - 0.2), (a - bonnet + 0.1, b - 0.05, waist))
-    part.block((a - bonnet, -b + 0.08, waist - 0.3), (a - 0.15, b - 0.08, waist - 0.06))
+    bonnet, boot = (0.25 * length, 0.02) if is_van else (bonnet, boot)
+    part.block((-a, a), (-b, b), (0.22, waist - 0.12))
+    part.block((-a + 0.1, a - bonnet + 0.1), (-b + 0.05, b - 0.05), (waist - 0.2, waist))
+    part.block((a - bonnet, a - 0.15), (-b + 0.08, b - 0.08), (waist - 0.3, waist - 0.06))
     slant = 0.35 if is_van else 0.5
     front, back = a - bonnet - slant, -a + boot + 0.3 * (not is_van)
-    part.block((back, -b + 0.1, waist - 0.1), (front, b - 0.1, roof))
+    part.block((back, front), (-b + 0.1, b - 0.1), (waist - 0.1, roof))
     for foot, head in ((front + slant, front - 0.03), (back - 0.28 * (not is_van) - 0.03, back + 0.02)):
         part.beam((foot, 0.0, waist - 0.06), (head, 0.0, roof - 0.05), width - 0.22, 0.08)
     for side in (-1.0, 1.0):
         part.box((front + 0.1, side * (b + 0.08), waist + 0.06), (0.12, 0.18, 0.14))
-    for x in (-0.62 * a, 0.64 * a):
-        for side in (-1.0, 1.0):
-            if round_wheels:
-                part.cylinder((x, side * (b - 0.2), 0.31), (x, side * (b + 0.01), 0.31), 0.33)
-            else:
-                part.box((x, side * (b - 0.1), 0.3), (0.56, 0.22, 0.68))
+    for x, side in product((-0.62 * a, 0.64 * a), (-1.0, 1.0)):
+        if round_wheels:
+            part.cylinder((x, side * (b - 0.2), 0.31), (x, side * (b + 0.01), 0.31), 0.33)
+        else:
+            part.box((x, side * (b - 0.1), 0.3), (0.56, 0.22, 0.68))
     return part
 
 
@@ -66,8 +99,8 @@ def pedestrian(rng: np.random.Generator) -> Builder:
         stride = side * rng.uniform(0.08, 0.16)
         part.beam((2.2 * stride, side * 0.09, -0.05), (0.0, side * 0.09, 0.88 * tall), 0.14, 0.16)
         part.beam((-1.8 * stride, side * 0.27, 0.8 * tall), (0.0, side * 0.25, 1.42 * tall), 0.09, 0.1)
-    part.block((-0.12, -0.21, 0.82 * tall), (0.13, 0.21, 1.46 * tall))
-    part.block((-0.09, -0.08, 1.46 * tall), (0.11, 0.08, 1.75 * tall))
+    part.block((-0.12, 0.13), (-0.21, 0.21), (0.82 * tall, 1.46 * tall))
+    part.block((-0.09, 0.11), (-0.08, 0.08), (1.46 * tall, 1.75 * tall))
     return part
 
 
@@ -81,8 +114,8 @@ def lamp_post(height: float, reach: float) -> Builder:
         part.cylinder((0.0, 0.0, height - 0.05), tip, 0.045)
         part.box(tip, (0.7, 0.28, 0.13))
     else:
-        part.block((-0.22, -0.22, height - 0.05), (0.22, 0.22, height + 0.35))
-        part.block((-0.3, -0.3, height + 0.35), (0.3, 0.3, height + 0.42))
+        part.block((-0.22, 0.22), (-0.22, 0.22), (height - 0.05, height + 0.35))
+        part.block((-0.3, 0.3), (-0.3, 0.3), (height + 0.35, height + 0.42))
     return part
 
 
@@ -94,7 +127,7 @@ def sign(rng: np.random.Generator) -> Builder:
     turn = Rotation.from_euler("x", rng.choice([0.0, 0.25 * np.pi])).as_matrix()
     part.box((0.05, 0.0, top - 0.5 * size), (0.025, size, size), R=turn)
     if rng.random() < 0.4:
-        part.block((0.04, -0.3, top - 1.8 * size), (0.06, 0.3, top - 1.8 * size + 0.22))
+        part.block((0.04, 0.06), (-0.3, 0.3), (top - 1.8 * size, top - 1.8 * size + 0.22))
     return part
 
 
@@ -103,12 +136,12 @@ def bench(rng: np.random.Generator) -> Builder:
     part = Builder()
     half = 0.5 * rng.uniform(1.5, 2.0)
     for x in (-0.2, -0.02, 0.16):
-        part.block((x, -half, 0.43), (x + 0.13, half, 0.47))
+        part.block((x, x + 0.13), (-half, half), (0.43, 0.47))
     for z in (0.6, 0.76):
-        part.block((-0.3, -half, z), (-0.26, half, z + 0.12))
+        part.block((-0.3, -0.26), (-half, half), (z, z + 0.12))
     for y in (-half + 0.2, half - 0.2):
-        part.block((-0.22, y - 0.05, -SUNK_M), (0.26, y + 0.05, 0.43))
-        part.block((-0.27, y - 0.04, 0.35), (-0.2, y + 0.04, 0.86))
+        part.block((-0.22, 0.26), (y - 0.05, y + 0.05), (-SUNK_M, 0.43))
+        part.block((-0.27, -0.2), (y - 0.04, y + 0.04), (0.35, 0.86))
     return part
 
 
@@ -134,10 +167,10 @@ def bus_shelter(rng: np.random.Generator) -> Builder:
     """A shelter open towards x, its back along y."""
     part = Builder()
     half = 0.5 * rng.uniform(3.0, 4.2)
-    part.block((-0.75, -half, 2.35), (0.7, half, 2.47))
-    part.block((-0.72, -half, 0.15), (-0.68, half, 2.35))
-    part.block((-0.7, half - 0.05, 0.15), (0.35, half, 2.35))
-    part.block((-0.6, -0.6 * half, 0.42), (-0.25, 0.6 * half, 0.48))
+    part.block((-0.75, 0.7), (-half, half), (2.35, 2.47))
+    part.block((-0.72, -0.68), (-half, half), (0.15, 2.35))
+    part.block((-0.7, 0.35), (half - 0.05, half), (0.15, 2.35))
+    part.block((-0.6, -0.25), (-0.6 * half, 0.6 * half), (0.42, 0.48))
     for x, y in ((-0.7, -half + 0.05), (-0.7, half - 0.05), (0.6, -half + 0.05), (0.6, half - 0.05), (-0.5, 0.0)):
         part.pole((x, y), (-SUNK_M, 2.4 if y else 0.44), 0.04)
     return part
@@ -147,14 +180,12 @@ def log_pile(rng: np.random.Generator, rows: int) -> Builder:
     """Logs along x, stacked `rows` wide at the bottom, between two stakes."""
     part = Builder()
     half, radius = 0.5 * rng.uniform(2.0, 4.0), rng.uniform(0.14, 0.22)
-    for level in range(rows):
-        for k in range(rows - level):
-            y, z = (2.0 * k - (rows - level - 1)) * radius, radius * (0.7 + 1.74 * level)
-            shift, r = rng.normal(0.0, 0.08), radius * rng.uniform(0.85, 1.0)
-            part.cylinder((shift - half, y, z), (shift + half, y, z), r)
-    for x in (-0.6 * half, 0.6 * half):
-        for side in (-1.0, 1.0):
-            part.pole((x, side * (rows * radius + 0.06)), (-SUNK_M, 1.3), 0.05)
+    for level, k in ((row, k) for row in range(rows) for k in range(rows - row)):
+        y, z = (2.0 * k - (rows - level - 1)) * radius, radius * (0.7 + 1.74 * level)
+        shift, r = rng.normal(0.0, 0.08), radius * rng.uniform(0.85, 1.0)
+        part.cylinder((shift - half, y, z), (shift + half, y, z), r)
+    for x, side in product((-0.6 * half, 0.6 * half), (-1.0, 1.0)):
+        part.pole((x, side * (rows * radius + 0.06)), (-SUNK_M, 1.3), 0.05)
     return part
 
 
@@ -166,14 +197,7 @@ _EDGE_M = 0.6
 
 
 def grass(rng: np.random.Generator, ground: HeightField, height_m: FloatArray, distance_m: FloatArray) -> Grass:
-    """Tussocks on the ground's grid (X, Y).
-
-    Args:
-        rng: of the tussocks.
-        ground: gives the grid.
-        height_m: (X, Y) mean height of the blades, 0 where none grow.
-        distance_m: (X, Y) from where the ground is kept free of grass, negative there.
-    """
+    """Tussocks of mean height (X, Y) on the ground's grid, at a distance (X, Y) from where it is kept free of grass."""
     shape = ground.heights.shape
     tussocks = 1.0 + 0.3 * smooth_noise(rng, shape, 1.0) + 0.3 * smooth_noise(rng, shape, 8.0)
     heights = height_m * np.clip(tussocks, 0.2, 2.0) * np.clip(distance_m / _EDGE_M, 0.0, 1.0)
@@ -210,6 +234,11 @@ def broadleaf(rng: np.random.Generator, height: float, trunk_radius: float, leav
         leaf_clump(part, rng, tip, 0.45 * crown, leaves // (boughs + 1), leaf_m)
     leaf_clump(part, rng, middle, crown, leaves - boughs * (leaves // (boughs + 1)), leaf_m)
     return part
+
+
+def old_tree(rng: np.random.Generator) -> Builder:
+    """A broadleaf tree of a meadow or a field."""
+    return broadleaf(rng, rng.uniform(7.0, 13.0), rng.uniform(0.18, 0.4), 80)
 
 
 def conifer(rng: np.random.Generator, height: float, trunk_radius: float, leaves: int) -> Builder:

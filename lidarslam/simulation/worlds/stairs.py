@@ -14,9 +14,8 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Route, World
 from lidarslam.simulation.worlds import interior
-from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Spot, glazed_wall
-from lidarslam.simulation.worlds.hall import draw_railing
-from lidarslam.simulation.worlds.interior import Furnisher, Room
+from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Room
+from lidarslam.simulation.worlds.interior import Furnisher, draw_railing
 from lidarslam.simulation.worlds.paths import Clearance
 
 RISE_M, TREAD_M = 0.17, 0.28
@@ -51,11 +50,11 @@ class StairPlan:
         """Width of the stairwell."""
         return 2.0 * self.width + self.shaft
 
-    def flight(self, builder: Builder, number: int) -> Spot:
+    def flight(self, builder: Builder, number: int) -> Builder:
         """The frame of a flight, x up it from the middle of its lowest riser; the shaft is on its left."""
         back = bool(number % 2)
         x, y = (self.run, self.across - 0.5 * self.width) if back else (0.0, 0.5 * self.width)
-        return Spot(builder, np.array([x, y, number * self.climb]), np.pi * back)
+        return builder.shifted(x, y, number * self.climb, yaw=np.pi * back)
 
 
 def build(seed: int) -> World:
@@ -90,15 +89,15 @@ def _route(plan: StairPlan) -> Route:
     return Route(waypoints, 0.3, _FREE_SIDE_M, _FREE_HEIGHT_M, _SPEED_LIMIT_MPS)
 
 
-def _draw_flight(flight: Spot, plan: StairPlan) -> None:
+def _draw_flight(flight: Builder, plan: StairPlan) -> None:
     """Steps, the landing that they lead to, and a railing along the shaft."""
     half = 0.5 * plan.width
     for k in range(1, plan.steps):
-        flight.box(((k - 1) * TREAD_M, k * TREAD_M), (-half, half), ((k - 1) * RISE_M - 0.1, k * RISE_M))
+        flight.block(((k - 1) * TREAD_M, k * TREAD_M), (-half, half), ((k - 1) * RISE_M - 0.1, k * RISE_M))
     slab = (plan.climb - _SLAB_M, plan.climb)
-    flight.box((plan.run, plan.run + plan.landing), (-half, plan.across - half), slab)
+    flight.block((plan.run, plan.run + plan.landing), (-half, plan.across - half), slab)
     aside = half - _RAIL_ASIDE_M
-    draw_railing(flight.point(0.0, aside, RISE_M), flight.point(plan.run, aside, plan.climb), flight.builder)
+    draw_railing(np.array([0.0, aside, RISE_M]), np.array([plan.run, aside, plan.climb]), flight)
 
 
 def _draw_shell(plan: StairPlan, builder: Builder, clearance: Clearance, rng: np.random.Generator) -> None:
@@ -107,19 +106,19 @@ def _draw_shell(plan: StairPlan, builder: Builder, clearance: Clearance, rng: np
     height = (plan.storeys + 1) * storey
     lobby_end = -plan.landing - OUTER_WALL_M
     for x, z in ((high, -_SLAB_M), (high, height), (lobby_end, storey - _SLAB_M)):
-        builder.block((low, 0.0, z), (x, plan.across, z + _SLAB_M))
+        builder.block((low, x), (0.0, plan.across), (z, z + _SLAB_M))
     for y in (-OUTER_WALL_M, plan.across):
-        builder.block((low, y, -_SLAB_M), (high, y + OUTER_WALL_M, height + _SLAB_M))
-    builder.block((low - OUTER_WALL_M, -OUTER_WALL_M, -_SLAB_M), (low, plan.across + OUTER_WALL_M, storey))
-    front = Spot(builder, np.array([-plan.landing, plan.across, 0.0]), -0.5 * np.pi)
-    back = Spot(builder, np.array([high, 0.0, 0.0]), 0.5 * np.pi)
+        builder.block((low, high), (y, y + OUTER_WALL_M), (-_SLAB_M, height + _SLAB_M))
+    builder.block((low - OUTER_WALL_M, low), (-OUTER_WALL_M, plan.across + OUTER_WALL_M), (-_SLAB_M, storey))
+    front = builder.shifted(-plan.landing, plan.across, yaw=-0.5 * np.pi)
+    back = builder.shifted(high, 0.0, yaw=0.5 * np.pi)
     middle, wide = 0.5 * plan.across, (0.0, plan.across)
     window = Opening((middle - 0.7, middle + 0.7), (plan.climb + 0.9, plan.climb + 1.5))
     door = Opening((middle - 0.5, middle + 0.5), (0.0, 2.1))
     for level in range(plan.storeys + 1):
-        glazed_wall(back.shifted(0.0, 0.0, level * storey), wide, storey, [window])
+        back.shifted(0.0, 0.0, level * storey).glazed_wall(wide, storey, [window])
         if level:  # the ground floor is open to the lobby
-            glazed_wall(front.shifted(0.0, 0.0, level * storey), wide, storey, [door])
+            front.shifted(0.0, 0.0, level * storey).glazed_wall(wide, storey, [door])
     put, lobby = Furnisher(builder, clearance, rng), Room(np.array([low, 0.0]), np.array([-plan.landing, plan.across]))
     clearance.take(np.array([-plan.landing - 1.0, 0.0, 0.0]), np.array([high, plan.across, height]))
     for _ in range(2):

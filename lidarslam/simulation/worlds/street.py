@@ -1,7 +1,7 @@
 """City streets round one block or two: houses, kerbs, parked and oncoming cars, trees, poles, people."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,16 +11,22 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import Builder, heading, left_of, smooth_noise
+from lidarslam.simulation.worlds.building import Builder, Vector, heading, left_of, smooth_noise
 from lidarslam.simulation.worlds.houses import house
-from lidarslam.simulation.worlds.outdoor import on_slope, upright
+from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
 
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 KERB_WIDTH_M = 0.3
-KERB_HEIGHT_M = 0.12
+_KERB_HEIGHT_M = 0.12
 # The ground rises from road to pavement over one cell of its grid, from the kerb's foot on.
 RISE_M = 0.5
 STONE_M = 3.0
+# From the middle line to the foot of the kerb, a multiple of `RISE_M`; radius of the kerb where two streets meet.
+HALF_WIDTH_M, _FILLET_M = 6.0, 4.0
+_REACH_M = HALF_WIDTH_M + _FILLET_M
+_DEPTHS_M = (8.0, 11.0)
+_LANE_M = 3.5
+_LEFT_RADIUS_M, _RIGHT_RADIUS_M = 8.0, 5.0
 
 
 class Side(NamedTuple):
@@ -41,13 +47,20 @@ class Side(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class StreetNetwork:
-    """Middle lines of streets."""
+class Quarter:
+    """Streets round one block or round two with a street between them, and dead ends that lead out of it."""
 
-    nodes: FloatArray  # (K, 2) crossings, corners and dead ends, at whole metres
+    nodes: FloatArray  # (K, 2) crossings, corners and dead ends of the middle lines, at whole metres
     edges: tuple[tuple[int, int], ...]  # pairs of nodes, each pair on a line along x or y
-    half_width_m: float  # from the middle line to the foot of the kerb, a multiple of `RISE_M`
-    fillet_m: float  # radius of the kerb where two streets meet
+    pavement_m: float  # width of the pavements
+    tour: FloatArray  # (M, 2) corners of the carrier's path along the middle lines
+    oncoming: FloatArray  # (K, 2) of a path that meets it, but crosses it nowhere if all keep to the right
+    blocks: FloatArray  # (B, 2, 2) lowest and highest corner of each block, to the streets' middle lines
+
+    @property
+    def front_m(self) -> float:
+        """From the middle line to the fronts of the houses."""
+        return HALF_WIDTH_M + self.pavement_m
 
     def arms(self, node: int) -> FloatArray:
         """(4,) whether a street leads from the node to +x, +y, -x, -y."""
@@ -67,13 +80,12 @@ class StreetNetwork:
         distance = np.full(len(xy), np.inf)
         for low, high in self.middle_lines:
             aside = np.maximum(np.maximum(low - xy, xy - high), 0.0)
-            distance = np.minimum(distance, np.hypot(aside[:, 0], aside[:, 1]) - self.half_width_m)
-        reach = self.half_width_m + self.fillet_m
+            distance = np.minimum(distance, np.hypot(aside[:, 0], aside[:, 1]) - HALF_WIDTH_M)
         for at, first, second, streets in self.corners():
             if streets == 2:
-                middle = at + reach * (first + second)
-                here = np.flatnonzero((np.abs(xy - at - 0.5 * (middle - at)) < 0.5 * reach).all(axis=1))
-                fillet = self.fillet_m - np.linalg.norm(xy[here] - middle, axis=1)
+                middle = at + _REACH_M * (first + second)
+                here = np.flatnonzero((np.abs(xy - at - 0.5 * (middle - at)) < 0.5 * _REACH_M).all(axis=1))
+                fillet = _FILLET_M - np.linalg.norm(xy[here] - middle, axis=1)
                 distance[here] = np.minimum(distance[here], fillet)
         return distance
 
@@ -93,102 +105,58 @@ class StreetNetwork:
     def kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Middle lines of the kerb's stones, from (2,) to (2,)."""
         middle = RISE_M - 0.5 * KERB_WIDTH_M
-        reach = self.half_width_m + self.fillet_m
         for side in self.sides():
-            end = side.start + side.length_m * side.along
-            first = reach if self._leads(side.start, side.outward) else 0.0
-            last = side.length_m - (reach if self._leads(end, side.outward) else 0.0)
-            aside = (self.half_width_m + middle) * side.outward
+            first, until_end = (
+                _REACH_M if self.arms(self._node(at))[int((_DIRECTIONS @ side.outward).argmax())] else 0.0
+                for at in (side.start, side.at(side.length_m, 0.0))
+            )
+            last = side.length_m - until_end
             at = np.linspace(first, last, max(2, 1 + round((last - first) / STONE_M)))
-            yield from pairwise(side.start + at[:, None] * side.along + aside)
+            yield from pairwise(side.start + at[:, None] * side.along + (HALF_WIDTH_M + middle) * side.outward)
         for node, one, other, streets in self.corners():
             if streets == 2:
-                yield from pairwise(_quarter(node + reach * (one + other), -one, -other, self.fillet_m - middle))
+                yield from pairwise(_arc(node + _REACH_M * (one + other), -one, -other, _FILLET_M - middle))
             elif streets == 0:
-                yield from pairwise(_quarter(node, one, other, self.half_width_m + middle))
+                yield from pairwise(_arc(node, one, other, HALF_WIDTH_M + middle))
 
-    def _leads(self, at: FloatArray, direction: FloatArray) -> bool:
-        """Whether a street leads in that direction from the node at (2,)."""
-        node = int(np.abs(self.nodes - at).sum(axis=1).argmin())
-        return bool(self.arms(node)[int((_DIRECTIONS @ direction).argmax())])
+    def _node(self, at: FloatArray) -> int:
+        return int(np.abs(self.nodes - at).sum(axis=1).argmin())
 
 
-def _quarter(centre: FloatArray, one: FloatArray, other: FloatArray, radius: float) -> FloatArray:
+def _arc(centre: FloatArray, one: FloatArray, other: FloatArray, radius: float) -> FloatArray:
     """Points (N, 2) on a quarter of a circle between two directions."""
     angle = np.linspace(0.0, 0.5 * np.pi, max(4, round(radius / 0.6)))[:, None]
     return np.asarray(centre + radius * (np.cos(angle) * one + np.sin(angle) * other))
 
 
-HALF_WIDTH_M = 6.0
-_FILLET_M = 4.0
-_DEPTHS_M = (8.0, 11.0)
+def rectangle(low: Vector, high: Vector) -> FloatArray:
+    """Its corners (4, 2), counter-clockwise from the lowest."""
+    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
-@dataclass(frozen=True, eq=False)
-class StreetPlan:
-    """A quarter of one block or of two with a street between them, and dead ends that lead out of it."""
-
-    network: StreetNetwork
-    pavement_m: float  # width of the pavements
-    tour: FloatArray  # (M, 2) corners of the carrier's path along the middle lines
-    oncoming: FloatArray  # (K, 2) of a path that meets it, but crosses it nowhere if all keep to the right
-    blocks: FloatArray  # (B, 2, 2) lowest and highest corner of each block, to the streets' middle lines
-
-
-@dataclass(frozen=True, eq=False)
-class Lot:
-    """Land for one house, to the left of its front."""
-
-    origin: FloatArray  # (2,) left end of the house's front as seen from within
-    along: FloatArray  # (2,) direction of the front
-    width: float
-    depth: float
-    setback_m: float = 0.0  # front garden between pavement and `origin`
-
-    @property
-    def inward(self) -> FloatArray:
-        """(2,) from the street into the house."""
-        return left_of(self.along)
-
-    @cached_property
-    def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Its lowest and highest corner (2,)."""
-        far = self.origin + self.width * self.along + self.depth * self.inward
-        return np.minimum(self.origin, far), np.maximum(self.origin, far)
-
-
-def _rectangle(west: float, east: float, height: float) -> FloatArray:
-    return np.array([[west, 0.0], [east, 0.0], [east, height], [west, height]])
-
-
-def draw_plan(rng: np.random.Generator) -> StreetPlan:
+def draw_quarter(rng: np.random.Generator) -> Quarter:
     """One block of 80 to 110 m, or two of 56 to 66 m with a tour in a figure of eight."""
     is_double = bool(rng.random() < 0.4)
     pavement = rng.uniform(3.4, 4.2)
     if is_double:
-        outline = _rectangle(-float(rng.integers(56, 66)), float(rng.integers(56, 66)), float(rng.integers(52, 62)))
+        west, east = -float(rng.integers(56, 66)), float(rng.integers(56, 66))
+        outline = rectangle((west, 0.0), (east, float(rng.integers(52, 62))))
         shared = np.array([[0.0, 0.0], [0.0, outline[2, 1]]])
-        first, second = outline[[3, 0]], outline[[2, 1]]
-        tour = np.concatenate([shared, first, shared, second])
-        oncoming = np.concatenate([shared, first])[::-1]
+        tour = np.concatenate([shared, outline[[3, 0]], shared, outline[[2, 1]]])
+        oncoming = np.concatenate([shared, outline[[3, 0]]])[::-1]
         blocks = np.array([[outline[0], shared[1]], [shared[0], outline[2]]])
     else:
-        outline = _rectangle(0.0, float(rng.integers(80, 111)), float(rng.integers(80, 111)))
+        outline = rectangle((0.0, 0.0), (float(rng.integers(80, 111)), float(rng.integers(80, 111))))
         tour = outline if rng.random() < 0.5 else outline[::-1]
         oncoming, blocks = tour[::-1], outline[None, [0, 2]]
-    return StreetPlan(_draw_network(rng, outline, is_double), pavement, tour, oncoming, blocks)
+    nodes, edges = _draw_streets(rng, outline, is_double)
+    return Quarter(nodes, edges, pavement, tour, oncoming, blocks)
 
 
-def draw_terrace_plan(rng: np.random.Generator) -> StreetPlan:
-    """One long, narrow block: two streets of about 400 m, and two short ones that join them."""
-    outline = _rectangle(0.0, float(rng.integers(380, 461)), float(rng.integers(56, 71)))
-    network = StreetNetwork(outline, tuple((k, (k + 1) % 4) for k in range(4)), HALF_WIDTH_M, _FILLET_M)
-    tour = outline if rng.random() < 0.5 else outline[::-1]
-    return StreetPlan(network, rng.uniform(3.4, 4.2), tour, tour[::-1], outline[None, [0, 2]])
-
-
-def _draw_network(rng: np.random.Generator, outline: FloatArray, is_double: bool) -> StreetNetwork:
-    """The streets round the outline (4, 2), counter-clockwise, with a middle street at x = 0 or none, and dead ends."""
+def _draw_streets(
+    rng: np.random.Generator, outline: FloatArray, is_double: bool
+) -> tuple[FloatArray, tuple[tuple[int, int], ...]]:
+    """Nodes and edges round the outline (4, 2), with a middle street at x = 0 or none, and of dead ends."""
     nodes: list[FloatArray] = []
     edges: list[tuple[int, int]] = []
 
@@ -214,102 +182,114 @@ def _draw_network(rng: np.random.Generator, outline: FloatArray, is_double: bool
         edges += pairwise([node(corner + stop * along) for stop in sorted(stops)])
     if is_double:
         edges.append((node(np.array([0.0, 0.0])), node(np.array([0.0, outline[2, 1]]))))
-    return StreetNetwork(np.array(nodes), tuple(edges), HALF_WIDTH_M, _FILLET_M)
+    return np.array(nodes), tuple(edges)
 
 
-@dataclass
-class LotSurvey:
-    """Places lots along all streets, none on a street or on another lot; `gaps` are lots without a house."""
+@dataclass(frozen=True, eq=False)
+class Lot:
+    """Land for one house, to the left of its front."""
 
-    plan: StreetPlan
-    lots: list[Lot] = field(default_factory=list)
-    gaps: list[Lot] = field(default_factory=list)
+    origin: FloatArray  # (2,) left end of the house's front as seen from within
+    along: FloatArray  # (2,) direction of the front
+    width: float
+    depth: float
+    setback_m: float = 0.0  # front garden between pavement and `origin`
 
-    def walk(self, rng: np.random.Generator) -> None:
-        """Build up the free parts of each side of each street, dead ends first."""
-        for start, length, along in self._frontages():
-            at = 0.0
-            while at < length:
-                depth = rng.uniform(*_DEPTHS_M)
-                setback = float(rng.choice([0.0, rng.uniform(0.2, 0.8), rng.uniform(2.5, 3.5)], p=[0.6, 0.25, 0.15]))
-                lot = Lot(start + at * along, along, min(rng.uniform(7.0, 15.0), max(length - at, 6.5)), depth, setback)
-                narrow = Lot(lot.origin, along, 6.5, depth)
-                fitting = next((one for one in (lot, narrow) if self._is_free(one)), None)
-                if fitting is None:
-                    at += 0.5
-                    continue
-                self.lots.append(replace(fitting, origin=fitting.origin + fitting.setback_m * fitting.inward))
-                at += fitting.width
-                if rng.random() < 0.22:
-                    gap = Lot(start + at * along, along, rng.uniform(2.5, 7.0), 6.0)
-                    self.gaps += [gap] if self._is_free(gap) else []
-                    at += gap.width
+    @property
+    def inward(self) -> FloatArray:
+        """(2,) from the street into the house."""
+        return left_of(self.along)
 
-    def repeat(self, width_m: float, depth_m: float) -> None:
-        """Build up each side of each street with equal lots, none set back."""
-        for start, length, along in self._frontages():
-            at = 0.0
-            while at + width_m <= length:
-                lot = Lot(start + at * along, along, width_m, depth_m)
-                is_free = self._is_free(lot)
-                self.lots += [lot] if is_free else []
-                at += width_m if is_free else 0.5
+    @cached_property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Its lowest and highest corner (2,)."""
+        far = self.origin + self.width * self.along + self.depth * self.inward
+        return np.minimum(self.origin, far), np.maximum(self.origin, far)
 
-    def _frontages(self) -> Iterator[tuple[FloatArray, float, FloatArray]]:
-        """Where each row of houses starts, how long it may be, and its direction."""
-        network, front = self.plan.network, self.plan.network.half_width_m + self.plan.pavement_m
-        is_dead = np.array([network.arms(k).sum() == 1.0 for k in range(len(network.nodes))])
-        for a, b in network.edges:
-            if is_dead[b]:  # dead ends run from their foot
-                ahead = (network.nodes[b] - network.nodes[a]) / np.linalg.norm(network.nodes[b] - network.nodes[a])
-                along = -left_of(ahead)
-                yield network.nodes[b] + front * (ahead - along), 2.0 * front, along
-        beyond = front + _DEPTHS_M[1]
-        dead_ends = network.nodes[is_dead]
-        for side in network.sides():
-            ends = (side.start, side.start + side.length_m * side.along)
-            before, after = (0.0 if (dead_ends == at).all(axis=1).any() else beyond for at in ends)
-            yield side.at(-before, front), before + side.length_m + after, side.along
-
-    def _is_free(self, lot: Lot) -> bool:
-        far = lot.origin + lot.width * lot.along + (lot.depth + lot.setback_m) * lot.inward
-        low, high = np.minimum(lot.origin, far) + 0.02, np.maximum(lot.origin, far) - 0.02
-        keep_off = self.plan.network.half_width_m + self.plan.pavement_m
-        ends = self.plan.network.middle_lines
-        if ((low < ends[:, 1] + keep_off) & (high > ends[:, 0] - keep_off)).all(axis=1).any():
+    def is_free(self, plan: Quarter, others: list["Lot"]) -> bool:
+        """Whether it is on no street and on no other lot."""
+        far = self.origin + self.width * self.along + (self.depth + self.setback_m) * self.inward
+        low, high = np.minimum(self.origin, far) + 0.02, np.maximum(self.origin, far) - 0.02
+        ends = plan.middle_lines
+        if ((low < ends[:, 1] + plan.front_m) & (high > ends[:, 0] - plan.front_m)).all(axis=1).any():
             return False
-        return not any((low < far).all() and (high > near).all() for near, far in self._taken())
-
-    def _taken(self) -> Iterator[tuple[FloatArray, FloatArray]]:
-        return (lot.bounds for lot in (*self.lots, *self.gaps))
+        return not any((low < far).all() and (high > near).all() for near, far in (other.bounds for other in others))
 
 
-_LANE_M = 3.5
-_LEFT_RADIUS_M, _RIGHT_RADIUS_M = 8.0, 5.0
-_CELL_M = RISE_M
+def draw_lots(plan: Quarter, rng: np.random.Generator) -> tuple[list[Lot], list[Lot]]:
+    """Lots along the free parts of each side of each street, dead ends first; and gaps between them."""
+    lots: list[Lot] = []
+    gaps: list[Lot] = []
+    for start, length, along in _frontages(plan):
+        at = 0.0
+        while at < length:
+            depth = rng.uniform(*_DEPTHS_M)
+            setback = float(rng.choice([0.0, rng.uniform(0.2, 0.8), rng.uniform(2.5, 3.5)], p=[0.6, 0.25, 0.15]))
+            lot = Lot(start + at * along, along, min(rng.uniform(7.0, 15.0), max(length - at, 6.5)), depth, setback)
+            narrow = Lot(lot.origin, along, 6.5, depth)
+            fitting = next((one for one in (lot, narrow) if one.is_free(plan, lots + gaps)), None)
+            if fitting is None:
+                at += 0.5
+                continue
+            lots.append(replace(fitting, origin=fitting.origin + fitting.setback_m * fitting.inward))
+            at += fitting.width
+            if rng.random() < 0.22:
+                gap = Lot(start + at * along, along, rng.uniform(2.5, 7.0), 6.0)
+                gaps += [gap] if gap.is_free(plan, lots + gaps) else []
+                at += gap.width
+    return lots, gaps
+
+
+def repeated_lots(plan: Quarter, width_m: float, depth_m: float) -> list[Lot]:
+    """Equal lots along each side of each street, none set back."""
+    lots: list[Lot] = []
+    for start, length, along in _frontages(plan):
+        at = 0.0
+        while at + width_m <= length:
+            lot = Lot(start + at * along, along, width_m, depth_m)
+            is_free = lot.is_free(plan, lots)
+            lots += [lot] if is_free else []
+            at += width_m if is_free else 0.5
+    return lots
+
+
+def _frontages(plan: Quarter) -> Iterator[tuple[FloatArray, float, FloatArray]]:
+    """Where each row of houses starts, how long it may be, and its direction."""
+    front = plan.front_m
+    is_dead = np.array([plan.arms(k).sum() == 1.0 for k in range(len(plan.nodes))])
+    for a, b in plan.edges:
+        if is_dead[b]:  # dead ends run from their foot
+            ahead = (plan.nodes[b] - plan.nodes[a]) / np.linalg.norm(plan.nodes[b] - plan.nodes[a])
+            along = -left_of(ahead)
+            yield plan.nodes[b] + front * (ahead - along), 2.0 * front, along
+    beyond = front + _DEPTHS_M[1]
+    dead_ends = plan.nodes[is_dead]
+    for side in plan.sides():
+        ends = (side.start, side.start + side.length_m * side.along)
+        before, after = (0.0 if (dead_ends == at).all(axis=1).any() else beyond for at in ends)
+        yield side.at(-before, front), before + side.length_m + after, side.along
 
 
 def build(seed: int) -> World:
     """A quarter of a city; everybody drives on the right."""
     rng = np.random.default_rng(seed)
-    plan = draw_plan(rng)
+    plan = draw_quarter(rng)
     ground = lay_ground(rng, plan, (0.6, 1.1))
-    survey = LotSurvey(plan)
-    survey.walk(rng)
-    solid, green = Builder(), Builder()
-    lay_kerbs(solid, plan.network.kerb_stones(), ground)
-    for lot in survey.lots:
-        sides = (_is_open(survey, lot, -1.5), _is_open(survey, lot, lot.width + 1.5))
+    lots, gaps = draw_lots(plan, rng)
+    grounds = Grounds(rng, plan.tour, ground)
+    lay_kerbs(grounds.solid, plan.kerb_stones(), ground)
+    for lot in lots:
+        sides = (_is_open(plan, lots, lot, -1.5), _is_open(plan, lots, lot, lot.width + 1.5))
         pose = house_pose(ground, lot.origin, lot.along, lot.width)
-        solid.place(house(rng, lot.width, lot.depth, sides), pose)
-    for lot in [*survey.gaps, *(lot for lot in survey.lots if lot.setback_m > 2.0)]:
-        _garden(solid, green, rng, lot, ground)
-    park_cars(solid, rng, plan, ground, (0.35, 0.85))
-    _pavements(solid, green, rng, plan, ground)
+        grounds.solid.place(house(rng, lot.width, lot.depth, sides), pose)
+    for lot in [*gaps, *(lot for lot in lots if lot.setback_m > 2.0)]:
+        _garden(grounds, lot)
+    park_cars(grounds, plan, (0.35, 0.85))
+    _pavements(grounds, plan)
     route = Route(paths.on_ground(lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, 11.0)
-    solid.place(paths.prune(green, route), np.eye(4))
-    movers = (*traffic(rng, plan, ground), *people(rng, plan, ground))
-    return World("street", seed, route, *solid.solids, (ground,), movers, map_spacing_m=0.1)
+    grounds.prune(route)
+    movers = (*traffic(grounds, plan), *people(grounds, plan))
+    return World("street", seed, route, *grounds.solid.solids, (ground,), movers, map_spacing_m=0.1)
 
 
 def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
@@ -319,15 +299,15 @@ def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
     return paths.subdivide_loop(paths.round_corners(corners, radii, step_m), 5.0)
 
 
-def lay_ground(rng: np.random.Generator, plan: StreetPlan, hills_m: tuple[float, float]) -> HeightField:
+def lay_ground(rng: np.random.Generator, plan: Quarter, hills_m: tuple[float, float]) -> HeightField:
     """Gentle slopes of that deviation, with the surface of the streets on them."""
-    margin = plan.network.half_width_m + plan.pavement_m + 20.0
+    margin = plan.front_m + 20.0
     # Nodes are at whole metres, so that a kerb is at grid points.
-    low = np.floor(plan.network.nodes.min(axis=0) - margin)
-    nodes = paths.grid_nodes(low, plan.network.nodes.max(axis=0) + margin, _CELL_M)
-    kerb = plan.network.kerb_distance(nodes.reshape(-1, 2)).reshape(nodes.shape[:2])
-    heights = rng.uniform(*hills_m) * smooth_noise(rng, kerb.shape, 40.0 / _CELL_M)
-    return HeightField(low, _CELL_M, pave(rng, heights, kerb, _CELL_M, plan.network.half_width_m))
+    low = np.floor(plan.nodes.min(axis=0) - margin)
+    nodes = paths.grid_nodes(low, plan.nodes.max(axis=0) + margin, RISE_M)
+    kerb = plan.kerb_distance(nodes.reshape(-1, 2)).reshape(nodes.shape[:2])
+    heights = rng.uniform(*hills_m) * smooth_noise(rng, kerb.shape, 40.0 / RISE_M)
+    return HeightField(low, RISE_M, pave(rng, heights, kerb, RISE_M, HALF_WIDTH_M))
 
 
 def pave(
@@ -336,7 +316,7 @@ def pave(
     """Hills (X, Y) with a cambered road, pavements a kerb higher, and roughness, by the kerb's distance (X, Y)."""
     shape = hills.shape
     heights = hills + (0.02 * smooth_noise(rng, shape, 3.0 / cell_m) + 0.005 * smooth_noise(rng, shape, 0.7))
-    heights += KERB_HEIGHT_M * np.clip(kerb / cell_m, 0.0, 1.0)
+    heights += _KERB_HEIGHT_M * np.clip(kerb / cell_m, 0.0, 1.0)
     return np.asarray(heights + 0.08 * (1.0 - (1.0 - np.clip(-kerb / half_width_m, 0.0, 1.0)) ** 2))
 
 
@@ -357,56 +337,58 @@ def house_pose(ground: HeightField, origin: FloatArray, along: FloatArray, width
     return pose
 
 
-def _is_open(survey: LotSurvey, lot: Lot, x: float) -> bool:
+def _is_open(plan: Quarter, lots: list[Lot], lot: Lot, x: float) -> bool:
     """Whether a house's side can be seen from a street close by; x is just outside it."""
     beside = lot.origin + x * lot.along + 3.0 * lot.inward
-    if survey.plan.network.kerb_distance(beside[None])[0] > survey.plan.pavement_m + 8.0:
+    if plan.kerb_distance(beside[None])[0] > plan.pavement_m + 8.0:
         return False
-    return not any((low < beside).all() and (beside < high).all() for low, high in (one.bounds for one in survey.lots))
+    return not any((low < beside).all() and (beside < high).all() for low, high in (one.bounds for one in lots))
 
 
-def _garden(solid: Builder, green: Builder, rng: np.random.Generator, lot: Lot, ground: HeightField) -> None:
+def _garden(grounds: Grounds, lot: Lot) -> None:
     """A wall or a hedge across a gap between houses or before a front garden, with a tree or a bush behind it."""
+    rng = grounds.rng
     start = lot.origin - (lot.setback_m - 0.25) * lot.inward
     length, high = (lot.width - 1.4, rng.uniform(0.9, 1.4)) if lot.setback_m else (lot.width, rng.uniform(1.6, 2.2))
-    pose = upright(ground, start, heading(lot.along))
+    yaw, level = heading(lot.along), float(grounds.ground.height_at(start[None])[0])
     if rng.random() < 0.5:
-        green.place(outdoor.hedge(rng, length, high, 0.5), pose)
+        grounds.put(outdoor.hedge(rng, length, high, 0.5), start, yaw, is_green=True)
     else:
-        solid.wall(start, start + length * lot.along, (pose[2, 3] - 1.0, pose[2, 3] + high), 0.3)
+        grounds.solid.wall(start, start + length * lot.along, (level - 1.0, level + high), 0.3)
     where = start + rng.uniform(0.3, 0.7) * length * lot.along
-    where = where + (1.5 if lot.setback_m else rng.uniform(3.0, 5.0)) * lot.inward
     if lot.setback_m:
-        green.place(outdoor.bush(rng, rng.uniform(0.5, 0.8), 14), upright(ground, where, 0.0))
+        bush = outdoor.bush(rng, rng.uniform(0.5, 0.8), 14)
+        grounds.put(bush, where + 1.5 * lot.inward, 0.0, is_green=True)
     else:
-        green.place(outdoor.broadleaf(rng, rng.uniform(5.0, 9.0), 0.16, 24), upright(ground, where, heading(lot.along)))
+        where = where + rng.uniform(3.0, 5.0) * lot.inward
+        grounds.put(outdoor.broadleaf(rng, rng.uniform(5.0, 9.0), 0.16, 24), where, yaw, is_green=True)
 
 
-def park_cars(
-    solid: Builder, rng: np.random.Generator, plan: StreetPlan, ground: HeightField, taken_share: tuple[float, float]
-) -> None:
+def park_cars(grounds: Grounds, plan: Quarter, taken_share: tuple[float, float]) -> None:
     """Cars along the kerbs; the share of the places taken is drawn for each side of a street."""
-    keep_off = plan.network.half_width_m + plan.network.fillet_m + 4.0
-    for side in plan.network.sides():
+    rng = grounds.rng
+    for side in plan.sides():
         taken = rng.uniform(*taken_share)
-        for at in np.arange(keep_off, side.length_m - keep_off, 6.0):
+        for at in np.arange(_REACH_M + 4.0, side.length_m - _REACH_M - 4.0, 6.0):
             if rng.random() > taken:
                 continue
-            offset = plan.network.half_width_m - 1.2 + rng.uniform(-0.08, 0.08)
+            offset = HALF_WIDTH_M - 1.2 + rng.uniform(-0.08, 0.08)
             where = side.at(at + rng.uniform(-0.4, 0.4), offset)
             ahead = side.along if rng.random() < 0.15 else -side.along  # to the right of the road is against `along`
             yaw = heading(ahead) + rng.normal(0.0, 0.015)
-            solid.place(outdoor.car(rng), on_slope(ground, where, yaw, 3.0, 1.6))
+            grounds.solid.place(outdoor.car(rng), on_slope(grounds.ground, where, yaw, 3.0, 1.6))
 
 
-def _pavements(solid: Builder, green: Builder, rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> None:
-    for side in plan.network.sides():
+def _pavements(grounds: Grounds, plan: Quarter) -> None:
+    rng = grounds.rng
+    for side in plan.sides():
         is_avenue, lamp_height = rng.random() < 0.35, rng.uniform(5.0, 7.5)
         for k, at in enumerate(np.arange(rng.uniform(1.0, 7.0), side.length_m, 8.0)):
-            where = side.at(at, plan.network.half_width_m + 0.9)
-            if plan.network.kerb_distance(where[None])[0] >= 0.85:
-                pose = upright(ground, where, heading(-side.outward))
-                furnish_pavement(solid, green, rng, pose, lamp_height if k % 4 == 0 else 0.0, is_avenue)
+            where = side.at(at, HALF_WIDTH_M + 0.9)
+            if plan.kerb_distance(where[None])[0] >= 0.85:
+                pose = upright(grounds.ground, where, heading(-side.outward))
+                high = lamp_height if k % 4 == 0 else 0.0
+                furnish_pavement(grounds.solid, grounds.green, rng, pose, high, is_avenue)
 
 
 def furnish_pavement(
@@ -429,23 +411,21 @@ def furnish_pavement(
         solid.place(outdoor.bus_shelter(rng), pose)
 
 
-def traffic(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
+def traffic(grounds: Grounds, plan: Quarter) -> list[Mover]:
     """Cars on the other lane, all equally fast, so that none catches up with another."""
-    waypoints = paths.on_ground(lane_of(plan.oncoming, 0.25), ground)
+    rng, waypoints = grounds.rng, paths.on_ground(lane_of(plan.oncoming, 0.25), grounds.ground)
     count, speed = int(rng.integers(3, 6)), rng.uniform(4.0, 8.0)
     starts = _starts(rng, count, waypoints)
     return [Mover(outdoor.car(rng, round_wheels=False).boxes, waypoints, speed, at) for at in starts]
 
 
-def people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
+def people(grounds: Grounds, plan: Quarter) -> list[Mover]:
     """Pedestrians round each block, on its own pavement, so that they cross no street."""
-    movers = []
-    inset = plan.network.half_width_m + plan.pavement_m - 1.0
+    rng, movers = grounds.rng, []
     for low, high in plan.blocks:
-        (x0, y0), (x1, y1) = low + inset, high - inset
-        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])[:: rng.choice([-1, 1])]
+        corners = rectangle(low + plan.front_m - 1.0, high - plan.front_m + 1.0)[:: rng.choice([-1, 1])]
         loop = paths.subdivide_loop(paths.round_corners(corners, np.full(4, 1.5), 0.25), 5.0)
-        waypoints = paths.on_ground(loop, ground)
+        waypoints = paths.on_ground(loop, grounds.ground)
         count, speed = int(rng.integers(2, 5)), rng.uniform(0.9, 1.5)
         starts = _starts(rng, count, waypoints)
         movers += [Mover(outdoor.pedestrian(rng).boxes, waypoints, speed, at) for at in starts]

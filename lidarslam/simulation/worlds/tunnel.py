@@ -1,6 +1,6 @@
 """A mine in rough rock: a loop of changing width and height, side galleries, and things left in them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -9,45 +9,50 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
-from lidarslam.simulation.worlds.building import UP, Builder, left_of, smooth_noise
+from lidarslam.simulation.worlds.building import UP, Builder, heading, left_of, smooth_noise
 from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, points_along
 
-SPACING_M = 0.25
+_SPACING_M = 0.25
 _STEEPEST = 0.08
+_FREE_SIDE_M, _FREE_HEIGHT_M = 0.8, 2.05
+
+
+def build(seed: int) -> World:
+    """The tunnel of that seed: ground and roof as height fields that meet in the walls, a loop of 150 to 300 m."""
+    rng = np.random.default_rng(seed)
+    galleries, pillars = draw_mine(rng)
+    rock = carve(galleries, pillars, rng)
+    loop = galleries[0]
+    builder = _fit_out(_Stations.along(loop, rock, rng))
+    waypoints = loop.line[:: round(1.5 / _SPACING_M)].copy()
+    waypoints[:, 2] = rock.ground.height_at(waypoints[:, :2])
+    route = Route(waypoints, 0.4, _FREE_SIDE_M, _FREE_HEIGHT_M, 1.5)
+    return World("tunnel", seed, route, *builder.solids, (rock.ground, rock.roof))
 
 
 @dataclass(frozen=True)
 class Gallery:
     """A drift through the rock."""
 
-    line: FloatArray  # (N, 3) middle of its floor, every `SPACING_M`; the loop's last point is next to its first
+    line: FloatArray  # (N, 3) middle of its floor, every `_SPACING_M`; the loop's last point is next to its first
     half_widths: FloatArray  # (N,) from the middle to the wall
     heights: FloatArray  # (N,) of the roof above the floor, in the middle
 
 
-@dataclass(frozen=True)
-class MinePlan:
-    """Galleries, and pillars of rock left standing in chambers."""
-
-    galleries: tuple[Gallery, ...]  # the loop first
-    pillars: FloatArray  # (P, 3) middle x, y and radius
-
-
-def draw_mine(rng: np.random.Generator) -> MinePlan:
-    """A mine that is different for each seed, its loop 155 to 260 m long."""
+def draw_mine(rng: np.random.Generator) -> tuple[list[Gallery], FloatArray]:
+    """Galleries, the loop of 155 to 260 m first, and pillars (P, 3) of rock left standing: middle x, y and radius."""
     loop, pillars = _with_chambers(_draw_loop(rng), rng)
     galleries = [loop, _draw_cut(loop, rng)]
     for _ in range(60):
         if len(galleries) >= 11:
             break
-        alcove = len(galleries) >= 6
-        branch = _draw_branch(loop, rng, alcove)
+        branch = _draw_branch(loop, rng, is_alcove=len(galleries) >= 6)
         if _keeps_apart(branch, galleries):
             galleries.append(branch)
-    return MinePlan(tuple(galleries), pillars)
+    return galleries, pillars
 
 
-def loop_lefts(line: FloatArray) -> FloatArray:
+def _loop_lefts(line: FloatArray) -> FloatArray:
     """(N, 2) unit vectors to the left of a closed line (N, 3)."""
     left = left_of(np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0))
     return np.asarray(left / np.linalg.norm(left, axis=1, keepdims=True))
@@ -64,18 +69,14 @@ def _draw_loop(rng: np.random.Generator) -> Gallery:
     closed = np.concatenate([xy, xy[:1]])
     along = lengths_along(closed)
     length = rng.uniform(155.0, 260.0)
-    n = round(length / SPACING_M)
-    line = points_along(
-        closed * (length / along[-1]), along * length / along[-1], np.arange(n, dtype=np.float64) * (length / n)
-    )
+    n = round(length / _SPACING_M)
+    at = np.arange(n, dtype=np.float64) * (length / n)
+    line = points_along(closed * (length / along[-1]), along * length / along[-1], at)
     z = _waves(rng, n, 3)
     steepest = float(np.abs(np.roll(z, -1) - z).max()) * n / length
     z *= rng.uniform(0.6, 1.0) * _STEEPEST / steepest
-    return Gallery(
-        np.column_stack([line, z - z[0]]),
-        2.25 + 0.5 * np.tanh(_waves(rng, n, 14)),
-        3.2 + 0.5 * np.tanh(_waves(rng, n, 9)),
-    )
+    widths, heights = 2.25 + 0.5 * np.tanh(_waves(rng, n, 14)), 3.2 + 0.5 * np.tanh(_waves(rng, n, 9))
+    return Gallery(np.column_stack([line, z - z[0]]), widths, heights)
 
 
 def _waves(rng: np.random.Generator, n: int, most: int) -> FloatArray:
@@ -89,10 +90,10 @@ def _waves(rng: np.random.Generator, n: int, most: int) -> FloatArray:
 def _with_chambers(loop: Gallery, rng: np.random.Generator) -> tuple[Gallery, FloatArray]:
     """The loop with one to three places where it widens, and pillars that stand in them."""
     n, widths, heights = len(loop.line), loop.half_widths.copy(), loop.heights.copy()
-    left, pillars = loop_lefts(loop.line), []
+    left, pillars = _loop_lefts(loop.line), []
     for k in rng.choice(8, size=int(rng.integers(1, 4)), replace=False):
         middle = int((k + 0.5) * n / 8)
-        away = np.minimum(np.mod(np.arange(n) - middle, n), np.mod(middle - np.arange(n), n)) * SPACING_M
+        away = np.minimum(np.mod(np.arange(n) - middle, n), np.mod(middle - np.arange(n), n)) * _SPACING_M
         bump = np.exp(-((away / rng.uniform(3.0, 5.0)) ** 2))
         widths += rng.uniform(1.6, 2.6) * bump
         heights += rng.uniform(0.2, 0.7) * bump
@@ -116,17 +117,16 @@ def _draw_cut(loop: Gallery, rng: np.random.Generator) -> Gallery:
     return _gallery((1 - t) ** 2 * a + 2 * t * (1 - t) * bend + t**2 * b, rng, (1.5, 2.1), (2.6, 3.3))
 
 
-def _draw_branch(loop: Gallery, rng: np.random.Generator, alcove: bool) -> Gallery:
+def _draw_branch(loop: Gallery, rng: np.random.Generator, is_alcove: bool) -> Gallery:
     """A dead end off the loop: a gallery of 8 to 16 m, or an alcove a few metres deep."""
     k, side = int(rng.integers(len(loop.line))), float(rng.choice([-1.0, 1.0]))
-    left = loop_lefts(loop.line)[k] * side
-    heading = float(np.arctan2(left[1], left[0])) + rng.uniform(-0.5, 0.5)
-    length = loop.half_widths[k] + (rng.uniform(1.2, 2.4) if alcove else rng.uniform(8.0, 16.0))
-    at = np.arange(0.0, length, SPACING_M)
-    headings = heading + rng.uniform(-0.05, 0.05) * at
-    xy = loop.line[k, :2] + np.cumsum(np.stack([np.cos(headings), np.sin(headings)], axis=1), axis=0) * SPACING_M
-    z = loop.line[k, 2] + (0.0 if alcove else rng.uniform(-_STEEPEST, _STEEPEST)) * np.maximum(at - 2.0, 0.0)
-    widths, heights = ((0.8, 1.3), (2.0, 2.6)) if alcove else ((1.4, 2.0), (2.4, 3.2))
+    yaw = heading(_loop_lefts(loop.line)[k] * side) + rng.uniform(-0.5, 0.5)
+    length = loop.half_widths[k] + (rng.uniform(1.2, 2.4) if is_alcove else rng.uniform(8.0, 16.0))
+    at = np.arange(0.0, length, _SPACING_M)
+    yaws = yaw + rng.uniform(-0.05, 0.05) * at
+    xy = loop.line[k, :2] + np.cumsum(np.stack([np.cos(yaws), np.sin(yaws)], axis=1), axis=0) * _SPACING_M
+    z = loop.line[k, 2] + (0.0 if is_alcove else rng.uniform(-_STEEPEST, _STEEPEST)) * np.maximum(at - 2.0, 0.0)
+    widths, heights = ((0.8, 1.3), (2.0, 2.6)) if is_alcove else ((1.4, 2.0), (2.4, 3.2))
     return _gallery(np.column_stack([xy, z]), rng, widths, heights)
 
 
@@ -135,7 +135,7 @@ def _gallery(
 ) -> Gallery:
     """A gallery along a line of any spacing, its width and height varying between limits."""
     ends = lengths_along(line)
-    at = np.arange(0.0, ends[-1], SPACING_M)
+    at = np.arange(0.0, ends[-1], _SPACING_M)
     knots = np.linspace(0.0, ends[-1], max(2, int(ends[-1] / 4.0)))
     curves = (np.interp(at, knots, rng.uniform(*limits, len(knots))) for limits in (widths, heights))
     return Gallery(points_along(line, ends, at), *curves)
@@ -148,7 +148,7 @@ def _keeps_apart(branch: Gallery, others: list[Gallery]) -> bool:
         gaps = np.linalg.norm(outer[:, None, :2] - other.line[None, ::4, :2], axis=2)
         reach = other.half_widths[None, ::4] + branch.half_widths.max() + 1.2
         # The loop is near by where the branch begins.
-        near = gaps[-1:] - reach[:, :] if k == 0 else gaps - reach
+        near = gaps[-1:] - reach if k == 0 else gaps - reach
         if near.min() < (-1.5 if k == 0 and len(branch.line) < 24 else 0.0):
             return False
     return True
@@ -183,20 +183,25 @@ class Rock:
         return np.asarray(np.where(solid.any(axis=1), steps[solid.argmax(axis=1)], furthest))
 
 
-def carve(plan: MinePlan, rng: np.random.Generator) -> Rock:
-    """The rock around the galleries, the ground first."""
-    lines = np.concatenate([gallery.line for gallery in plan.galleries])
+def carve(galleries: list[Gallery], pillars: FloatArray, rng: np.random.Generator) -> Rock:
+    """The rock around the galleries."""
+    lines = np.concatenate([gallery.line for gallery in galleries])
     low = lines[:, :2].min(axis=0) - _BORDER_M
     nodes = grid_nodes(low, lines[:, :2].max(axis=0) + _BORDER_M, _CELL_M)
     shape = nodes.shape[:2]
-    depth, floor, height, to_loop = _blend(plan, nodes)
+    depth, floor, height, to_loop = _blend(galleries, nodes)
     warp = np.zeros(shape)
     for size, scale in ((0.24, 9.0), (0.13, 3.5), (0.06, 1.3)):
         warp += size * smooth_noise(rng, shape, scale)
     depth = np.maximum(np.clip(depth + warp, -3.0, None), _CORE_M - to_loop)
-    for x, y, radius in plan.pillars:
+    for x, y, radius in pillars:
         depth = np.minimum(depth, np.hypot(nodes[..., 0] - x, nodes[..., 1] - y) - radius + 0.5 * warp)
-    ground = floor + _floor_roughness(depth, to_loop, rng) + _rise(0.5 - depth)
+    # Trodden flat along the path, rubble towards the walls.
+    trodden = np.clip((to_loop - 0.9) / 0.8, 0.15, 1.0)
+    rubble = np.exp(-np.clip(depth, 0.0, None) / 0.6)
+    fine, coarse = smooth_noise(rng, shape, 1.5), smooth_noise(rng, shape, 7.0)
+    rough = trodden * (0.05 * coarse + 0.03 * fine + 0.12 * rubble * np.abs(fine))
+    ground = floor + rough + _rise(0.5 - depth)
     bumps = 0.12 * smooth_noise(rng, shape, 6.0) + 0.08 * smooth_noise(rng, shape, 2.2)
     arch = 0.3 * height * np.clip(1.0 - depth / 1.9, 0.0, 1.0) ** 2
     roof = floor + height + bumps - arch - _rise(0.35 - depth)
@@ -204,13 +209,13 @@ def carve(plan: MinePlan, rng: np.random.Generator) -> Rock:
     return Rock(HeightField(low, _CELL_M, ground), HeightField(low, _CELL_M, np.maximum(roof, headroom)))
 
 
-def _blend(plan: MinePlan, nodes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _blend(galleries: list[Gallery], nodes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """For nodes (X, Y, 2): depth inside the galleries, floor, height, and distance from the loop's line, each (X, Y).
 
     Where galleries meet, each counts by how deep inside of it a node is.
     """
     parts = []
-    for gallery in plan.galleries:
+    for gallery in galleries:
         distance, nearest = cKDTree(gallery.line[:, :2]).query(nodes, distance_upper_bound=_REACH_M)
         distance, nearest = np.minimum(distance, _REACH_M), np.minimum(nearest, len(gallery.line) - 1)
         depth = gallery.half_widths[nearest] - distance
@@ -226,35 +231,34 @@ def _blend(plan: MinePlan, nodes: FloatArray) -> tuple[FloatArray, FloatArray, F
     return deepest, gaussian_filter(floor, 2.0), gaussian_filter(height, 3.0), to_loop
 
 
-def _floor_roughness(depth: FloatArray, to_loop: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Trodden flat along the path, rubble towards the walls."""
-    trodden = np.clip((to_loop - 0.9) / 0.8, 0.15, 1.0)
-    rubble = np.exp(-np.clip(depth, 0.0, None) / 0.6)
-    fine, coarse = smooth_noise(rng, depth.shape, 1.5), smooth_noise(rng, depth.shape, 7.0)
-    return np.asarray(trodden * (0.05 * coarse + 0.03 * fine + 0.12 * rubble * np.abs(fine)))
-
-
 def _rise(x: FloatArray) -> FloatArray:
     """0 for x well below 0, a slope of `_WALL_SLOPE` above, with a short bend between."""
     return np.asarray(_WALL_SLOPE * _BEND_M * np.logaddexp(0.0, x / _BEND_M))
 
 
 @dataclass(frozen=True)
-class Stations:
-    """Places along the loop, `_STATION_M` apart."""
+class _Stations:
+    """Places along the loop, `_STATION_M` apart, numbered round and round, where things are fitted to the rock."""
 
     floor: FloatArray  # (N, 3) on the ground in the middle
     left: FloatArray  # (N, 2) unit vectors to the left
     half_widths: FloatArray  # (N,) as planned
-    rock: Rock  # around them
-    free_side_m: float  # to be kept free of fittings, as is the height
-    free_height_m: float
+    rock: Rock
+    rng: np.random.Generator
+    builder: Builder = field(default_factory=Builder)
+
+    @classmethod
+    def along(cls, loop: Gallery, rock: Rock, rng: np.random.Generator) -> "_Stations":
+        every = round(_STATION_M / _SPACING_M)
+        line, left = loop.line[::every].copy(), _loop_lefts(loop.line)[::every]
+        line[:, 2] = rock.ground.height_at(line[:, :2])
+        return cls(line, left, loop.half_widths[::every], rock, rng)
 
     def __len__(self) -> int:
         return len(self.floor)
 
     def at(self, k: int, aside: float, up: float) -> FloatArray:
-        """A point (3,) that far to the left of station k (modulo their number) and above its floor."""
+        """A point (3,) that far to the left of station k and above its floor."""
         k %= len(self)
         return np.append(self.floor[k, :2] + aside * self.left[k], self.floor[k, 2] + up)
 
@@ -268,49 +272,46 @@ class Stations:
         """Whether a thing that reaches that far around a point (3,) is outside the free space along the path."""
         nearest = float(np.linalg.norm(self.floor[:, :2] - point[:2], axis=1).min())
         # Between two stations the path is up to this much closer.
-        return nearest > float(np.hypot(self.free_side_m + reach + 0.05, 0.5 * _STATION_M))
+        return nearest > float(np.hypot(_FREE_SIDE_M + reach + 0.05, 0.5 * _STATION_M))
 
     def wall(self, side: float, up: float) -> FloatArray:
         """(N,) distance to the wall on one side (+1 left, -1 right), at a height above the floor."""
         return self.rock.reach(self.floor + up * UP, side * self.left)
 
+    def walls(self, up: float) -> dict[float, FloatArray]:
+        """The distances to the walls of both sides."""
+        return {side: self.wall(side, up) for side in (-1.0, 1.0)}
 
-def place_stations(loop: Gallery, rock: Rock, free_side_m: float, free_height_m: float) -> Stations:
-    """Stations along the loop, on the carved ground."""
-    every = round(_STATION_M / SPACING_M)
-    line, left = loop.line[::every].copy(), loop_lefts(loop.line)[::every]
-    line[:, 2] = rock.ground.height_at(line[:, :2])
-    return Stations(line, left, loop.half_widths[::every], rock, free_side_m, free_height_m)
+    def side(self) -> float:
+        """One of the sides, drawn."""
+        return float(self.rng.choice([-1.0, 1.0]))
+
+    def stretch(self, shortest: float, longest: float) -> range:
+        """Consecutive stations, drawn; the limits are shares of the loop."""
+        start, length = int(self.rng.integers(len(self))), int(len(self) * self.rng.uniform(shortest, longest))
+        return range(start, start + length)
 
 
-def fit_out(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _fit_out(stations: _Stations) -> Builder:
     """Everything, each over stretches of its own."""
-    for _ in range(int(rng.integers(3, 6))):
-        _lay_pipe(stations, builder, rng)
-    for _ in range(int(rng.integers(2, 4))):
-        _hang_cable(stations, builder, rng)
-    for _ in range(int(rng.integers(2, 5))):
-        _set_supports(stations, builder, rng)
-    _lay_rails(stations, builder, rng)
-    _hang_lamps(stations, builder, rng)
-    _drop_rocks(stations, builder, rng)
-    _leave_things(stations, builder, rng)
+    for fit, (fewest, most) in ((_lay_pipe, (3, 6)), (_hang_cable, (2, 4)), (_set_supports, (2, 5))):
+        for _ in range(int(stations.rng.integers(fewest, most))):
+            fit(stations)
+    for place in (_lay_rails, _hang_lamps, _drop_rocks, _leave_things):
+        place(stations)
+    return stations.builder
 
 
-def _stretch(n: int, rng: np.random.Generator, shortest: float, longest: float) -> range:
-    start, length = int(rng.integers(n)), int(n * rng.uniform(shortest, longest))
-    return range(start, start + length)
-
-
-def _lay_pipe(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _lay_pipe(stations: _Stations) -> None:
     """A pipe that follows one wall at some height, with flanges and brackets; it ends where the wall does."""
-    side, up, radius = float(rng.choice([-1.0, 1.0])), rng.uniform(0.5, 2.0), rng.uniform(0.04, 0.13)
+    rng, builder = stations.rng, stations.builder
+    side, up, radius = stations.side(), rng.uniform(0.5, 2.0), rng.uniform(0.04, 0.13)
     wall = stations.wall(side, up)
     aside = gaussian_filter1d(minimum_filter1d(wall, 5, mode="wrap"), 1.0, mode="wrap") - radius - 0.06
     aside = np.minimum(aside, wall - radius - 0.03)
-    there = (aside > stations.free_side_m + radius + 0.15) & (wall < stations.half_widths + 0.9)
+    there = (aside > _FREE_SIDE_M + radius + 0.15) & (wall < stations.half_widths + 0.9)
     goes_on = there & np.roll(there, -1) & (np.abs(np.roll(aside, -1) - aside) < 0.6)
-    stretch = _stretch(len(stations), rng, 0.25, 0.7)
+    stretch = stations.stretch(0.25, 0.7)
     for k in stretch:
         a, b = k % len(stations), (k + 1) % len(stations)
         if not goes_on[a]:
@@ -329,123 +330,100 @@ def _lay_pipe(stations: Stations, builder: Builder, rng: np.random.Generator) ->
             builder.beam(start - 1.2 * radius * UP, bracket, 0.05, 0.03)
 
 
-def _hang_cable(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _hang_cable(stations: _Stations) -> None:
     """A cable from hook to hook under the roof, sagging between them."""
-    side, share = float(rng.choice([-1.0, 1.0])), rng.uniform(0.5, 0.8)
+    side, share = stations.side(), stations.rng.uniform(0.5, 0.8)
     aside = side * np.minimum(share * stations.wall(side, 1.8), stations.half_widths)
-    for k in _stretch(len(stations), rng, 0.3, 0.9)[::3]:
+    for k in stations.stretch(0.3, 0.9)[::3]:
         a, b = k % len(stations), (k + 3) % len(stations)
         ends = np.stack([stations.at(j, aside[j], 0.0) for j in (a, b)])
         ends[:, 2] = stations.rock.roof.height_at(ends[:, :2]) - 0.06
-        t, sag = np.linspace(0.0, 1.0, 4)[:, None], rng.uniform(0.08, 0.2)
+        t, sag = np.linspace(0.0, 1.0, 4)[:, None], stations.rng.uniform(0.08, 0.2)
         points = ends[0] + t * (ends[1] - ends[0]) - 4.0 * sag * t * (1 - t) * UP
         over_way = points[:, 2].min() - max(stations.floor[a, 2], stations.floor[b, 2])
-        if abs(aside[a] - aside[b]) > 1.0 or over_way < stations.free_height_m + 0.15:
-            continue
-        for p, q in pairwise(points):
-            builder.cylinder(p, q, 0.025)
+        if abs(aside[a] - aside[b]) <= 1.0 and over_way >= _FREE_HEIGHT_M + 0.15:
+            for p, q in pairwise(points):
+                stations.builder.cylinder(p, q, 0.025)
 
 
-def _set_supports(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _set_supports(stations: _Stations) -> None:
     """Frames of two props and a cap, of round timber or of steel, at even distances over a stretch."""
-    timber, every = rng.random() < 0.55, int(rng.integers(2, 5))
+    rng, builder = stations.rng, stations.builder
+    is_timber, every = rng.random() < 0.55, int(rng.integers(2, 5))
     left, right = stations.wall(1.0, 1.0), stations.wall(-1.0, 1.0)
     thick = rng.uniform(0.16, 0.24)
-    for k in _stretch(len(stations), rng, 0.08, 0.22)[::every]:
+    for k in stations.stretch(0.08, 0.22)[::every]:
         j = k % len(stations)
         asides = (left[j] - 0.5 * thick, -(right[j] - 0.5 * thick))
         is_wide = max(left[j], right[j]) > stations.half_widths[j] + 0.6
-        if is_wide or min(asides[0], -asides[1]) < stations.free_side_m + thick:
+        if is_wide or min(asides[0], -asides[1]) < _FREE_SIDE_M + thick:
             continue
         across = np.array([stations.at(j, a, 0.0) for a in np.linspace(asides[1] + 0.3, asides[0] - 0.3, 9)])
         roof = float(stations.rock.roof.height_at(across[:, :2]).min())
-        top = max(roof - 0.03, stations.floor[j, 2] + stations.free_height_m + thick + 0.2)
-        feet = [stations.on_ground(j, a) for a in asides]
+        top = max(roof - 0.03, stations.floor[j, 2] + _FREE_HEIGHT_M + thick + 0.2)
         heads = [np.array([*stations.at(j, 0.9 * a, 0.0)[:2], top - thick]) for a in asides]
+        for aside, head in zip(asides, heads, strict=True):
+            foot = stations.on_ground(j, aside) - 0.45 * UP
+            if is_timber:
+                builder.cylinder(foot, head, 0.5 * thick)
+            else:
+                builder.beam(foot, head, 0.8 * thick, 0.8 * thick)
         lift = 0.5 * thick * UP
-        if timber:
-            for foot, head in zip(feet, heads, strict=True):
-                builder.cylinder(foot - 0.45 * UP, head, 0.5 * thick)
+        if is_timber:
             cap = 0.15 * (heads[0] - heads[1]) / np.linalg.norm(heads[0] - heads[1])
             builder.cylinder(heads[1] - cap + lift, heads[0] + cap + lift, 0.5 * thick)
         else:
-            for foot, head in zip(feet, heads, strict=True):
-                builder.beam(foot - 0.45 * UP, head, 0.8 * thick, 0.8 * thick)
             builder.beam(heads[1] + lift, heads[0] + lift, 0.8 * thick, thick)
 
 
-def _lay_rails(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _lay_rails(stations: _Stations) -> None:
     """A narrow-gauge track over part of the loop, low enough to drive along."""
-    gauge = rng.uniform(0.5, 0.65)
-    for k in _stretch(len(stations), rng, 0.2, 0.6):
+    gauge = stations.rng.uniform(0.5, 0.65)
+    for k in stations.stretch(0.2, 0.6):
         for side in (-0.5, 0.5):
-            a, b = (stations.on_ground(j % len(stations), side * gauge) + 0.05 * UP for j in (k, k + 1))
-            builder.beam(a, b, 0.05, 0.09)
-        a, b = stations.on_ground(k % len(stations), 0.5), stations.on_ground(k % len(stations), -0.5)
-        builder.beam(a, b, 0.16, 0.07)
+            a, b = (stations.on_ground(j, side * gauge) + 0.05 * UP for j in (k, k + 1))
+            stations.builder.beam(a, b, 0.05, 0.09)
+        stations.builder.beam(stations.on_ground(k, 0.5), stations.on_ground(k, -0.5), 0.16, 0.07)
 
 
-def _hang_lamps(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _hang_lamps(stations: _Stations) -> None:
     """A lamp on the wall every so often."""
-    walls = {side: stations.wall(side, 2.0) for side in (-1.0, 1.0)}
-    for k in range(0, len(stations), int(rng.integers(6, 11))):
-        side = float(rng.choice([-1.0, 1.0]))
+    walls = stations.walls(2.0)
+    for k in range(0, len(stations), int(stations.rng.integers(6, 11))):
+        side = stations.side()
         aside = walls[side][k] - 0.02
-        if stations.free_side_m + 0.3 < aside < stations.half_widths[k] + 0.5:
-            yaw = float(np.arctan2(stations.left[k, 1], stations.left[k, 0]))
-            builder.box(stations.at(k, side * aside, 2.0), (0.14, 0.32, 0.16), yaw=yaw)
+        if _FREE_SIDE_M + 0.3 < aside < stations.half_widths[k] + 0.5:
+            lamp = stations.at(k, side * aside, 2.0)
+            stations.builder.box(lamp, (0.14, 0.32, 0.16), yaw=heading(stations.left[k]))
 
 
-def _drop_rocks(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _drop_rocks(stations: _Stations) -> None:
     """Single rocks at the foot of the walls, and heaps of them."""
-    walls = {side: stations.wall(side, 0.25) for side in (-1.0, 1.0)}
-    heaps = [int(rng.integers(len(stations))) for _ in range(len(stations) // 14)]
-    places = [*rng.integers(0, len(stations), size=int(1.1 * len(stations))), *np.repeat(heaps, 12)]
-    for k in places:
-        side, size = float(rng.choice([-1.0, 1.0])), rng.uniform(0.1, 0.3) * rng.uniform(0.7, 2.0)
-        inner, outer = stations.free_side_m + 0.95 * size + 0.15, walls[side][k] - 0.3 * size
+    rng, n, walls = stations.rng, len(stations), stations.walls(0.25)
+    heaps = [int(rng.integers(n)) for _ in range(n // 14)]
+    for k in [*rng.integers(0, n, size=int(1.1 * n)), *np.repeat(heaps, 12)]:
+        side, size = stations.side(), rng.uniform(0.1, 0.3) * rng.uniform(0.7, 2.0)
+        inner, outer = _FREE_SIDE_M + 0.95 * size + 0.15, walls[side][k] - 0.3 * size
         if inner >= outer:
             continue
-        aside = side * max(inner, outer - abs(rng.normal(0.0, 0.35)))
-        spot = stations.on_ground(int(k), aside)
+        spot = stations.on_ground(int(k), side * max(inner, outer - abs(rng.normal(0.0, 0.35))))
         spot[:2] += rng.uniform(-0.3, 0.3) * np.array([stations.left[k, 1], -stations.left[k, 0]])
-        if not stations.is_beside(spot, 0.95 * size):
-            continue
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        turn[:, 0] *= np.sign(np.linalg.det(turn))
-        builder.box(spot + 0.22 * size * UP, size * rng.uniform(0.5, 1.1, 3), R=turn)
+        if stations.is_beside(spot, 0.95 * size):
+            turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+            turn[:, 0] *= np.sign(np.linalg.det(turn))
+            stations.builder.box(spot + 0.22 * size * UP, size * rng.uniform(0.5, 1.1, 3), R=turn)
 
 
-def _leave_things(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
+def _leave_things(stations: _Stations) -> None:
     """Barrels, crates and planks where the tunnel is wide enough."""
-    walls = {side: stations.wall(side, 0.5) for side in (-1.0, 1.0)}
+    rng, builder, walls = stations.rng, stations.builder, stations.walls(0.5)
     for k in rng.permutation(len(stations))[: len(stations) // 4]:
-        side, size = float(rng.choice([-1.0, 1.0])), rng.uniform(0.5, 0.75)
+        side, size = stations.side(), rng.uniform(0.5, 0.75)
         aside = walls[side][k] - 0.5 * size
-        if aside - 0.75 * size < stations.free_side_m + 0.12:
-            continue
         foot = stations.on_ground(int(k), side * aside)
-        if not stations.is_beside(foot, 0.7 * size):
+        if aside - 0.75 * size < _FREE_SIDE_M + 0.12 or not stations.is_beside(foot, 0.7 * size):
             continue
         if rng.random() < 0.5:
             builder.cylinder(foot - 0.4 * UP, foot + 0.85 * UP, 0.29)
         else:
             builder.box(foot + 0.3 * size * UP, (size, 0.8 * size, 1.4 * size), yaw=rng.uniform(0.0, np.pi))
-
-
-_WAYPOINT_M = 1.5
-_FREE_SIDE_M, _FREE_HEIGHT_M = 0.8, 2.05
-
-
-def build(seed: int) -> World:
-    """The tunnel of that seed: ground and roof as height fields that meet in the walls, a loop of 150 to 300 m."""
-    rng = np.random.default_rng(seed)
-    plan = draw_mine(rng)
-    rock = carve(plan, rng)
-    builder = Builder()
-    loop = plan.galleries[0]
-    fit_out(place_stations(loop, rock, _FREE_SIDE_M, _FREE_HEIGHT_M), builder, rng)
-    waypoints = loop.line[:: round(_WAYPOINT_M / SPACING_M)].copy()
-    waypoints[:, 2] = rock.ground.height_at(waypoints[:, :2])
-    route = Route(waypoints, 0.4, _FREE_SIDE_M, _FREE_HEIGHT_M, 1.5)
-    return World("tunnel", seed, route, *builder.solids, (rock.ground, rock.roof))
