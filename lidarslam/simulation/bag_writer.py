@@ -2,7 +2,7 @@
 
 import heapq
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -39,57 +39,33 @@ class DriverCloud:
     topic: str  # the driver's defaults
     frame_id: str
     record: np.dtype[np.void]  # type of a point, padding included
-    columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # besides x, y, z, by the sweep and its stamp_ns
     imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one next to it
     imu_frame_id: str = "imu_link"
     message_type: str = POINT_CLOUD2_TYPE
 
     def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
         """The points (N,) of a sweep whose message is stamped `stamp_ns`."""
-        records = np.zeros(len(simulated.scan), self.record)
-        for column, axis in enumerate("xyz"):
-            records[axis] = simulated.scan.points[:, column]
-        for name, values in self.columns(simulated, stamp_ns).items():
-            records[name] = values
+        scan = simulated.scan
+        offsets = np.zeros(len(scan)) if scan.time_offsets is None else scan.time_offsets
+        rings = 0 if scan.rings is None else scan.rings
+        columns: dict[str, ArrayLike] = {
+            **dict(zip("xyz", scan.points.T, strict=True)),
+            "intensity": simulated.intensities,  # whole numbers from 0 to 255, the scale of all four drivers
+            "reflectivity": simulated.intensities,
+            "ring": rings,
+            "line": rings,
+            "tag": _FIRST_RETURN,
+            "time": offsets,
+            "timestamp": stamp_ns / 10**9 + offsets,
+            "t": np.round(1e9 * offsets),
+            "offset_time": np.round(1e9 * offsets),
+            "range": np.round(1e3 * np.linalg.norm(scan.points, axis=1)),
+            "ambient": 0,  # sunlight: the simulated night is dark
+        }
+        records = np.zeros(len(scan), self.record)
+        for name in self.record.names or ():
+            records[name] = columns[name]
         return records
-
-
-def _offsets(simulated: SimulatedScan) -> NDArray[np.float64]:
-    offsets = simulated.scan.time_offsets
-    return np.zeros(len(simulated.scan)) if offsets is None else offsets
-
-
-def _rings(simulated: SimulatedScan) -> ArrayLike:
-    return 0 if simulated.scan.rings is None else simulated.scan.rings
-
-
-# Intensities are whole numbers from 0 to 255, the scale of all four drivers.
-def _velodyne(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
-    return {"intensity": simulated.intensities, "ring": _rings(simulated), "time": _offsets(simulated)}
-
-
-def _ouster(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
-    return {  # `ambient`, sunlight, stays zero: the simulated night is dark
-        "intensity": simulated.intensities,
-        "t": np.round(1e9 * _offsets(simulated)),
-        "reflectivity": simulated.intensities,
-        "ring": _rings(simulated),
-        "range": np.round(1e3 * np.linalg.norm(simulated.scan.points, axis=1)),
-    }
-
-
-def _hesai(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:
-    timestamps = stamp_ns / 10**9 + _offsets(simulated)
-    return {"intensity": simulated.intensities, "ring": _rings(simulated), "timestamp": timestamps}
-
-
-def _livox(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
-    return {
-        "offset_time": np.round(1e9 * _offsets(simulated)),
-        "reflectivity": simulated.intensities,
-        "tag": _FIRST_RETURN,
-        "line": _rings(simulated),
-    }
 
 
 _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
@@ -110,12 +86,10 @@ _HESAI_POINT = np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("timesta
 _LIVOX_POINT = np.dtype([("offset_time", "<u4"), *_XYZ, ("reflectivity", "|u1"), ("tag", "|u1"), ("line", "|u1")])
 
 DRIVERS: dict[str, DriverCloud] = {
-    "velodyne": DriverCloud("/velodyne_points", "velodyne", _VELODYNE_POINT, _velodyne),
-    "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, _ouster, "/ouster/imu", "os_imu"),
-    "hesai": DriverCloud("/lidar_points", "hesai_lidar", _HESAI_POINT, _hesai),
-    "livox": DriverCloud(
-        "/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, "/livox/imu", "livox_imu", _CUSTOM_MESSAGE
-    ),
+    "velodyne": DriverCloud("/velodyne_points", "velodyne", _VELODYNE_POINT),
+    "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, "/ouster/imu", "os_imu"),
+    "hesai": DriverCloud("/lidar_points", "hesai_lidar", _HESAI_POINT),
+    "livox": DriverCloud("/livox/lidar", "livox_frame", _LIVOX_POINT, "/livox/imu", "livox_imu", _CUSTOM_MESSAGE),
 }
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -151,8 +125,7 @@ def write_bag(
         write_chunk_checksums(folder / f"{folder.name}.mcap")
 
 
-Messages = Iterator[tuple[Any, int, bytes]]
-"""Connection, time of recording in nanoseconds, and bytes of messages in the order of time."""
+Messages = Iterator[tuple[Any, int, bytes]]  # connection, time of recording in nanoseconds, bytes; in order of time
 
 
 def _clouds(

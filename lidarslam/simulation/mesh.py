@@ -182,7 +182,7 @@ def _cut(pieces: Pieces, size: float) -> Pieces:
 
 
 def _together(parts: list[Pieces]) -> Pieces:
-    return Pieces(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "starts", "ends")))
+    return Pieces(*map(np.concatenate, zip(*((part.corners, part.starts, part.ends) for part in parts), strict=True)))
 
 
 def _place(pieces: Pieces, size: float) -> NDArray[np.int64]:
@@ -213,22 +213,18 @@ class Caster:
         import open3d as o3d
 
         mesh = mesh or world_mesh(world)
-        corners = mesh.vertices[mesh.triangles].reshape(-1, 3) if len(mesh.triangles) else np.zeros((1, 3))
+        corners = mesh.vertices[mesh.triangles].reshape(-1, 3)
         self._middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         self._movers = [mover for mover in world.movers if len(mover.boxes)]
         self._tensor = o3d.core.Tensor.from_numpy
         self._scene: Any = o3d.t.geometry.RaycastingScene()
-        self._is_filled = len(mesh.triangles) > 0
-        if self._is_filled:
-            self._scene.add_triangles(
-                self._tensor((mesh.vertices - self._middle).astype(np.float32)),
-                self._tensor(np.ascontiguousarray(mesh.triangles, dtype=np.uint32)),
-            )
+        self._scene.add_triangles(
+            self._tensor((mesh.vertices - self._middle).astype(np.float32)),
+            self._tensor(np.ascontiguousarray(mesh.triangles, dtype=np.uint32)),
+        )
 
     def distances(self, points: FloatArray) -> FloatArray:
         """Distances (N,) of points (N, 3) from the nearest static surface, from either side of it."""
-        if not self._is_filled:
-            return np.full(len(points), np.inf)
         found = self._scene.compute_distance(self._tensor((points - self._middle).astype(np.float32)))
         return np.asarray(found.numpy(), dtype=np.float64)
 

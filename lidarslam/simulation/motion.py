@@ -196,8 +196,6 @@ def find_carrier(name: str) -> Carrier:
 
 def mount_pose(name: str, height_m: float) -> FloatArray:
     """T_body_lidar (4, 4) of a LiDAR mounted so, that far above the body's origin."""
-    from scipy.spatial.transform import Rotation
-
     R = Rotation.from_rotvec(np.deg2rad(choose("mount", name, MOUNTS))).as_matrix()
     return make_transform(R, [0.0, 0.0, height_m])
 
@@ -249,14 +247,14 @@ def motion_along(
 ) -> Motion:
     """Follow a trajectory in its own time, on smooth splines; after the last pose the body stays where it is.
 
-    The trajectory's world frame is the world's; the world has to be made around it (`worlds.street.along`), or the
-    path be checked (`path_clearance`).
+    The trajectory's world frame is the world's; the world has to be made around it (`worlds.along`), or the path be
+    checked (`record.check_clearance`).
 
     Args:
         trajectory: poses of a frame with x forwards and z up.
         world: gives the ground, if the motion is on it.
-        on_ground: take position and heading from the trajectory, height, roll and pitch from the ground under the
-            carrier; else take the poses as they are, for aircraft and hand-held sensors.
+        on_ground: take height, roll and pitch from the ground under the carrier; else take the poses as they are, for
+            aircraft and hand-held sensors.
         carrier: whose footprint and sensor height are meant when on the ground.
         smoothing_s: time within which the trajectory's noise is evened out: centimetres of a GPS receiver at 10 Hz
             are accelerations far beyond a car's, which 0.25 s removes. 0 passes through every pose.

@@ -21,7 +21,7 @@ from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum, wr
 from lidarslam.simulation.mesh import world_mesh
 from lidarslam.simulation.motion import Carrier, Motion, find_carrier, motion_along, mount_pose
 from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_s
-from lidarslam.simulation.reference_map import KeyArray, ReferenceMap, SeenSurfaces, sample_seen
+from lidarslam.simulation.reference_map import KeyArray, SeenSurfaces, sample_seen
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import Sensor, find_sensor
 from lidarslam.simulation.world import World, build_world
@@ -170,19 +170,26 @@ _IMU = """\
 
 
 def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
-    """The README as Markdown."""
+    """The README as Markdown; its command makes the same recording again."""
+    made = find_format(request.format)
+    words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
+    words += ["--trajectory", str(request.trajectory)] if request.trajectory is not None else []
+    words += ["--motion", request.motion]
+    words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
+    words += ["--mount", request.mount, "--scans", str(summary.scans), "--seed", str(request.seed)]
+    words += ["--imu"] if request.imu else []
     return _README.format(
-        **vars(request) | vars(summary) | {"imu": _imu(request)},
+        **vars(request) | vars(summary) | {"imu": _IMU.format(where=made.imu) if request.imu else ""},
         made_by=MADE_BY,
         version=version("lidarslam"),
-        simulate=_simulate_command(request, summary),
+        simulate=command_line(*words, "--format", request.format),
         moved=request.moved,
-        layout=find_format(request.format).layout,
+        layout=made.layout,
         ground_truth=GROUND_TRUTH,
         reference_map=REFERENCE_MAP,
         spacing=small_length(summary.map_spacing_m),
         info=command_line("lidarslam", "info", str(summary.source)),
-        run=_run_command(summary),
+        run=command_line("lidarslam", "run", str(summary.source)),
     )
 
 
@@ -194,28 +201,9 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
         f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points per scan,"
         f" reference map of {summary.map_points:,} points",
         f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what",
-        f"next: {_run_command(summary, as_typed('lidarslam'))}",
+        f"next: {command_line(as_typed('lidarslam'), 'run', str(summary.source))}",
     )
     return joined(lines)
-
-
-def _imu(request: RecordRequest) -> str:
-    return _IMU.format(where=find_format(request.format).imu) if request.imu else ""
-
-
-def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
-    """The command that makes the same recording again."""
-    words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
-    words += ["--trajectory", str(request.trajectory)] if request.trajectory is not None else []
-    words += ["--motion", request.motion]
-    words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
-    words += ["--mount", request.mount, "--scans", str(summary.scans), "--seed", str(request.seed)]
-    words += ["--imu"] if request.imu else []
-    return command_line(*words, "--format", request.format)
-
-
-def _run_command(summary: RecordingSummary, program: str = "lidarslam") -> str:
-    return command_line(program, "run", str(summary.source))
 
 
 _TIME_STEP_S = 0.02
@@ -227,28 +215,22 @@ def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None
 
     The body is a ball of the carrier's half width round the sensor; on the ground, one above the wheels as well.
 
-    Args:
-        simulation: whose motion follows the trajectory.
-        carrier: moves along it.
-        name: of the trajectory, for the message.
-
     Raises:
-        InputError: the path leads through something solid or off the world's ground; the message has place and time.
+        InputError: the path leads through something solid or off the world's ground; the message has the trajectory's
+            name, place and time.
     """
     world = simulation.world
     times = np.arange(0.0, simulation.scan_count / simulation.sensor.rate_hz + _TIME_STEP_S, _TIME_STEP_S)
     positions = simulation.motion.pose_at(times)[:, :3, 3]
-    on_ground = [carrier.half_width_m + _LOWEST_M, carrier.sensor_height_m]
     is_blocked = np.zeros(len(times), dtype=bool)
-    for height in on_ground if carrier.leans_with_ground else [0.0]:
+    on_ground = (carrier.half_width_m + _LOWEST_M, carrier.sensor_height_m)
+    for height in on_ground if carrier.leans_with_ground else (0.0,):
         body = positions + np.array([0.0, 0.0, height])
         is_blocked |= simulation.distance_to_surfaces(body) < carrier.half_width_m
         # A surface cannot be crossed without coming near it, so that only the start can be deep inside something.
-        is_blocked[0] |= is_inside(world, body[0])
-    for refused, whither in (
-        (is_blocked, "through something solid"),
-        (_is_off_ground(world, positions), "off the ground"),
-    ):
+        is_blocked[0] |= _is_inside(world, body[0])
+    is_off = _is_off_ground(world, positions)
+    for refused, whither in ((is_blocked, "through something solid"), (is_off, "off the ground")):
         if refused.any():
             x, y, z = positions[refused.argmax()]
             raise InputError(
@@ -257,7 +239,7 @@ def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None
             )
 
 
-def is_inside(world: World, point: FloatArray) -> bool:
+def _is_inside(world: World, point: FloatArray) -> bool:
     """Whether a point (3,) is inside a box or a cylinder, under the ground, or above the ceiling of a tunnel."""
     boxes, cylinders = world.boxes, world.cylinders
     local = np.einsum("nji,nj->ni", boxes.R_world_box, point - boxes.centres)
@@ -403,18 +385,13 @@ def _chunk(task: tuple[RecordRequest, range]) -> tuple[list[SimulatedScan], KeyA
     return made, seen.keys()
 
 
-@lru_cache(maxsize=1)
-def _simulation_of_process(request: RecordRequest) -> Simulation:
-    """Built once in each process."""
-    return make_simulation(request)
+_simulation_of_process = lru_cache(maxsize=1)(make_simulation)  # built once in each process
 
 
-Progress = Callable[[int, int], None]
-"""Called after every scan with its number from 1 and how many there will be."""
-
-
-def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
+def record(request: RecordRequest, progress: Callable[[int, int], None]) -> RecordingSummary:
     """Make the recording's folder; it appears when everything in it is complete.
+
+    After every scan `progress` is called with its number from 1 and how many there will be.
 
     Raises:
         InputError: no world, sensor, motion, mount or format has that name, the format holds no IMU, or the
@@ -442,7 +419,8 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
         stamps = np.array([clock_s(stamp, chosen.clock_start_ns) for stamp in truth.stamps])
         write_tum(folder / GROUND_TRUTH, Trajectory(stamps, truth.T_world_lidar))
         true_map = sample_seen(world_mesh(simulation.world), seen, spacing_m)
-        _write_map(folder / REFERENCE_MAP, true_map)
+        columns = zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack(true_map).T, strict=True)
+        write_ply(folder / REFERENCE_MAP, as_records({name: ("<f4", values) for name, values in columns}))
         summary = RecordingSummary(
             source=chosen.source_in(request.out),
             rate_hz=sensor.rate_hz,
@@ -456,8 +434,3 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
         )
         (folder / README).write_text(format_readme(request, summary), encoding="utf-8")
     return summary
-
-
-def _write_map(path: Path, true_map: ReferenceMap) -> None:
-    columns = zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack(true_map).T, strict=True)
-    write_ply(path, as_records({name: ("<f4", values) for name, values in columns}))

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.imu import GRAVITY
-from lidarslam.simulation.motion import CHANNELS, Carrier, Motion, Sway, Swing, find_carrier, ground_under
+from lidarslam.simulation.motion import CHANNELS, Carrier, Motion, Sway, find_carrier, ground_under
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.paths import lengths_along, turning_angles
 
@@ -110,17 +110,11 @@ TIME_STEP_S = 0.01
 def rest_to_rest(
     positions: FloatArray, speed_limits: FloatArray, acceleration: float, smoothing_s: float
 ) -> FloatArray:
-    """Positions (N,) at steps of `TIME_STEP_S` on the fastest motion that keeps the limits.
+    """Positions (N,) at steps of `TIME_STEP_S` on the fastest motion that keeps the limits (M,) at positions (M,).
 
     The fastest motion has constant acceleration between the limits; averaged in time over a window of `smoothing_s`
     to either side it keeps both limits on speed and acceleration (an average of values within a limit is within it
     too), and its acceleration is continuous.
-
-    Args:
-        positions: (M,) increasing from 0.
-        speed_limits: (M,) positive, at the positions.
-        acceleration: of speeding up and slowing down.
-        smoothing_s: half the window; the window's weights are (1 - x^2)^2.
     """
     limits = speed_limits.copy()
     limits[[0, -1]] = 0.0
@@ -147,12 +141,6 @@ def round_and_round(
     travelled = _travelled(positions, speeds, times, float(times[-1]) / steps * np.arange(steps + 1, dtype=np.float64))
     smooth = smoothed(np.concatenate([travelled[:-1] - lap, travelled, travelled[1:] + lap]), smoothing_s)
     return np.asarray(smooth[steps : 2 * steps + 1] - smooth[steps])
-
-
-def travelled_at(lengths: FloatArray, parameters: FloatArray, travelled: FloatArray) -> FloatArray:
-    """Parameters (N,) of a path at travelled lengths (N,), from those (M,) at increasing lengths (M,); never back."""
-    found = CubicSpline(lengths, parameters)(travelled)
-    return np.clip(np.maximum.accumulate(found), parameters[0], parameters[-1])
 
 
 def _within_acceleration(positions: FloatArray, speed_limits: FloatArray, acceleration: float) -> FloatArray:
@@ -225,18 +213,16 @@ def _seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
     """The carrier's sines with random phases, frequencies within a tenth and amplitudes within a fifth of nominal."""
     gait = rng.uniform(0.9, 1.1)
 
-    def frequency(swing: Swing) -> float:
-        return swing.frequency_hz * (gait if swing.stepwise else rng.uniform(0.9, 1.1))
-
-    def amplitude(swing: Swing) -> float:
-        size = swing.amplitude * rng.uniform(0.8, 1.2)
-        return float(np.deg2rad(size)) if swing.axis in ("roll", "pitch", "yaw") else size
-
+    sines = carrier.sway
+    sizes = [swing.amplitude * rng.uniform(0.8, 1.2) for swing in sines]
     return Sway(
-        tuple(CHANNELS.index(swing.axis) for swing in carrier.sway),
-        tuple(amplitude(swing) for swing in carrier.sway),
-        tuple(frequency(swing) for swing in carrier.sway),
-        tuple(rng.uniform(0.0, 2.0 * np.pi) for _ in carrier.sway),
+        tuple(CHANNELS.index(swing.axis) for swing in sines),
+        tuple(
+            float(np.deg2rad(size)) if swing.axis in ("roll", "pitch", "yaw") else size
+            for swing, size in zip(sines, sizes, strict=True)
+        ),
+        tuple(swing.frequency_hz * (gait if swing.stepwise else rng.uniform(0.9, 1.1)) for swing in sines),
+        tuple(rng.uniform(0.0, 2.0 * np.pi) for _ in sines),
     )
 
 
@@ -302,7 +288,8 @@ def _drive(carrier: Carrier, world: World, vertices: FloatArray, is_closed: bool
     limits = np.minimum(np.sqrt(carrier.side_acceleration / bend), np.deg2rad(carrier.turn_rate_deg) / bend)
     limits = np.minimum(limits, min(carrier.speed_mps, route.speed_limit_mps))
     profile = round_and_round if is_closed else rest_to_rest
-    u = travelled_at(s, u, profile(s, limits, carrier.acceleration, carrier.smoothing_s))
+    travelled = CubicSpline(s, u)(profile(s, limits, carrier.acceleration, carrier.smoothing_s))
+    u = np.clip(np.maximum.accumulate(travelled), u[0], u[-1])  # never back
     where, first, _ = path.at(u)
     # A ramp's foot is rounded by no more than the body's own length.
     lift, climb, _ = RoundedPath(vertices, np.minimum(windows, 2.0 * carrier.footprint_m)).at(u)

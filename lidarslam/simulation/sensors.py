@@ -25,6 +25,16 @@ class Rays(NamedTuple):
     rings: NDArray[np.int32]  # (N,) the laser
 
 
+def _rays(azimuth: FloatArray, elevation: FloatArray, fractions: FloatArray, rings: NDArray[np.int64]) -> Rays:
+    """Rays from azimuths, counter-clockwise from x, and elevations, upwards, which broadcast to (columns, lasers)."""
+    azimuth, elevation, fractions, rings = (
+        array.ravel() for array in np.broadcast_arrays(azimuth, elevation, fractions, rings)
+    )
+    level = np.cos(elevation)
+    directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return Rays(directions, fractions, rings.astype(np.int32))
+
+
 @dataclass(frozen=True, eq=False)
 class Spinning:
     """A column of lasers that turns once a sweep."""
@@ -52,9 +62,7 @@ class Spinning:
         fractions = (np.arange(self.columns)[:, None] + self.firing[order]) / self.columns
         turned = (-2.0 if self.clockwise else 2.0) * np.pi * fractions
         azimuth = np.deg2rad(self.start_azimuth_deg + self.azimuth_offsets_deg[order]) + turned
-        elevation = np.broadcast_to(np.deg2rad(self.elevations_deg[order]), azimuth.shape)
-        rings = np.broadcast_to(order.astype(np.int32), azimuth.shape)
-        return Rays(directions(azimuth.ravel(), elevation.ravel()), fractions.ravel(), rings.ravel())
+        return _rays(azimuth, np.deg2rad(self.elevations_deg[order]), fractions, order)
 
     def rays(self, scan_index: int) -> Rays:  # noqa: ARG002  every turn is like the other
         """The rays of one turn, the same arrays for each."""
@@ -94,9 +102,8 @@ class Rosette:
         low, high = np.deg2rad(self.elevation_range_deg)
         above = np.deg2rad(self.laser_step_deg) * number
         elevation = low + rising * (high - low - above[-1]) + above
-        azimuth = np.broadcast_to(np.pi - 2.0 * np.pi * np.mod(self.turns_per_sweep * sweeps, 1.0), elevation.shape)
-        rings = np.tile(np.arange(self.lasers, dtype=np.int32), self.columns)
-        return Rays(directions(azimuth.ravel(), elevation.ravel()), np.repeat(fractions, self.lasers), rings)
+        azimuth = np.pi - 2.0 * np.pi * np.mod(self.turns_per_sweep * sweeps, 1.0)
+        return _rays(azimuth, elevation, fractions[:, None], number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,19 +132,12 @@ class RisleyPrisms:
         radius = 0.5 * np.deg2rad(self.radius_deg)
         steps = np.deg2rad(self.laser_step_deg) * (np.arange(self.lasers) - 0.5 * (self.lasers - 1))
         elevation = radius * (np.sin(one) - np.sin(other))[:, None] + steps
-        azimuth = np.repeat(radius * (np.cos(one) + np.cos(other)), self.lasers)
-        rings = np.tile(np.arange(self.lasers, dtype=np.int32), self.columns)
-        return Rays(directions(azimuth, elevation.ravel()), np.repeat(fractions, self.lasers), rings)
+        azimuth = (radius * (np.cos(one) + np.cos(other)))[:, None]
+        return _rays(azimuth, elevation, fractions[:, None], np.arange(self.lasers))
 
 
 ScanPattern = Spinning | Rosette | RisleyPrisms
 """A LiDAR's optics: `columns` shots a sweep of `lasers` rays each, `column_angle` between two shots of a laser."""
-
-
-def directions(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) of azimuths (N,), counter-clockwise from x, and elevations (N,), upwards; radians."""
-    level = np.cos(elevation)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 Driver = Literal["velodyne", "ouster", "hesai", "livox"]
@@ -230,12 +230,6 @@ def _ouster(altitudes_deg: FloatArray, azimuths_deg: list[float], columns: int) 
     return Spinning(altitudes_deg, offsets, np.zeros(len(altitudes_deg)), columns)
 
 
-def _hesai_32(columns: int) -> Spinning:
-    """XT32: 15 to -16 degrees in steps of one, 1.512 us from laser to laser, 50 us from column to column."""
-    firing = np.asarray(1.512 * np.arange(32) / 50.0, dtype=np.float64)
-    return Spinning(np.arange(15.0, -17.0, -1.0), np.zeros(32), firing, columns, start_azimuth_deg=90.0)
-
-
 # Range limits: VLP-16 100 m, HDL-32E 80 to 100 m, HDL-64E 120 m, OS0 50 m and OS1 120 m at 80 % reflectivity,
 # XT32 120 m, Mid-360 70 m and Avia 320 m at 80 %. Packets of Velodyne count 2 mm, Hesai 4 mm, Ouster and Livox 1 mm.
 _VELODYNE_SMALL = RangeModel(0.4, 100.0, 0.010, 0.00020, 0.0030, 0.002)
@@ -253,6 +247,8 @@ _VLP_16 = _one_column(np.arange(-15.0, 16.0, 2.0), 1800, 0.0, 16 * 2.304 / 55.29
 _HDL_32 = _one_column(np.linspace(-30.67, 10.67, 32), 2170, 0.0, 32 * 1.152 / 46.08)
 # the first generation's design values: 33.2 degrees
 _OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024)
+# 15 to -16 degrees in steps of one, 1.512 us from laser to laser, 50 us from column to column
+_XT32_COLUMN = Spinning(np.arange(15.0, -17.0, -1.0), np.zeros(32), 1.512 * np.arange(32.0) / 50.0, 2000, 90.0)
 # after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
 _ROSETTE = Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5)
 # The same view as strokes of four lasers together, some ten degrees of azimuth apart, a turn a sweep.
@@ -273,7 +269,7 @@ _TABLE = (
     Sensor("os0-64", "ouster", 10.0, _ouster(_OS0_64_DEG, [9.2, -3.0], 1024), _OS0),
     Sensor("os1-64", "ouster", 10.0, _OS1_64_COLUMN, _OS1_64),
     Sensor("os1-128", "ouster", 10.0, _ouster(_OS1_128_DEG, [4.21, 1.41, -1.40, -4.21], 1024), _OS1_128),
-    Sensor("xt32", "hesai", 10.0, _hesai_32(2000), _XT32),
+    Sensor("xt32", "hesai", 10.0, _XT32_COLUMN, _XT32),
     Sensor("livox", "livox", 10.0, _ROSETTE, _MID_360),
     Sensor("mid-360", "livox", 10.0, _STROKES, _MID_360, has_rings=False),
     Sensor("avia", "livox", 10.0, _AVIA, _AVIA_RANGES, has_rings=False),

@@ -18,7 +18,7 @@ SCANS = 3
 
 @pytest.fixture(scope="module")
 def drawn() -> list[Excerpt]:
-    return list(mixture(len(MIXED_WORLDS), SCANS, SEED))
+    return list(mixture(2, SCANS, SEED))
 
 
 @dataclass
@@ -63,17 +63,14 @@ def simulation(excerpt: Excerpt) -> Simulation:
     return excerpt.whole
 
 
-def test_all_worlds_appear_as_their_ingredients_say(drawn):
-    drawn_names = []
+def test_recordings_are_as_their_ingredients_say(drawn):
     for number, excerpt in enumerate(drawn):
         of, made = ingredients_of(number, SEED), simulation(excerpt)
-        drawn_names.append((of.world, of.sensor, of.carrier))
-        assert drawn_names[-1] == (made.world.name, made.sensor.name, made.motion.name)
+        assert (of.world, of.sensor, of.carrier) == (made.world.name, made.sensor.name, made.motion.name)
         assert of.mount in MOUNTS
-    worlds, sensors, carriers = map(set, zip(*drawn_names, strict=True))
-    assert worlds == set(MIXED_WORLDS)
-    assert min(len(sensors), len(carriers)) > 2
-    assert len({excerpt.name for excerpt in drawn}) == len(drawn)
+    drawn_names = [vars(ingredients_of(number, SEED)) for number in range(len(MIXED_WORLDS))]
+    assert {of["world"] for of in drawn_names} == set(MIXED_WORLDS)
+    assert min(len({of[kind] for of in drawn_names}) for kind in ("sensor", "carrier")) > 2
 
 
 def test_the_draw_of_a_number_does_not_change():

@@ -9,9 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, is_rigid, make_transform
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion import CARRIERS, Sway, motion_along
-from lidarslam.simulation.route_motion import (
-    motion_along_route,
-)
+from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import Route, World
 
 STEP_S = 0.005

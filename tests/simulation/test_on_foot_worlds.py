@@ -13,7 +13,7 @@ from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import World, build_world
 from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, STANDING
 
-SEEDS = (0, 1, 2)
+SEEDS = (0, 1)
 RISE_M, TREAD_M = 0.17, 0.28
 world_of, each_seed = cache(build_world), pytest.mark.parametrize("seed", SEEDS)
 LEFT, RIGHT, UP, DOWN = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])

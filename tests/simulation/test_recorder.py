@@ -49,7 +49,7 @@ def same_bytes(a, b):
 def test_exact_scans_lie_on_the_surfaces(sensor, mount, simulation, distance_to_yard):
     model = replace(find_sensor(sensor), ranging=EXACT)
     simulated = exact(replace(simulation, sensor=model, T_body_lidar=mount_pose(mount, 0.6)))
-    for index in (0, 37, 120):
+    for index in (0, 120):
         sweep = simulated.scan(index)
         points = in_world(simulated, sweep.scan)[~sweep.moving]
         assert len(points) > 3000

@@ -35,10 +35,18 @@ def yard_map(recording):
     return reference_map(recording, spacing_m=0.15, step=40)
 
 
+def see(x, y, z, normal=(0.0, 0.0, 1.0), from_behind=False):
+    """Surfaces seen at the nodes of a grid, and the nodes."""
+    seen, points = SeenSurfaces(), grid(x, y, z)
+    seen.add(points, np.tile(normal, (len(points), 1)), np.full(len(points), from_behind))
+    return seen, points
+
+
+ALL = np.arange(0.05, 10.0, 0.1)
+
+
 def test_samples_are_even():
-    seen = SeenSurfaces()
-    points = grid(np.arange(0.05, 10.0, 0.1), np.arange(0.05, 10.0, 0.1), [0.0])
-    seen.add(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.zeros(len(points), dtype=bool))
+    seen, points = see(ALL, ALL, [0.0])
     sampled = sample_seen(SQUARE, seen, spacing_m=0.1).points
     assert abs(len(sampled) - 10_000) < 10
     np.testing.assert_array_equal(sampled[:, 2], 0.0)
@@ -49,9 +57,7 @@ def test_samples_are_even():
 
 
 def test_only_what_was_seen_is_kept():
-    seen = SeenSurfaces(voxel_m=0.2)
-    points = grid(np.arange(0.05, 5.0, 0.1), np.arange(0.05, 10.0, 0.1), [0.0])
-    seen.add(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.zeros(len(points), dtype=bool))
+    seen, _ = see(np.arange(0.05, 5.0, 0.1), ALL, [0.0])
     sampled = sample_seen(SQUARE, seen, spacing_m=0.1).points
     assert 5.0 < sampled[:, 0].max() < 5.4
     assert len(sample_seen(SQUARE, SeenSurfaces(), 0.1).points) == 0
@@ -59,18 +65,14 @@ def test_only_what_was_seen_is_kept():
 
 def test_the_far_side_of_a_wall_stays_out():
     wall = box_mesh(Boxes(np.array([[0.0, 0.0, 1.0]]), np.array([[0.05, 4.0, 1.0]]), np.eye(3)[None]))
-    seen = SeenSurfaces(voxel_m=0.2)
-    points = grid([0.05], np.arange(-4.0, 4.0, 0.1), np.arange(0.0, 2.0, 0.1))
-    seen.add(points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), np.zeros(len(points), dtype=bool))
+    seen, _ = see([0.05], np.arange(-4.0, 4.0, 0.1), np.arange(0.0, 2.0, 0.1), normal=(1.0, 0.0, 0.0))
     sampled, normals = sample_seen(wall, seen, spacing_m=0.05)
     np.testing.assert_allclose(sampled[:, 0], 0.05, atol=1e-12)
     np.testing.assert_allclose(normals, np.tile([1.0, 0.0, 0.0], (len(normals), 1)), atol=1e-12)
 
 
 def test_normals_are_of_the_side_that_was_seen():
-    seen = SeenSurfaces()
-    points = grid(np.arange(0.05, 10.0, 0.1), np.arange(0.05, 10.0, 0.1), [0.0])
-    seen.add(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.ones(len(points), dtype=bool))  # a ceiling
+    seen, _ = see(ALL, ALL, [0.0], from_behind=True)  # a ceiling
     normals = sample_seen(SQUARE, seen, spacing_m=0.2).normals
     np.testing.assert_allclose(normals, np.tile([0.0, 0.0, -1.0], (len(normals), 1)), atol=1e-12)
 

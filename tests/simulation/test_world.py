@@ -17,11 +17,6 @@ def test_a_plane_has_its_height_everywhere(rng):
     np.testing.assert_allclose(field.height_at(xy), expected, atol=1e-12)
 
 
-def test_cells_are_split_from_the_lowest_to_the_highest_corner():
-    field = HeightField(np.zeros(2), 1.0, np.array([[0.0, 0.0], [1.0, 0.0]]))
-    np.testing.assert_allclose(field.height_at(np.array([[0.5, 0.5], [0.75, 0.25], [0.25, 0.75]])), [0.0, 0.5, 0.0])
-
-
 def test_outside_its_grid_a_field_goes_on_level():
     field = HeightField(np.zeros(2), 1.0, np.array([[0.0, 1.0], [2.0, 3.0]]))
     np.testing.assert_allclose(field.height_at(np.array([[-5.0, -5.0], [9.0, 9.0], [9.0, 0.0]])), [0.0, 3.0, 2.0])

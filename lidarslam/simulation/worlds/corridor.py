@@ -92,7 +92,6 @@ def _draw_yard(yard: Room, grounds: Grounds) -> None:
 
 
 def _plant_yard(yard: Room, grounds: Grounds, clearance: Clearance) -> None:
-    """Trees, lamp posts and benches off the path."""
     rng = grounds.rng
     for k in range(14):
         where = rng.uniform(yard.low + np.array([2.0, 2.5]), yard.high - 2.5)

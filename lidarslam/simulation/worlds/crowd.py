@@ -53,7 +53,6 @@ def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Gene
 
 
 def _furnish(room: Room, height: float, put: Furnisher) -> None:
-    """Pillars and a counter first, then seats, tables, cabinets and plants."""
     for _ in range(10):
         put.at_wall(room, put.drawn((0.4, (0.15, 0.3), height)), interior.pilaster)
     put.at_wall(room, (4.0, 0.7, 2.2), interior.counter)

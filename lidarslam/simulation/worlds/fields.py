@@ -90,7 +90,6 @@ def _fences(grounds: Grounds) -> None:
 
 
 def _barn(grounds: Grounds) -> None:
-    """One barn with a pitched roof, at some distance from the road."""
     rng, road = grounds.rng, grounds.path
     where, yaw = road[0], 0.0
     while grounds.off_path(where) < 22.0:
@@ -108,7 +107,6 @@ def _barn(grounds: Grounds) -> None:
 
 
 def _bales(grounds: Grounds) -> None:
-    """Round bales, lying about two parcels."""
     rng = grounds.rng
     for at in rng.integers(0, len(grounds.path), 2):
         middle, _ = grounds.beside(at, beside(rng, 25.0, 35.0))
@@ -121,7 +119,6 @@ def _bales(grounds: Grounds) -> None:
 
 
 def _hedges(grounds: Grounds) -> None:
-    """Hedges between parcels, from the verge away from the road."""
     rng = grounds.rng
     for at in rng.integers(0, len(grounds.path), 6):
         side = rng.choice([-1.0, 1.0])
@@ -136,7 +133,6 @@ def _hedges(grounds: Grounds) -> None:
 
 
 def _trees(grounds: Grounds) -> None:
-    """Single trees far from one another, and some bushes."""
     rng, road = grounds.rng, grounds.path
     low, high = road.min(axis=0) - 0.7 * _MARGIN_M, road.max(axis=0) + 0.7 * _MARGIN_M
     stands = np.empty((0, 2))

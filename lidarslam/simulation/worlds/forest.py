@@ -69,7 +69,6 @@ def _trees(grounds: Grounds) -> None:
 
 
 def _floor(grounds: Grounds) -> None:
-    """Fallen trunks, boulders, bushes, stumps and piles of logs under the trees."""
     rng, ground, green = grounds.rng, grounds.ground, grounds.green
     for where in _scatter(grounds, 26, (_FREE_SIDE_M + 0.8, 25.0), 6.0):
         length, radius, yaw = rng.uniform(4.0, 11.0), rng.uniform(0.14, 0.38), rng.uniform(0.0, np.pi)

@@ -186,7 +186,6 @@ def _draw_stairs(plan: HallPlan, put: Furnisher) -> None:
 
 
 def _send_forklifts(plan: HallPlan, put: Furnisher) -> tuple[Mover, ...]:
-    """Two or three fork-lifts that drive in rectangles off the route."""
     rng = put.rng
     movers: list[Mover] = []
     wanted = int(rng.integers(2, 4))
@@ -222,7 +221,6 @@ def _set_racks(plan: HallPlan, put: Furnisher) -> None:
 
 
 def _set_machines(plan: HallPlan, put: Furnisher) -> None:
-    """Machines in rows, of alternating kinds."""
     rng, (width, depth) = put.rng, plan.floor.high
     xs, ys = np.arange(3.0, width - 2.0, 3.6), np.arange(6.0, depth - 10.0, 3.2)
     places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
@@ -244,7 +242,6 @@ _CABIN: tuple[Piece, Measures] = equipment.cabin, ((2.6, 4.0), (2.2, 3.0), 2.5)
 
 
 def _fill(put: Furnisher, floor: Room, from_walls: float, z: float, tries: int) -> None:
-    """A cabin, and pallets, drums and crates wherever there is room."""
     rng = put.rng
     for k in range(tries):
         piece, measures = _GOODS[int(rng.integers(3))] if k else _CABIN
@@ -257,7 +254,6 @@ def _fill(put: Furnisher, floor: Room, from_walls: float, z: float, tries: int) 
 
 
 def _draw_shell(plan: HallPlan, put: Furnisher) -> None:
-    """The structure of the hall, and the fittings fastened to it."""
     builder, rng, (width, depth) = put.builder, put.rng, plan.floor.high
     for z in (-0.2, plan.height + 0.2):
         builder.box((0.5 * width, 0.5 * depth, z), (width + 2.0 * _WALL_M, depth + 2.0 * _WALL_M, 0.4))

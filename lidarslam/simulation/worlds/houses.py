@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.simulation.worlds.building import Builder, rotation_z
+from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.worlds.building import Builder
 
 # Walls go this far down: houses stand level on streets that slope.
 _FOUNDATION_M = 2.0
@@ -44,21 +44,12 @@ class _Style:
 
 
 def house(
-    rng: np.random.Generator,
-    width: float,
-    depth: float,
-    open_sides: tuple[bool, bool],
-    storeys: tuple[int, int] = (2, 5),
-    is_plain: bool = False,
-) -> Builder:
-    """A house of two to five storeys.
+    rng: np.random.Generator, width: float, depth: float, open_sides: tuple[bool, bool],
+    storeys: tuple[int, int] = (2, 5), is_plain: bool = False,
+) -> Builder:  # fmt: skip
+    """A house between the fewest and most storeys, its left and right sides with windows where they are open.
 
-    Args:
-        rng: of its style.
-        width, depth: of the house.
-        open_sides: whether its left and right sides have windows too.
-        storeys: fewest and most.
-        is_plain: few wide windows and no ornaments, for streets of many kilometres.
+    A plain one has few wide windows and no ornaments, for streets of many kilometres.
     """
     part = Builder()
     style = _draw_style(rng, storeys, 3.0 if is_plain else 1.0)
@@ -82,9 +73,7 @@ def house(
         _ornaments(part, rng, style, openings, door)
     for is_open, corner, yaw in zip(open_sides, ((0.0, depth), (width, 0.0)), (-0.5 * np.pi, 0.5 * np.pi), strict=True):
         if is_open:
-            side = Builder()
-            _facade(side, style, depth, style.openings(depth))
-            part.place(side, make_transform(rotation_z(yaw), [*corner, 0.0]))
+            _facade(part.shifted(*corner, yaw=yaw), style, depth, style.openings(depth))
     _roof(part, rng, width, depth, top)
     return part
 
@@ -93,17 +82,14 @@ def _draw_style(rng: np.random.Generator, storeys: tuple[int, int], spread: floa
     storey = rng.uniform(2.9, 3.5)
     is_shop = rng.random() < 0.3
     sill = rng.uniform(0.7, 1.0)
-    return _Style(
-        storeys=int(rng.integers(*storeys, endpoint=True)),
-        storey_m=storey,
-        recess_m=rng.uniform(0.14, 0.38),
-        axis_m=spread * rng.uniform(2.1, 3.4),
-        opening=rng.uniform(0.4, 0.62),
-        sill_m=sill,
-        lintel_m=rng.uniform(sill + 1.2, storey - 0.25),
-        ground_sill_m=0.35 if is_shop else sill + 0.1,
-        ground_lintel_m=2.6 if is_shop else rng.uniform(2.2, 2.6),
+    count, recess = int(rng.integers(*storeys, endpoint=True)), rng.uniform(0.14, 0.38)
+    axis, opening, lintel = (
+        spread * rng.uniform(2.1, 3.4),
+        rng.uniform(0.4, 0.62),
+        rng.uniform(sill + 1.2, storey - 0.25),
     )
+    ground = (0.35, 2.6) if is_shop else (sill + 0.1, rng.uniform(2.2, 2.6))
+    return _Style(count, storey, recess, axis, opening, sill, lintel, *ground)
 
 
 def _facade(
@@ -155,7 +141,6 @@ def _bay(part: Builder, style: _Style, opening: FloatArray, reach: float) -> Non
 
 
 def _balcony(part: Builder, opening: FloatArray, floor: float, reach: float) -> None:
-    """A slab with a railing of bars."""
     x0, x1 = opening[0] - 0.3, opening[1] + 0.3
     part.block((x0, x1), (-reach, 0.1), (floor - 0.16, floor))
     part.block((x0, x1), (-reach, -reach + 0.05), (floor + 0.95, floor + 1.0))

@@ -64,7 +64,6 @@ def shelf(spot: Builder, size: Size, rng: np.random.Generator) -> None:
 
 
 def _goods(spot: Builder, x: Limits, depth: float, z: Limits, rng: np.random.Generator) -> None:
-    """Blocks of books or boxes in a row, with gaps."""
     at = x[0]
     while at < x[1] - 0.15:
         length = min(rng.uniform(0.15, 0.5), x[1] - at)

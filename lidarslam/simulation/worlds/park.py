@@ -106,7 +106,6 @@ def _trees(grounds: Grounds, pavilion: FloatArray) -> None:
 
 
 def _borders(grounds: Grounds, pavilion: FloatArray) -> None:
-    """A few low walls, hedges and bushes along the path."""
     rng, solid = grounds.rng, grounds.solid
     for at in rng.integers(0, len(grounds.path), 9):
         start, yaw = grounds.beside(at, beside(rng, 4.0, 9.0))

@@ -66,8 +66,8 @@ def build(seed: int) -> World:
     builder, route = Builder(), _route(plan)
     for number in range(2 * plan.storeys):
         _draw_flight(plan.flight(builder, number), plan)
-    top = plan.flight(builder, 2 * plan.storeys)
-    draw_railing(top.point(0.0, -0.5 * plan.width, 0.0), top.point(0.0, 0.5 * plan.width + plan.shaft, 0.0), builder)
+    left, right = np.array([[0.0, -0.5 * plan.width, 0.0], [0.0, 0.5 * plan.width + plan.shaft, 0.0]])
+    draw_railing(left, right, plan.flight(builder, 2 * plan.storeys))
     _draw_shell(plan, builder, Clearance(route), rng)
     return World("stairs", seed, route, *builder.solids)
 
@@ -90,7 +90,6 @@ def _route(plan: StairPlan) -> Route:
 
 
 def _draw_flight(flight: Builder, plan: StairPlan) -> None:
-    """Steps, the landing that they lead to, and a railing along the shaft."""
     half = 0.5 * plan.width
     for k in range(1, plan.steps):
         flight.block(((k - 1) * TREAD_M, k * TREAD_M), (-half, half), ((k - 1) * RISE_M - 0.1, k * RISE_M))

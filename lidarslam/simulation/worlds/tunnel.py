@@ -293,7 +293,6 @@ class _Stations:
 
 
 def _fit_out(stations: _Stations) -> Builder:
-    """Everything, each over stretches of its own."""
     for fit, (fewest, most) in ((_lay_pipe, (3, 6)), (_hang_cable, (2, 4)), (_set_supports, (2, 5))):
         for _ in range(int(stations.rng.integers(fewest, most))):
             fit(stations)
@@ -387,7 +386,6 @@ def _lay_rails(stations: _Stations) -> None:
 
 
 def _hang_lamps(stations: _Stations) -> None:
-    """A lamp on the wall every so often."""
     walls = stations.walls(2.0)
     for k in range(0, len(stations), int(stations.rng.integers(6, 11))):
         side = stations.side()
@@ -415,7 +413,6 @@ def _drop_rocks(stations: _Stations) -> None:
 
 
 def _leave_things(stations: _Stations) -> None:
-    """Barrels, crates and planks where the tunnel is wide enough."""
     rng, builder, walls = stations.rng, stations.builder, stations.walls(0.5)
     for k in rng.permutation(len(stations))[: len(stations) // 4]:
         side, size = stations.side(), rng.uniform(0.5, 0.75)
