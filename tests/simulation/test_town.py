@@ -53,6 +53,7 @@ def small() -> World:
         return town.build(0)
 
 
+@pytest.mark.slow
 def test_nothing_stands_in_the_way_of_the_car(small):
     lane = subdivide_loop(small.route.waypoints, 1.0)
     clear = Caster(small).distances(lane + np.array([0.0, 0.0, FREE_SIDE_M]))
@@ -61,6 +62,7 @@ def test_nothing_stands_in_the_way_of_the_car(small):
     assert len(small.cylinders) > 20
 
 
+@pytest.mark.slow
 def test_a_car_goes_round_and_round(small):
     motion = motion_along_route("car-fast", small, 0)
     way = np.linalg.norm(np.diff(motion.base[:, :2], axis=0), axis=1)

@@ -85,9 +85,11 @@ def level_frames(world: World, spacing_m: float) -> tuple[FloatArray, FloatArray
     return points, ahead, np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))], axis=1)
 
 
+SMALL = ("hall", "stairs", "crowd", "corridor")
+
+
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name in OUTDOORS else ()) for name in WORLDS if name != "town"],
+    "name", [*SMALL, *(pytest.param(n, marks=pytest.mark.slow) for n in WORLDS if n not in (*SMALL, "town"))]
 )
 def test_the_seed_makes_the_world(name: str) -> None:
     first, again, other = cached_world(name, 0), build_world(name, 0), cached_world(name, 3)

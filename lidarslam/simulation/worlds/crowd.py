@@ -8,7 +8,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Mover, Route, World
 from lidarslam.simulation.worlds import interior, outdoor, paths
 from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Room, left_of, rotation_z
-from lidarslam.simulation.worlds.interior import Furnisher
+from lidarslam.simulation.worlds.interior import Furnisher, Pieces
 from lidarslam.simulation.worlds.office import draw_room_ceiling
 from lidarslam.simulation.worlds.paths import Clearance
 
@@ -53,17 +53,20 @@ def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Gene
 
 
 def _furnish(room: Room, height: float, put: Furnisher) -> None:
-    for _ in range(10):
-        put.at_wall(room, put.drawn((0.4, (0.15, 0.3), height)), interior.pilaster)
-    put.at_wall(room, (4.0, 0.7, 2.2), interior.counter)
-    for _ in range(4):
-        put.on_floor(room, (0.5, 0.5, height), interior.crate, tries=60)
-        put.on_floor(room, (0.9, 0.9, 0.8), interior.round_table, tries=60)
-    put.some(room, interior.sofa, (3, 6), ((1.3, 2.3), 0.9, 0.9))
-    put.some(room, interior.cabinet, (4, 8), ((0.6, 1.8), (0.3, 0.5), (0.8, 2.0)))
-    put.some(room, interior.plant, (4, 8), (0.75, 0.75, (0.8, 1.6)))
-    for _ in range(8):
-        put.at_wall(room, put.drawn(((0.6, 1.8), 0.04, 1.0)), interior.board, z=1.0)
+    for pieces in (
+        Pieces(interior.pilaster, 10, (0.4, (0.15, 0.3), height)),
+        Pieces(interior.counter, 1, (4.0, 0.7, 2.2)),
+        *4
+        * (
+            Pieces(interior.crate, 1, (0.5, 0.5, height), tries=60, is_on_floor=True),
+            Pieces(interior.round_table, 1, (0.9, 0.9, 0.8), tries=60, is_on_floor=True),
+        ),
+        Pieces(interior.sofa, (3, 6), ((1.3, 2.3), 0.9, 0.9)),
+        Pieces(interior.cabinet, (4, 8), ((0.6, 1.8), (0.3, 0.5), (0.8, 2.0))),
+        Pieces(interior.plant, (4, 8), (0.75, 0.75, (0.8, 1.6))),
+        Pieces(interior.board, 8, ((0.6, 1.8), 0.04, 1.0), z=1.0),
+    ):
+        put.some(room, pieces)
 
 
 def draw_people(route: Route, rng: np.random.Generator) -> tuple[Mover, ...]:

@@ -224,10 +224,6 @@ def crate(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa:
     spot.block((-0.5 * size[0], 0.5 * size[0]), (-0.5 * size[1], 0.5 * size[1]), (0.0, size[2]))
 
 
-def _corridor_plant(spot: Builder, size: Size, rng: np.random.Generator) -> None:
-    plant(spot, (size[0], 0.45, 1.1), rng)
-
-
 def _gas_bottle(spot: Builder, size: Size, rng: np.random.Generator, height: float, radius: float) -> None:  # noqa: ARG001
     spot.pole((0.0, 0.28), (0.0, height), radius)
     spot.pole((0.0, 0.28), (height, height + 0.1), 0.3 * radius)
@@ -245,6 +241,18 @@ def draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
 
 Measure = float | tuple[float, float]  # a length, or the limits it is drawn between
 Measures = tuple[Measure, Measure, Measure]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Pieces of one kind at the walls of a room or on its floor; number and size, or the limits they are drawn in."""
+
+    piece: Piece
+    count: int | tuple[int, int]
+    size: Measures
+    z: float = 0.0
+    tries: int = 12
+    is_on_floor: bool = False
 
 
 @dataclass(frozen=True)
@@ -295,12 +303,13 @@ class Furnisher:
                 return True
         return False
 
-    def some(
-        self, room: Room, piece: Piece, count: int | tuple[int, int], size: Measures, z: float = 0.0, tries: int = 12
-    ) -> None:
-        """A number of pieces at the walls, each of its own size."""
-        for _ in self.number(count):
-            self.at_wall(room, self.drawn(size), piece, z, tries)
+    def some(self, room: Room, pieces: "Pieces") -> None:
+        """A number of pieces, each of its own size."""
+        for _ in self.number(pieces.count):
+            if pieces.is_on_floor:
+                self.on_floor(room, self.drawn(pieces.size), pieces.piece, pieces.tries)
+            else:
+                self.at_wall(room, self.drawn(pieces.size), pieces.piece, pieces.z, pieces.tries)
 
     def number(self, count: int | tuple[int, int]) -> range:
         """A range of that length, or of one within limits."""
@@ -315,8 +324,8 @@ class Furnisher:
 def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
     """Fill a room after its kind, then hang a few boards or pictures."""
     for pieces in KINDS[kind]:
-        if isinstance(pieces, tuple):
-            put.some(room, *pieces)
+        if isinstance(pieces, Pieces):
+            put.some(room, pieces)
         else:
             pieces(room, put)
     for _ in put.number((1, 4)):
@@ -327,14 +336,14 @@ def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
 def furnish_corridor(corridor: Room, height: float, put: Furnisher) -> None:
     """Pillars, lockers, plants, extinguishers and notice boards, as far as the route allows."""
     area = float((corridor.high - corridor.low).prod())
-    put.some(corridor, pilaster, int(area / 6.0), (0.35, (0.12, 0.2), height), tries=6)
+    put.some(corridor, Pieces(pilaster, int(area / 6.0), (0.35, (0.12, 0.2), height), tries=6))
     for _ in range(int(area / 6.0)):
         depth, width, tall = put.drawn(((0.25, 0.45), (0.6, 1.8), (0.8, 2.0)))
         put.at_wall(corridor, (width, depth, tall), cabinet, tries=8)
     for _ in range(int(area / 9.0)):
         put.at_wall(corridor, (0.2, 0.2, 0.7), extinguisher, z=0.3, tries=6)
-        put.some(corridor, partial(board, low=0.05), 1, ((0.5, 1.6), 0.05, 1.0), z=1.0, tries=6)
-        put.at_wall(corridor, (0.5, 0.5, 1.2), _corridor_plant, tries=6)
+        put.at_wall(corridor, put.drawn(((0.5, 1.6), 0.05, 1.0)), partial(board, low=0.05), z=1.0, tries=6)
+        put.at_wall(corridor, (0.5, 0.5, 1.2), lambda spot, _, rng: plant(spot, (0.5, 0.45, 1.1), rng), tries=6)
 
 
 def _conference(room: Room, put: Furnisher) -> None:
@@ -342,68 +351,64 @@ def _conference(room: Room, put: Furnisher) -> None:
     for _ in range(3):
         if put.on_floor(room, put.drawn(((1.4, longest), (2.0, 2.4), 1.0)), conference):
             break
-    put.at_wall(room, (1.7, 0.4, 0.75), cabinet)
-    put.at_wall(room, (2.0, 0.05, 1.4), board, z=0.7)
 
 
-def _crates(room: Room, put: Furnisher) -> None:
-    for _ in put.number((4, 9)):
-        put.on_floor(room, put.drawn(((0.3, 0.8), (0.3, 0.8), (0.3, 0.8))), crate)
-
-
-def _kitchen(room: Room, put: Furnisher) -> None:
-    put.some(room, counter, 1, ((1.6, 2.6), 0.64, 2.2), tries=30)
+def _round_tables(room: Room, put: Furnisher) -> None:
     for _ in put.number((1, 4)):
         span = put.rng.uniform(1.6, 2.0)
         put.on_floor(room, (span, span, 1.0), round_table_with_chairs)
 
 
-def _laboratory(room: Room, put: Furnisher) -> None:
-    put.on_floor(room, (1.8, 0.9, 1.1), table)
+def _gas_bottles(room: Room, put: Furnisher) -> None:
     for _ in put.number((1, 4)):
         bottle = partial(_gas_bottle, height=put.rng.uniform(0.7, 1.6), radius=put.rng.uniform(0.12, 0.25))
         put.at_wall(room, (0.55, 0.55, 1.7), bottle)
 
 
-def _screens(room: Room, put: Furnisher) -> None:
-    for _ in put.number((2, 5)):
-        put.on_floor(room, (1.5, 1.6, 1.5), screened_workplace, tries=25)
-
-
-def _coffee_table(room: Room, put: Furnisher) -> None:
-    put.on_floor(room, (0.9, 0.9, 0.8), round_table)
-
-
 _SHELF = (0.8, 1.4), (0.28, 0.42)
 _CABINET = (0.5, 1.2), (0.4, 0.5)
 _PLANT = 0.75, 0.75, (0.8, 1.6)
-# What stands in a room of each kind, in the order of placing: pieces at the walls, their number and size, or a step.
-_Pieces = tuple[Piece, int | tuple[int, int], Measures]
-KINDS: dict[str, tuple[_Pieces | Callable[[Room, Furnisher], None], ...]] = {
+# What stands in a room of each kind, in the order of placing.
+KINDS: dict[str, tuple[Pieces | Callable[[Room, Furnisher], None], ...]] = {
     "office": (
-        (workplace, (2, 5), ((1.3, 1.8), (1.45, 1.6), 1.3)),
-        (shelf, (1, 3), (*_SHELF, (1.7, 2.2))),
-        (cabinet, (1, 3), (*_CABINET, (0.7, 1.5))),
-        (plant, (0, 3), _PLANT),
+        Pieces(workplace, (2, 5), ((1.3, 1.8), (1.45, 1.6), 1.3)),
+        Pieces(shelf, (1, 3), (*_SHELF, (1.7, 2.2))),
+        Pieces(cabinet, (1, 3), (*_CABINET, (0.7, 1.5))),
+        Pieces(plant, (0, 3), _PLANT),
     ),
-    "meeting": (_conference, (spare_chair, 2, (0.6, 0.6, 1.1)), (plant, 2, _PLANT)),
-    "storage": ((shelf, 6, (*_SHELF, (2.0, 2.4))), _crates),
-    "kitchen": ((cabinet, 1, (0.62, 0.64, 1.85)), _kitchen, (plant, 1, _PLANT)),
+    "meeting": (
+        _conference,
+        Pieces(cabinet, 1, (1.7, 0.4, 0.75)),
+        Pieces(board, 1, (2.0, 0.05, 1.4), z=0.7),
+        Pieces(spare_chair, 2, (0.6, 0.6, 1.1)),
+        Pieces(plant, 2, _PLANT),
+    ),
+    "storage": (
+        Pieces(shelf, 6, (*_SHELF, (2.0, 2.4))),
+        Pieces(crate, (4, 9), ((0.3, 0.8), (0.3, 0.8), (0.3, 0.8)), is_on_floor=True),
+    ),
+    "kitchen": (
+        Pieces(cabinet, 1, (0.62, 0.64, 1.85)),
+        Pieces(counter, 1, ((1.6, 2.6), 0.64, 2.2), tries=30),
+        _round_tables,
+        Pieces(plant, 1, _PLANT),
+    ),
     "laboratory": (
-        (counter, 3, ((1.4, 2.4), 0.64, 2.2)),
-        _laboratory,
-        (cabinet, 2, (*_CABINET, (1.8, 2.1))),
+        Pieces(counter, 3, ((1.4, 2.4), 0.64, 2.2)),
+        Pieces(table, 1, (1.8, 0.9, 1.1), is_on_floor=True),
+        _gas_bottles,
+        Pieces(cabinet, 2, (*_CABINET, (1.8, 2.1))),
     ),
     "lounge": (
-        (sofa, (1, 4), ((1.3, 2.3), 0.9, 0.9)),
-        _coffee_table,
-        (shelf, 1, (*_SHELF, (1.2, 1.9))),
-        (plant, 4, _PLANT),
+        Pieces(sofa, (1, 4), ((1.3, 2.3), 0.9, 0.9)),
+        Pieces(round_table, 1, (0.9, 0.9, 0.8), is_on_floor=True),
+        Pieces(shelf, 1, (*_SHELF, (1.2, 1.9))),
+        Pieces(plant, 4, _PLANT),
     ),
     "open_plan": (
-        _screens,
-        (workplace, 2, (1.5, 1.5, 1.3)),
-        (cabinet, 3, (*_CABINET, (0.9, 1.4))),
-        (plant, 1, _PLANT),
+        Pieces(screened_workplace, (2, 5), (1.5, 1.6, 1.5), tries=25, is_on_floor=True),
+        Pieces(workplace, 2, (1.5, 1.5, 1.3)),
+        Pieces(cabinet, 3, (*_CABINET, (0.9, 1.4))),
+        Pieces(plant, 1, _PLANT),
     ),
 }
