@@ -106,53 +106,75 @@ def _exp_one(xi: FloatArray) -> FloatArray:
     angle = math.sqrt(a * a + b * b + c * c)
     if not math.isfinite(angle):
         return np.full((4, 4), np.nan)
-    s, v, j = coefficients(angle)
-    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
-    u, w, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x v
-    return np.array(
-        [
-            [1.0 - v * (bb + cc), v * ab - s * c, v * ac + s * b, x + v * u + j * (b * h - c * w)],
-            [v * ab + s * c, 1.0 - v * (aa + cc), v * bc - s * a, y + v * w + j * (c * u - a * h)],
-            [v * ac - s * b, v * bc + s * a, 1.0 - v * (aa + bb), z + v * h + j * (a * w - b * u)],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    rows = exp_rows(a, b, c, x, y, z, *coefficients(angle))
+    return np.array([*rows, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
 
 
 def _log_one(T: FloatArray) -> FloatArray:
     """As `log`, (6,) of the only transform."""
     (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = T.reshape(4, 4).tolist()
-    # Each row of 4 q q^T is a multiple of the quaternion; that with the largest diagonal is the best conditioned.
-    i, j, k = r21 - r12, r02 - r20, r10 - r01
-    rows = (
-        (1.0 + r00 + r11 + r22, i, j, k),
-        (i, 1.0 + r00 - r11 - r22, r01 + r10, r02 + r20),
-        (j, r01 + r10, 1.0 - r00 + r11 - r22, r12 + r21),
-        (k, r02 + r20, r12 + r21, 1.0 - r00 - r11 + r22),
+    a, b, c, angle = rotation_vector(r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    s, v, _ = coefficients(angle)
+    return np.array([a, b, c, *log_translation(a, b, c, x, y, z, angle, s, v)])
+
+
+# The following are also compiled, see `lidarslam.odometry.alignment.steps`.
+
+
+def exp_rows(
+    a: float, b: float, c: float, x: float, y: float, z: float, s: float, v: float, j: float
+) -> tuple[float, float, float, float, float, float, float, float, float, float, float, float]:
+    """The first three rows of `exp` of (a, b, c, x, y, z), with the `coefficients` of its angle."""
+    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
+    u, w, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x v
+    return (
+        *(1.0 - v * (bb + cc), v * ab - s * c, v * ac + s * b, x + v * u + j * (b * h - c * w)),
+        *(v * ab + s * c, 1.0 - v * (aa + cc), v * bc - s * a, y + v * w + j * (c * u - a * h)),
+        *(v * ac - s * b, v * bc + s * a, 1.0 - v * (aa + bb), z + v * h + j * (a * w - b * u)),
     )
-    w, i, j, k = rows[max(range(4), key=lambda n: rows[n][n])]
-    sine = math.sqrt(i * i + j * j + k * k)
+
+
+def rotation_vector(
+    r00: float, r01: float, r02: float, r10: float, r11: float, r12: float, r20: float, r21: float, r22: float
+) -> tuple[float, float, float, float]:
+    """The rotation vector of a matrix, and its angle.
+
+    Each row of 4 q q^T is a multiple of the quaternion; that with the largest diagonal is the best conditioned.
+    """
+    i, j, k = r21 - r12, r02 - r20, r10 - r01
+    p, q, r = r01 + r10, r02 + r20, r12 + r21
+    real, by_x, by_y = 1.0 + r00 + r11 + r22, 1.0 + r00 - r11 - r22, 1.0 - r00 + r11 - r22
+    by_z = 1.0 - r00 - r11 + r22
+    if real >= by_x and real >= by_y and real >= by_z:
+        w, a, b, c = real, i, j, k
+    elif by_x >= by_y and by_x >= by_z:
+        w, a, b, c = i, by_x, p, q
+    elif by_y >= by_z:
+        w, a, b, c = j, p, by_y, r
+    else:
+        w, a, b, c = k, q, r, by_z
+    sine = math.sqrt(a * a + b * b + c * c)
     angle = 2.0 * math.atan2(sine, abs(w))
     scale = math.copysign(angle / sine if sine > 0.0 else 0.0, w)
-    a, b, c = scale * i, scale * j, scale * k
-    if angle < SMALL_ANGLE:
-        coefficient = 1.0 / 12.0 + angle**2 / 720.0
-    else:
-        s, v, _ = coefficients(angle)
-        coefficient = (1.0 - s / (2.0 * v)) / angle**2
+    return scale * a, scale * b, scale * c, angle
+
+
+def log_translation(
+    a: float, b: float, c: float, x: float, y: float, z: float, angle: float, s: float, v: float
+) -> tuple[float, float, float]:
+    """The translation part of `log`, of a rotation vector and a translation, with the `coefficients` of its angle."""
+    near = angle < SMALL_ANGLE
+    coefficient = 1.0 / 12.0 + angle**2 / 720.0 if near else (1.0 - s / (2.0 * v)) / angle**2
     u, g, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x t
-    return np.array(
-        [
-            *(a, b, c),
-            x - 0.5 * u + coefficient * (b * h - c * g),
-            y - 0.5 * g + coefficient * (c * u - a * h),
-            z - 0.5 * h + coefficient * (a * g - b * u),
-        ]
+    return (
+        x - 0.5 * u + coefficient * (b * h - c * g),
+        y - 0.5 * g + coefficient * (c * u - a * h),
+        z - 0.5 * h + coefficient * (a * g - b * u),
     )
 
 
 def coefficients(angle: float) -> tuple[float, float, float]:
-    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3 of an angle; also compiled, see `lidarslam.odometry.alignment`."""
+    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3 of an angle."""
     if angle < SMALL_ANGLE:
         a2 = angle * angle
         return 1.0 - a2 / 6.0, 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0

@@ -30,12 +30,7 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 class Devices:
-    """The device of this process, and its place among the others.
-
-    Attributes:
-        device: of this process.
-        processes: their number.
-        process: number of this one; only the first writes and prints.
+    """The `device` of this `process`, one of several `processes`, of which only the first, 0, writes and prints.
 
     Raises:
         ConfigError: the device is not available.
@@ -48,15 +43,11 @@ class Devices:
         self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if is_cuda else torch.device("cpu")
         self.processes = int(os.environ.get("WORLD_SIZE", "1"))
         self.process = int(os.environ.get("RANK", "0")) if self.processes > 1 else 0
+        self.is_first = self.process == 0
         if is_cuda:
             torch.cuda.set_device(self.device)
         if self.processes > 1 and not distributed.is_initialized():
             distributed.init_process_group("nccl" if is_cuda else "gloo")
-
-    @property
-    def is_first(self) -> bool:
-        """Whether this process is the one that writes and prints."""
-        return self.process == 0
 
     def shared(self, module: nn.Module) -> nn.Module:
         """A module on the device, with gradients averaged over the processes."""
@@ -110,44 +101,26 @@ class _LossModule(nn.Module):
 
     def __init__(self, network: nn.Module, config: TrainingConfig) -> None:
         super().__init__()
-        self.network = network
-        self.config = config
+        self.network, self.config = network, config
 
     def forward(self, batch: PairBatch, generator: Generator) -> dict[str, Tensor]:
         """The loss and its parts."""
-        return dict(vars(objective(cast(PairNetwork, self.network)(batch), batch, self.config, generator)))
+        return objective(cast(PairNetwork, self.network)(batch), batch, self.config, generator)._asdict()
 
 
+@dataclass(eq=False)
 class TrainingLoop:
-    """One training in one process; only the first process validates, writes and prints.
+    """One training in one process; only the first process validates, writes and prints."""
 
-    Args:
-        config: of the training.
-        network, optimizer: on the device.
-        progress: the state of the training.
-        devices: of the processes.
-        out: its directory.
-        about: the data that the weights are trained on.
-        say: prints a line.
-    """
-
-    def __init__(
-        self,
-        config: TrainingConfig,
-        network: nn.Module,
-        optimizer: torch.optim.Optimizer,
-        progress: Progress,
-        devices: Devices,
-        out: Path,
-        about: dict[str, Any],
-        say: Callable[[str], None],
-    ) -> None:
-        self._config, self._devices, self._out, self._about, self._say = config, devices, out, about, say
-        self._network, self._optimizer, self._progress = network, optimizer, progress
-        self._module = devices.shared(_LossModule(network, config))
-        is_new = not progress.step and progress.best is None  # or killed before its first state
-        self._log = TrainingLog(out, None if is_new else progress.step) if devices.is_first else None
-        self._clock = time.perf_counter()
+    config: TrainingConfig
+    # network, optimizer: on the device
+    network: nn.Module
+    optimizer: torch.optim.Optimizer
+    progress: Progress
+    devices: Devices
+    out: Path  # the directory of the training
+    about: dict[str, Any]  # the data that the weights are trained on
+    say: Callable[[str], None]  # prints a line
 
     def run(self, recordings: Recordings, is_interrupted: Callable[[], bool]) -> bool:
         """Do the remaining steps; whether all of them were done.
@@ -155,19 +128,21 @@ class TrainingLoop:
         Raises:
             ConfigError: the loss is no longer a number.
         """
-        config, progress = self._config, self._progress
+        config, progress, devices = self.config, self.progress, self.devices
+        self._module = devices.shared(_LossModule(self.network, config))
+        is_new = not progress.step and progress.best is None  # or killed before its first state
+        self._log = TrainingLog(self.out, None if is_new else progress.step) if devices.is_first else None
         surfaces, birds = config.geometric is not None, config.network.name == "correlation"
-        device = self._devices.device
-        pairs = Pairs(recordings.learned, config.seed, surfaces, birds, recordings.weights, device=device)
+        pairs = Pairs(recordings.learned, config.seed, surfaces, birds, recordings.weights, device=devices.device)
+        self._clock = time.perf_counter()
         if progress.best is None:
             self._validate(recordings)
-        self._clock = time.perf_counter()
         todo = range(progress.step, config.steps)
         validate_every = max(VALIDATE_EVERY, -(-config.steps // _MOST_VALIDATIONS))
-        drawn = prefetch(pairs.batch(step, config.batch, self._devices.process) for step in todo)
+        drawn = prefetch(pairs.batch(step, config.batch, devices.process) for step in todo)
         with contextlib.closing(cast(Any, drawn)) as batches:
             for step, batch in zip(todo, batches, strict=True):
-                if self._devices.any(is_interrupted()):
+                if devices.any(is_interrupted()):
                     break
                 self._step(step, batch)
                 is_last = progress.step == config.steps
@@ -182,15 +157,15 @@ class TrainingLoop:
         return progress.step == config.steps
 
     def _step(self, step: int, batch: PairBatch) -> None:
-        config, progress = self._config, self._progress
-        generator = Generator().manual_seed((config.seed * _LOSS_STREAM + step) * _LOSS_STREAM + self._devices.process)
-        for group in self._optimizer.param_groups:
+        config, progress = self.config, self.progress
+        generator = Generator().manual_seed((config.seed * _LOSS_STREAM + step) * _LOSS_STREAM + self.devices.process)
+        for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(step, config)
-        self._optimizer.zero_grad()
+        self.optimizer.zero_grad()
         losses: dict[str, Tensor] = self._module(batch, generator)
         losses["total"].backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self._module.parameters(), _MOST_GRADIENT)
-        self._optimizer.step()
+        self.optimizer.step()
         values = torch.stack(list(losses.values())).tolist()  # one transfer from the device
         for name, value in zip(losses, values, strict=True):
             progress.sums[name] = progress.sums.get(name, 0.0) + value
@@ -198,54 +173,53 @@ class TrainingLoop:
         progress.step += 1
 
     def _report(self) -> None:
-        config, progress = self._config, self._progress
+        config, progress = self.config, self.progress
         losses = {name: value / progress.counted for name, value in progress.sums.items()}
         if not math.isfinite(losses["total"]):
             raise ConfigError(
                 f"the loss is no longer a number at step {progress.step}; lower training.learning_rate."
-                f" The last state in {self._out} is from before"
+                f" The last state in {self.out} is from before"
             )
         now = time.perf_counter()
         per_step = (now - self._clock) / progress.counted
-        speed = config.batch * self._devices.processes / per_step
+        speed = config.batch * self.devices.processes / per_step
         self._clock, progress.sums, progress.counted = now, {}, 0
         if self._log is not None:
             rate = {"learning_rate": learning_rate(progress.step - 1, config), "pairs_per_s": speed}
             self._log.losses(progress.step, losses | rate)
             left_s = per_step * (config.steps - progress.step)
-            self._say(format_step(progress.step, config.steps, losses, speed, left_s))
+            self.say(format_step(progress.step, config.steps, losses, speed, left_s))
 
     def _validate(self, recordings: Recordings) -> None:
         """Measure the network on the held-out recordings, and keep the best."""
         began = time.perf_counter()
         if self._log is not None:
-            self._network.eval()
-            progress = self._progress
+            self.network.eval()
+            progress = self.progress
             self._save_weights(files.LAST_WEIGHTS, None)
             if recordings.held_out:
-                result = validate(self._network, recordings.held_out, device=self._devices.device)
+                result = validate(self.network, recordings.held_out, self.devices.device)
                 self._log.validation(progress.step, result)
                 # Without anything to compare with, the last is as good as any.
                 improves = progress.best is not None and score(result) < progress.best
                 if improves or not result.pairs or progress.best is None:
                     progress.best = score(result) if result.pairs else None
                     self._save_weights(files.WEIGHTS, result if result.pairs else None)
-                self._say(format_validation(progress.step, result, improves))
+                self.say(format_validation(progress.step, result, improves))
             else:
                 self._save_weights(files.WEIGHTS, None)
-            self._network.train()
-        self._devices.wait()
+            self.network.train()
+        self.devices.wait()
         self._clock += time.perf_counter() - began
 
     def _save_weights(self, name: str, result: Validation | None) -> None:
-        validation = None if result is None else vars(result)
-        about = {**self._about, "steps": self._progress.step, "validation": validation}
-        config = self._config
-        save_checkpoint(self._out / name, checkpoint_of(self._network, config.network, config.images, about))
+        about = {**self.about, "steps": self.progress.step, "validation": result and vars(result)}
+        checkpoint = checkpoint_of(self.network, self.config.network, self.config.images, about)
+        save_checkpoint(self.out / name, checkpoint)
 
     def _save(self) -> None:
         if self._log is not None:
-            save_state(self._out / files.STATE, self._network, self._optimizer, self._progress)
+            save_state(self.out / files.STATE, self.network, self.optimizer, self.progress)
 
 
 def score(result: Validation) -> float:

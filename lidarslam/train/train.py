@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from lidarslam.config.settings import SOURCES_SECTION, reader_settings
 from lidarslam.config.yaml_text import read_yaml
@@ -35,7 +34,7 @@ from lidarslam.train.data import (
     recorded,
     simulated,
 )
-from lidarslam.train.directory import CONFIG, Progress, is_training, load_state
+from lidarslam.train.directory import Progress, load_state
 from lidarslam.train.log import format_outcome
 from lidarslam.train.loop import DeviceName, Devices, Recordings, TrainingLoop
 from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
@@ -47,9 +46,9 @@ class TrainRequest:
 
     sources: tuple[Path, ...]  # recordings; may be none where the configuration names simulated ones
     out: Path  # the directory of the training
-    config: TrainConfig  # how it is trained
+    config: TrainConfig
     start_from: Path | None = None  # weights to begin with instead of random ones
-    device: DeviceName = "auto"  # where to compute
+    device: DeviceName = "auto"
     prepared: Path | None = None  # where prepared recordings are kept; None: in `out`
     resume: bool = False  # continue the training in `out`
     overwrite: bool = False  # replace it
@@ -70,7 +69,14 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
     stretches = [*(recorded(source, config.reader) for source in request.sources), *simulated(config.simulated)]
     if not stretches:
         raise ConfigError("there is nothing to train on; name a SOURCE, or set simulated.recordings=100")
-    about = _about(request, stretches)
+    about = {
+        "version": version("lidarslam"),
+        "sources": [str(source) for source in request.sources],
+        "recordings": len(stretches),
+        "digest": digest(stretches),
+    }
+    if request.start_from is not None:
+        about["from"] = str(request.start_from)
     with contextlib.closing(Devices(request.device)) as devices, _interruption() as is_interrupted:
         make_directory(request.out)
         with only_writer(request.out) if devices.is_first else contextlib.nullcontext():
@@ -85,7 +91,9 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
                 say(f"going on after step {progress.step:,}")
             is_complete = loop.run(recordings, is_interrupted)
         if devices.is_first:
-            weights, best = request.out / files.WEIGHTS, _best(request.out / files.WEIGHTS)
+            weights = request.out / files.WEIGHTS
+            kept = load_checkpoint(weights).about.get("validation")
+            best = kept and Validation(**{**kept, "covered_percent": tuple(kept["covered_percent"])})
             say(format_outcome(request.out, weights, progress.step, best, not is_complete))
     return is_complete
 
@@ -146,7 +154,13 @@ def _loop(
     about: dict[str, Any], say: Callable[[str], None],
 ) -> tuple[TrainingLoop, Progress]:  # fmt: skip
     """The training, at its beginning or where it was stopped."""
-    network = _first_network(config, start).to(devices.device)
+    if start is None:  # random weights, which follow from the seed alone
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            network = make_network(config.network)
+    else:
+        network = network_of(start).train()
+    network = network.to(devices.device)
     optimizer = make_optimizer(network, config)
     progress = Progress(data=about["digest"])
     state = request.out / files.STATE
@@ -164,25 +178,6 @@ def _loop(
     return TrainingLoop(config, network, optimizer, progress, devices, request.out, about, say), progress
 
 
-def _first_network(config: TrainingConfig, start: Checkpoint | None) -> nn.Module:
-    """The initial network: its random weights follow from the seed alone."""
-    if start is not None:
-        return network_of(start).train()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        return make_network(config.network)
-
-
-def _about(request: TrainRequest, stretches: Sequence[Stretch]) -> dict[str, Any]:
-    about: dict[str, Any] = {
-        "version": version("lidarslam"),
-        "sources": [str(source) for source in request.sources],
-        "recordings": len(stretches),
-        "digest": digest(stretches),
-    }
-    return about if request.start_from is None else {**about, "from": str(request.start_from)}
-
-
 def _summary(recordings: Recordings, stretches: Sequence[Stretch], devices: Devices) -> str:
     drawn = sum(stretch.is_simulated for stretch in stretches)
     of_them = f", {drawn:,} of them simulated" if drawn else ""
@@ -196,12 +191,6 @@ def _summary(recordings: Recordings, stretches: Sequence[Stretch], devices: Devi
         f" learn from, {held_out}; {100.0 * float(valid.float().mean()):.0f} % of consecutive scans could be"
         f" aligned. Computing on {devices.device}{processes}"
     )
-
-
-def _best(weights: Path) -> Validation | None:
-    """The validation of the weights that are kept."""
-    values = load_checkpoint(weights).about.get("validation")
-    return None if values is None else Validation(**{**values, "covered_percent": tuple(values["covered_percent"])})
 
 
 @contextlib.contextmanager
@@ -231,7 +220,9 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
         raise ConfigError("--resume goes on with what --overwrite replaces; choose one")
     if options["resume"] and start_from is not None:
         raise ConfigError("--resume goes on with the weights it left; leave --from out")
-    earlier = out / CONFIG if options["resume"] and is_training(out) else None
+    earlier = out / files.CONFIG if options["resume"] and files.is_training(out) else None
+    section = {} if earlier is None else read_yaml(earlier).get(SOURCES_SECTION)
+    earlier_sources = section.get("sources", []) if isinstance(section, dict) else []
     if start_from is not None:
         start_from = default_weights() if start_from == "shipped" else Path(start_from)
     named = {"training.steps": options["steps"], "training.network.name": options["network"]}
@@ -242,17 +233,10 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
         *reader_settings(name=options["reader"], topic=options["topic"], sequence=options["sequence"]),
     ]
     request = TrainRequest(
-        sources=sources or _earlier_sources(earlier),
+        sources=sources or tuple(Path(str(source)) for source in earlier_sources),
         out=out,
         config=load_train_config(options["config_file"] or earlier, settings),
         start_from=start_from,
         **{name: options[name] for name in ("device", "prepared", "resume", "overwrite", "where")},
     )
     return execute(request, say)
-
-
-def _earlier_sources(earlier: Path | None) -> tuple[Path, ...]:
-    """The recordings that a training began with."""
-    section = {} if earlier is None else read_yaml(earlier).get(SOURCES_SECTION)
-    sources = section.get("sources", []) if isinstance(section, dict) else []
-    return tuple(Path(str(source)) for source in sources)

@@ -8,7 +8,7 @@ one sweep to the middle of the other, and the change of velocity is estimated wi
 the change is expected to continue as between the motions before.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.tracking import Degeneracy, lever_scale
-from lidarslam.odometry.alignment.point_to_plane import FINE_M, InlierSums, PairMotion, PointToPlane
+from lidarslam.odometry.alignment.point_to_plane import FINE_M, PairMotion, PointToPlane
 from lidarslam.odometry.alignment.steps import take_step, write_velocities
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
@@ -105,13 +105,13 @@ class Alignment:
 
 def align(start: InitialEstimate, sweeps: SweepPair, effort: Effort = NORMAL) -> Alignment:
     """Gauss-Newton on point-to-plane distances, with Geman-McClure weights whose scale shrinks from step to step."""
-    return align_each([start], sweeps, effort)[0]
+    return _align(start, sweeps, PointToPlane(sweeps, effort.column_step), effort.iterations)
 
 
-def align_each(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Effort = NORMAL) -> list[Alignment]:
-    """As `align`, from each of several initial estimates."""
-    cost = PointToPlane(sweeps, effort.column_step)
-    return [_align(start, sweeps, cost, effort.iterations) for start in starts]
+def _align_roughly(starts: Iterable[FloatArray], sweeps: SweepPair) -> list[Alignment]:
+    """From each of several motions (4, 4)."""
+    cost = PointToPlane(sweeps, _ROUGH.column_step)
+    return [_align(InitialEstimate(T), sweeps, cost, _ROUGH.iterations) for T in starts]
 
 
 def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterations: int) -> Alignment:
@@ -132,7 +132,20 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
         if done >= _ANNEALED and largest < _CONVERGED:
             break
     motion = _motion(T_prev_curr, innovation, sweeps)
-    return _alignment(T_prev_curr, 0.5 * (motion.late - motion.early), cost.fit(motion), information)
+    fit = cost.fit(motion)
+    explained, weakest = _explained(fit.in_view, fit.inlier)
+    return Alignment(
+        T_prev_curr=T_prev_curr,
+        velocity_change=0.5 * (motion.late - motion.early),
+        information=_marginal(fit.H, 1.0),
+        prior_information=information,
+        inlier_share=fit.inlier_share,
+        # Points that leave the other image's view do not count, unless they are most of the scan.
+        explained=explained * min(fit.share_in_view / _MOSTLY_IN_VIEW, 1.0),
+        weakest=weakest,
+        residual_m=float(np.sqrt(fit.squared_residuals / max(fit.inliers, 1))),
+        inliers=fit.inliers,
+    )
 
 
 def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> PairMotion:
@@ -171,22 +184,6 @@ def _compared(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArra
     return np.asarray(root, dtype=np.float64), ratios, axes
 
 
-def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: InlierSums, prior: FloatArray) -> Alignment:
-    explained, weakest = _explained(fit.in_view, fit.inlier)
-    return Alignment(
-        T_prev_curr=T_prev_curr,
-        velocity_change=change,
-        information=_marginal(fit.H, 1.0),
-        prior_information=prior,
-        inlier_share=fit.inlier_share,
-        # Points that leave the other image's view do not count, unless they are most of the scan.
-        explained=explained * min(fit.share_in_view / _MOSTLY_IN_VIEW, 1.0),
-        weakest=weakest,
-        residual_m=float(np.sqrt(fit.squared_residuals / max(fit.inliers, 1))),
-        inliers=fit.inliers,
-    )
-
-
 def _marginal(H: FloatArray, per_m2: float) -> FloatArray:
     """(6, 6) information of the motion, with the change of velocity marginalised by Schur's complement.
 
@@ -218,29 +215,27 @@ def align_best(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Eff
     best = align(_choose(starts, sweeps), sweeps, effort)
     if best.explained >= DOUBTFUL or not STEPS_M:
         return best
-    other = try_instead(best, _along_weakest(best), sweeps, effort)
+    moved = np.repeat(best.T_prev_curr[None], 2 * len(STEPS_M), axis=0)
+    moved[:, :3, 3] += np.outer(np.outer(STEPS_M, [1.0, -1.0]), best.weakest)  # to either side
+    other = try_instead(best, moved, sweeps, effort)
     if other is None or other.explained - best.explained <= _CLEARLY_BETTER * _sigmas_away(other, starts):
         return best
     return other
 
 
 def try_instead(
-    best: Alignment, starts: Sequence[FloatArray], sweeps: SweepPair, effort: Effort = NORMAL
+    best: Alignment, starts: Iterable[FloatArray], sweeps: SweepPair, effort: Effort = NORMAL
 ) -> Alignment | None:
     """The alignment from the most promising of many motions (4, 4), if it explains clearly more than the best."""
-    rough = align_each([InitialEstimate(T) for T in starts], sweeps, _ROUGH)
-    other = align(InitialEstimate(max(rough, key=lambda one: one.explained).T_prev_curr), sweeps, effort)
+    rough = max(_align_roughly(starts, sweeps), key=lambda one: one.explained)
+    other = align(InitialEstimate(rough.T_prev_curr), sweeps, effort)
     return other if other.explained - best.explained > _CLEARLY_BETTER else None
 
 
 def _sigmas_away(alignment: Alignment, starts: Sequence[InitialEstimate]) -> float:
     """Mahalanobis distance from the nearest initial estimate; 0 where none has a covariance."""
-    distances = []
-    for start in starts:
-        if start.information is not None:
-            away = log(alignment.T_prev_curr @ inverse(start.T_prev_curr))
-            distances.append(float(np.sqrt(away @ start.information @ away)))
-    return min(distances, default=0.0)
+    certain = [(log(alignment.T_prev_curr @ inverse(one.T_prev_curr)), one.information) for one in starts]
+    return min((float(np.sqrt(away @ known @ away)) for away, known in certain if known is not None), default=0.0)
 
 
 def _choose(starts: Sequence[InitialEstimate], sweeps: SweepPair) -> InitialEstimate:
@@ -249,16 +244,9 @@ def _choose(starts: Sequence[InitialEstimate], sweeps: SweepPair) -> InitialEsti
     away = np.array([log(start.T_prev_curr @ first) for start in starts])
     if (np.linalg.norm(away.reshape(-1, 2, 3), axis=2) < (_ALIKE_RAD, _ALIKE_M)).all():
         return starts[0]
-    rough = align_each([InitialEstimate(start.T_prev_curr) for start in starts], sweeps, _ROUGH)
+    rough = _align_roughly([start.T_prev_curr for start in starts], sweeps)
     scores = [one.explained - _CLEARLY_BETTER * start.sigmas for one, start in zip(rough, starts, strict=True)]
     return starts[int(np.argmax(scores))]
-
-
-def _along_weakest(alignment: Alignment) -> list[FloatArray]:
-    """The motion (4, 4), moved to either side along its weakest direction."""
-    moved = np.repeat(alignment.T_prev_curr[None], 2 * len(STEPS_M), axis=0)
-    moved[:, :3, 3] += np.outer(np.outer(STEPS_M, [1.0, -1.0]), alignment.weakest)
-    return list(moved)
 
 
 def find_degeneracy(information: FloatArray, inliers: int, images: SweepImages) -> Degeneracy:

@@ -84,7 +84,10 @@ def _correspond(
         if taken_back:
             _take_back(size, _single(motion.early), work)
         _project(size, planes, work)
-        _look_up(size, planes.pixels, work)
+        for k in range(size):
+            pixel = planes.pixels[int(work[_PIXEL + k])]
+            work[_AT_X + k], work[_AT_Y + k], work[_AT_Z + k] = pixel[0], pixel[1], pixel[2]
+            work[U + k], work[V + k], work[W + k], work[_T + k] = pixel[3], pixel[4], pixel[5], pixel[6]
     _judge(size, scale_m, is_robust, work)
 
 
@@ -157,15 +160,6 @@ def _project(size: int, planes: Planes, work: Floats) -> None:
         column = np.floor((azimuth + (_TURN if azimuth < _ZERO else _ZERO)) * columns_per_radian)
         column = column if column < width - _ONE else width - _ONE  # NaN lies in the last column
         work[_PIXEL + k] = row * width + column
-
-
-@compiled_part
-def _look_up(size: int, pixels: Floats, work: Floats) -> None:
-    """Write the point, the normal and the seconds of the pixels."""
-    for k in range(size):
-        pixel = pixels[int(work[_PIXEL + k])]
-        work[_AT_X + k], work[_AT_Y + k], work[_AT_Z + k] = pixel[0], pixel[1], pixel[2]
-        work[U + k], work[V + k], work[W + k], work[_T + k] = pixel[3], pixel[4], pixel[5], pixel[6]
 
 
 @compiled_part
@@ -316,12 +310,7 @@ class InlierSums:
 
 
 class PointToPlane:
-    """The points of the current sweep against the planes of the previous one.
-
-    Args:
-        sweeps: the pair.
-        column_step: stride of the columns whose points are used.
-    """
+    """The points of every `column_step`-th column of the current sweep against the planes of the previous one."""
 
     def __init__(self, sweeps: SweepPair, column_step: int) -> None:
         self._points, self._count = _points(sweeps.current, column_step)

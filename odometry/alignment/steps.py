@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from lidarslam.core.compiled import compiled, compiled_part
-from lidarslam.core.geometry import SMALL_ANGLE, FloatArray, coefficients
+from lidarslam.core.geometry import FloatArray, coefficients, exp_rows, log_translation, rotation_vector
 
 # Information that keeps the normal equations solvable.
 _DAMPING = 1e-3
@@ -13,7 +13,8 @@ _DAMPING = 1e-3
 _LARGEST_STEP = 0.3
 _UNKNOWNS = 12
 
-_coefficients = compiled_part(coefficients)
+_coefficients, _exp_rows = compiled_part(coefficients), compiled_part(exp_rows)
+_rotation_vector, _log_translation = compiled_part(rotation_vector), compiled_part(log_translation)
 
 
 @compiled
@@ -48,10 +49,15 @@ def take_step(
     for i in range(6):
         largest = max(largest, abs(step[i]))
         innovation[i] -= step[6 + i]
-    shortened, change = -_LARGEST_STEP / max(largest, _LARGEST_STEP), np.empty((4, 4))
+    shortened, change = -_LARGEST_STEP / max(largest, _LARGEST_STEP), np.zeros((4, 4))
     for i in range(6):
         step[i] *= shortened
-    _exp(step, change)
+    a, b, c = step[0], step[1], step[2]
+    s, v, w = _coefficients(math.sqrt(a * a + b * b + c * c))
+    rows = _exp_rows(a, b, c, step[3], step[4], step[5], s, v, w)
+    for i in range(12):
+        change[i // 4, i % 4] = rows[i]
+    change[3, 3] = 1.0
     _multiply(change, T, moved)
     for i in range(4):
         for j in range(4):
@@ -107,60 +113,11 @@ def _multiply(T_a_b: FloatArray, T_b_c: FloatArray, T_a_c: FloatArray) -> None:
 
 
 @compiled_part
-def _exp(xi: FloatArray, T: FloatArray) -> None:
-    """Write `lidarslam.core.geometry.exp` of the first six numbers."""
-    a, b, c, x, y, z = xi[0], xi[1], xi[2], xi[3], xi[4], xi[5]
-    s, v, j = _coefficients(math.sqrt(a * a + b * b + c * c))
-    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
-    u, w, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x v
-    T[0, 0], T[0, 1], T[0, 2], T[0, 3] = (
-        1.0 - v * (bb + cc),
-        v * ab - s * c,
-        v * ac + s * b,
-        x + v * u + j * (b * h - c * w),
-    )
-    T[1, 0], T[1, 1], T[1, 2], T[1, 3] = (
-        v * ab + s * c,
-        1.0 - v * (aa + cc),
-        v * bc - s * a,
-        y + v * w + j * (c * u - a * h),
-    )
-    T[2, 0], T[2, 1], T[2, 2], T[2, 3] = (
-        v * ac - s * b,
-        v * bc + s * a,
-        1.0 - v * (aa + bb),
-        z + v * h + j * (a * w - b * u),
-    )
-    T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
-
-
-@compiled_part
 def _log(T: FloatArray, xi: FloatArray) -> None:
-    """Write `lidarslam.core.geometry.log` (6,), by the best conditioned of four multiples of the quaternion."""
-    i, j, k = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
-    p, q, r = T[0, 1] + T[1, 0], T[0, 2] + T[2, 0], T[1, 2] + T[2, 1]
-    real = 1.0 + T[0, 0] + T[1, 1] + T[2, 2]
-    by_x, by_y, by_z = (
-        1.0 + T[0, 0] - T[1, 1] - T[2, 2], 1.0 - T[0, 0] + T[1, 1] - T[2, 2], 1.0 - T[0, 0] - T[1, 1] + T[2, 2]
+    """Write `lidarslam.core.geometry.log` (6,)."""
+    a, b, c, angle = _rotation_vector(
+        T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2], T[2, 0], T[2, 1], T[2, 2]
     )  # fmt: skip
-    if real >= by_x and real >= by_y and real >= by_z:
-        w, a, b, c = real, i, j, k
-    elif by_x >= by_y and by_x >= by_z:
-        w, a, b, c = i, by_x, p, q
-    elif by_y >= by_z:
-        w, a, b, c = j, p, by_y, r
-    else:
-        w, a, b, c = k, q, r, by_z
-    sine = math.sqrt(a * a + b * b + c * c)
-    angle = 2.0 * math.atan2(sine, abs(w))
-    scale = math.copysign(angle / sine if sine > 0.0 else 0.0, w)
-    a, b, c = scale * a, scale * b, scale * c
     s, v, _ = _coefficients(angle)
-    near = angle < SMALL_ANGLE
-    coefficient = 1.0 / 12.0 + angle * angle / 720.0 if near else (1.0 - s / (2.0 * v)) / (angle * angle)
-    x, y, z = T[0, 3], T[1, 3], T[2, 3]
-    u, g, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x t
     xi[0], xi[1], xi[2] = a, b, c
-    xi[3] = x - 0.5 * u + coefficient * (b * h - c * g)
-    xi[4] = y - 0.5 * g + coefficient * (c * u - a * h)
-    xi[5] = z - 0.5 * h + coefficient * (a * g - b * u)
+    xi[3], xi[4], xi[5] = _log_translation(a, b, c, T[0, 3], T[1, 3], T[2, 3], angle, s, v)

@@ -67,17 +67,11 @@ class SweepImages:
 
     def with_normal(self) -> int:
         """Number of pixels with a normal."""
-        return _filled(self.normals)
+        return int(np.count_nonzero(self.normals.any(axis=0)))
 
     def share_with_normal(self) -> float:
         """Of the pixels that have a point; 0 when there are none."""
-        return self.with_normal() / max(_filled(self.points), 1)
-
-
-def _filled(image: Floats) -> int:
-    """Number of pixels of an image (3, H, W) that are not zero."""
-    x, y, z = image != 0.0
-    return int(np.count_nonzero(x | y | z))
+        return self.with_normal() / max(int(np.count_nonzero(self.points.any(axis=0))), 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,13 @@ Two things differ from calling the library: it runs in a child process, because 
 which belongs to the end of the sweep, is expressed at the scan's stamp.
 """
 
-import contextlib
-import json
 import logging
 import subprocess
 import sys
 from dataclasses import dataclass
+from multiprocessing import Pipe
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.odometry.config import KissConfig
 from lidarslam.odometry.interface import Motion
-from lidarslam.odometry.methods.kiss_worker import receive, send
 
 _log = logging.getLogger(__name__)
 
@@ -34,36 +32,31 @@ class OdometryError(LidarSlamError):
 
 
 class _Worker:
-    """The child process.
-
-    Raises:
-        OdometryError: it did not start.
-    """
+    """The child process; OdometryError where it does not start."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
+        self._pipe, end = Pipe()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "lidarslam.odometry.methods.kiss_worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
+            [sys.executable, "-m", "lidarslam.odometry.methods.kiss_worker", str(end.fileno())],
+            stdin=subprocess.DEVNULL,
+            stdout=2,  # the library's output
+            pass_fds=[end.fileno()],
             cwd=Path(__file__).resolve().parents[2],  # a folder called odometry in the working directory must not win
         )
-        self._requests, self._replies = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
+        end.close()
         try:
-            send(self._requests, np.array(json.dumps(settings)))
-            receive(self._replies)
+            self.ask(settings)
         except (EOFError, OSError) as error:
             raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?") from error
 
-    def register(self, points: FloatArray, stamps: FloatArray) -> tuple[FloatArray, int]:
-        """The pose (4, 4) of a scan and the number of points registered; EOFError or OSError if the child died."""
-        send(self._requests, points, stamps)
-        return receive(self._replies), int(receive(self._replies))
+    def ask(self, message: Any) -> Any:
+        """The answer to a message, see `kiss_worker`; EOFError or OSError if the child died."""
+        self._pipe.send(message)
+        return self._pipe.recv()
 
     def close(self) -> int:
         """End the child; its exit status, negative for the signal that ended it."""
-        for stream in (self._requests, self._replies):
-            with contextlib.suppress(OSError):  # unwritten data has no reader
-                stream.close()
+        self._pipe.close()
         try:
             return self._process.wait(timeout=5.0)
         except subprocess.TimeoutExpired:
@@ -99,7 +92,7 @@ class KissOdometry:
         try:
             if self._worker is None:
                 self._worker = _Worker(_library_settings(self._config))
-            T_map_lidar, points_used = self._worker.register(scan.points, offsets)
+            T_map_lidar, points_used = self._worker.ask((scan.points, offsets))
         except (EOFError, OSError):
             return self._predict(scan.stamp, self._bury_worker())
         last, self._last = self._last, _TimedPose(self._pose_time(scan, offsets), T_map_lidar)

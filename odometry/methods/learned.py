@@ -59,12 +59,9 @@ class _Sweep:
 
 
 class LearnedOdometry(Stateful):
-    """Motions between consecutive scans from a trained network.
+    """Motions between consecutive scans by the candidates of a trained network, whose images have the size `images`.
 
-    Args:
-        search: finds candidates with the trained network.
-        images: size of the network's images.
-        is_aligned: whether candidates are refined; else the first is the motion.
+    Not aligned, the first candidate is the motion as it is.
     """
 
     _last: _Sweep | None
@@ -93,7 +90,9 @@ class LearnedOdometry(Stateful):
         if not len(scan):
             return Motion(np.eye(4), 0, "the scan is empty")
         if self._skipped is not None:
-            self._take_skipped(self._skipped)
+            self._forget()
+            self._begin(self._skipped, self._imager.images(self._skipped))
+            self._skipped = None
         images = self._imager.images(scan)
         motion = self._estimate(scan, images)
         has_own_axes = np.array_equal(images.R_image_lidar, np.eye(3))
@@ -103,14 +102,10 @@ class LearnedOdometry(Stateful):
         """Take a scan with points whose motion is not asked for; see `SkippingOdometry`."""
         self._skipped = scan
 
-    def _take_skipped(self, scan: Scan) -> None:
-        """Restart with a scan that was skipped."""
-        self._forget()
-        images = self._imager.images(scan)
-        shown = images.network
-        self._described = self._search.describe(shown.points, shown.normals)
-        middle = scan.stamp + scan.middle_offset_s
-        self._last, self._skipped = _Sweep(images, self._described.heading, scan.stamp, middle), None
+    def _begin(self, scan: Scan, images: ScanImages) -> None:
+        """The next motion is relative to this scan, whose own is not estimated."""
+        self._described = self._search.describe(images.network.points, images.network.normals)
+        self._last = _Sweep(images, self._described.heading, scan.stamp, scan.stamp + scan.middle_offset_s)
 
     def _estimate(self, scan: Scan, images: ScanImages) -> Motion:
         """The motion in the images' axes."""
@@ -118,13 +113,13 @@ class LearnedOdometry(Stateful):
         if last is not None and not np.array_equal(last.images.R_image_lidar, images.R_image_lidar):
             self._forget()
             last = None
-        shown = images.network
-        if last is None or self._described is None or middle <= last.middle:
-            self._described = self._search.describe(shown.points, shown.normals)
-            self._last = _Sweep(images, self._described.heading, scan.stamp, middle)
-            if last is None:
-                return Motion(np.eye(4), images.alignment.with_normal())
+        if last is None or self._described is None:
+            self._begin(scan, images)
+            return Motion(np.eye(4), images.alignment.with_normal())
+        if middle <= last.middle:
+            self._begin(scan, images)
             return Motion(np.eye(4), 0, "the scan is not later than the one before")
+        shown = images.network
         candidates, self._described = self._search.compare(self._described, shown.points, shown.normals)
         self._last = sweep = _Sweep(images, self._described.heading, scan.stamp, middle)
         if not all(candidate.is_motion() for candidate in candidates):
@@ -132,8 +127,8 @@ class LearnedOdometry(Stateful):
             return Motion(np.eye(4), 0, "the network's answer is not a motion; try other weights")
         if self._is_aligned:
             return self._refined(candidates, last, sweep)
-        motion = self._motion(candidates[0].T_prev_curr, candidates[0].covariance, np.zeros(6), last, sweep)
-        return replace(motion, points_used=images.network.with_normal())
+        first, used = candidates[0], shown.with_normal()
+        return self._motion(first.T_prev_curr, first.covariance, np.zeros(6), last, sweep, used)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -157,8 +152,8 @@ class LearnedOdometry(Stateful):
             best = align(InitialEstimate(start, held, held), sweeps)
             information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
         elif len(degeneracy):
-            seen = INFORMATION_PER_M2 * best.information
-            information = joined_information(seen, candidates[0].covariance, degeneracy)
+            covariance = candidates[0].covariance
+            information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
         else:
             information = INFORMATION_PER_M2 * best.information + best.prior_information
         if best.explained < _LEAST_EXPLAINED or best.inliers < _LEAST_INLIERS:
@@ -166,21 +161,19 @@ class LearnedOdometry(Stateful):
             misfit = f"{best.inliers} inliers, {100.0 * best.explained:.0f} % of the information about one direction"
             return Motion(np.eye(4), 0, f"the scan does not fit the last one: {misfit}")
         covariance = np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)), dtype=np.float64)
-        motion = self._motion(best.T_prev_curr, covariance, best.velocity_change, last, sweep)
-        return replace(motion, points_used=best.inliers, degenerate=degeneracy.names)
+        motion = self._motion(best.T_prev_curr, covariance, best.velocity_change, last, sweep, best.inliers)
+        return replace(motion, degenerate=degeneracy.names)
 
     def _motion(
-        self, T_prev_curr: FloatArray, covariance: FloatArray, change: FloatArray, last: _Sweep, sweep: _Sweep
-    ) -> Motion:
-        """The motion between the stamps from that between the middles, whose covariance is of a change from the left.
-
-        The points that it rests on are left to the caller.
-        """
+        self, T_prev_curr: FloatArray, covariance: FloatArray, change: FloatArray, last: _Sweep, sweep: _Sweep,
+        points_used: int,
+    ) -> Motion:  # fmt: skip
+        """The motion between the stamps by that between the middles, whose covariance is of a change from the left."""
         self._last_covariance = covariance
         interval_s = sweep.middle - last.middle
         stamps, middles = (last.stamp, sweep.stamp), (last.middle, sweep.middle)
         between = self._interpolator.between_stamps(T_prev_curr, change, middles, stamps)
-        return Motion(between, 0, covariance=_right_covariance(T_prev_curr, covariance, change * interval_s))
+        return Motion(between, points_used, covariance=_right_covariance(T_prev_curr, covariance, change * interval_s))
 
     def _forget(self) -> None:
         """The next motion does not follow on the last."""

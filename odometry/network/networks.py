@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -27,13 +26,10 @@ from lidarslam.odometry.network.torch_geometry import make_transform, rotation_f
 class PairImages:
     """The input of the networks for B pairs of scans."""
 
-    # previous, current: (B, 6, H, W) points and normals
-    previous: Tensor
-    current: Tensor
-    # bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) seen from above, the current scan turned by about the
-    # turn between the two; None for networks that do not look from above
-    bird_previous: Tensor | None = None
-    bird_current: Tensor | None = None
+    scans: Tensor  # (B, 2, 6, H, W) points and normals of the previous and the current scan
+    # (B, 2, CHANNELS, CELLS, CELLS) both seen from above, the current scan turned by about the turn between the two;
+    # None for networks that do not look from above
+    birds: Tensor | None = None
     scale: Tensor | None = None  # (B,) of the scene in these grids, as in `training.pairs`; None: its own
 
 
@@ -51,11 +47,8 @@ class PairEstimate:
     shift_scores: Tensor  # (B, SHIFTS, SHIFTS) the same of shifts by whole cells along y and x; (B, 0, 0) without
 
 
-class PairNetwork(Protocol):
-    """A network that estimates the motion between two scans."""
-
-    def __call__(self, pairs: PairImages) -> PairEstimate:
-        """The motions of B pairs."""
+PairNetwork = Callable[[PairImages], PairEstimate]
+"""A network that estimates the motion between two scans, for B pairs."""
 
 
 def make_network(config: NetworkConfig) -> nn.Module:
@@ -67,7 +60,7 @@ def of_two_images(network: PairNetwork) -> Callable[[Tensor, Tensor], tuple[Tens
     """The network as a function of two images (B, 6, H, W): the motions (B, 4, 4) and log sigma (B, 6)."""
 
     def estimate(previous: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
-        estimated = network(PairImages(previous, current))
+        estimated = network(PairImages(torch.stack([previous, current], dim=1)))
         return estimated.T_prev_curr, estimated.log_sigma
 
     return estimate
@@ -267,10 +260,10 @@ class CorrelationNetwork(nn.Module):
 
     def forward(self, pairs: PairImages) -> PairEstimate:
         """The motions of B pairs that are seen from above as well."""
-        if pairs.bird_previous is None or pairs.bird_current is None:
+        if pairs.birds is None:
             raise ValueError("the network `correlation` needs the scans as seen from above")
-        images, birds = torch.cat([pairs.previous, pairs.current]), torch.cat([pairs.bird_previous, pairs.bird_current])
-        columns, cells = self.columns(images[:, :3], images[:, 3:]), self.bird(birds)
+        images, grids = (both.transpose(0, 1).flatten(0, 1) for both in (pairs.scans, pairs.birds))  # (2 B, C, H, W)
+        columns, cells = self.columns(images[:, :3], images[:, 3:]), self.bird(grids)
         turn_scores = self.turn_scores(*columns.chunk(2))
         shift_scores = self.shift_scores(*cells.chunk(2))
         angle, shift, log_sigma = self.peaks(turn_scores, shift_scores)
@@ -341,7 +334,9 @@ class DeloraNetwork(nn.Module):
 
     def forward(self, pairs: PairImages) -> PairEstimate:
         """The motions of B pairs, with constant standard deviations."""
-        images = torch.cat([_with_ranges(pairs.previous), _with_ranges(pairs.current)], dim=1)  # (B, 8, H, W)
+        points = pairs.scans[:, :, :3]
+        ranges = points.square().sum(2, keepdim=True).sqrt()
+        images = torch.cat([points, ranges], dim=2).flatten(1, 2)  # (B, 8, H, W)
         features = self.stages(self.stem(images))  # (B, 64, H, W/4) -> (B, 512, H/2, W/32)
         shared = self.trunk(self.pool(features).flatten(1))  # (B, 512, 1, 1) -> (B, 1000)
         quaternions = self.rotation(shared)  # (B, 4), w first, of any length
@@ -364,12 +359,6 @@ class _DeloraBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.tanh(self.residual(x) + self.shortcut(x))
-
-
-def _with_ranges(images: Tensor) -> Tensor:
-    """(B, 4, H, W) points and ranges of points and normals (B, 6, H, W)."""
-    points = images[:, :3]
-    return torch.cat([points, points.square().sum(1, keepdim=True).sqrt()], dim=1)
 
 
 def _around(layer: nn.Module) -> nn.Module:

@@ -5,7 +5,7 @@ points and normals only: correspondences are taken as given.
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from scipy.spatial import cKDTree
@@ -22,8 +22,7 @@ from lidarslam.odometry.training.pairs import PairBatch
 _GATE_M, _HUBER_M = 1.0, 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Surfaces:
+class Surfaces(NamedTuple):
     """Points of scans and the surfaces they lie on."""
 
     points: Tensor  # (B, N, 3), metres, in the frame of each scan; zero where there is none. Finite everywhere.
@@ -31,14 +30,12 @@ class Surfaces:
     valid: Tensor  # (B, N) bool, which points have a normal
 
 
-@dataclass(frozen=True, eq=False)
-class GeometricLoss:
+class GeometricLoss(NamedTuple):
     """A loss and its parts, (B,) each; parts that are switched off are there, but not in the total."""
 
     total: Tensor  # the objective
     point_to_plane: Tensor  # m^2 (also with the robust kernel)
     plane_to_plane: Tensor  # no unit
-    matched_share: Tensor  # correspondences, of the source points with a normal, 0 to 1
 
 
 def geometric_loss(T_prev_curr: Tensor, source: Surfaces, target: Surfaces, config: LossConfig) -> GeometricLoss:
@@ -58,19 +55,11 @@ def geometric_loss(T_prev_curr: Tensor, source: Surfaces, target: Surfaces, conf
     weight = counts.to(points.dtype)
     target_normals = _pick(target.normals, index)
     residual = ((points - _pick(target.points, index)) * target_normals).sum(-1)
-    squared = _huber(residual) if config.robust else residual.square()
-    point_to_plane = _mean(squared, weight)
+    huber = 2.0 * functional.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=_HUBER_M)
+    point_to_plane = _mean(huber if config.robust else residual.square(), weight)
     plane_to_plane = _mean((normals - target_normals).square().sum(-1), weight)
-    total = torch.zeros_like(point_to_plane)
-    if config.point_to_plane:
-        total = total + point_to_plane
-    if config.plane_to_plane:
-        total = total + plane_to_plane
-    return GeometricLoss(total, point_to_plane, plane_to_plane, weight.sum(1) / source.valid.sum(1).clamp(min=1))
-
-
-def _huber(residual: Tensor) -> Tensor:
-    return 2.0 * functional.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=_HUBER_M)
+    total = config.point_to_plane * point_to_plane + config.plane_to_plane * plane_to_plane
+    return GeometricLoss(total, point_to_plane, plane_to_plane)
 
 
 def _pick(values: Tensor, index: Tensor) -> Tensor:
@@ -114,8 +103,7 @@ def nearest(query: Tensor, reference: Tensor, valid: Tensor) -> tuple[Tensor, Te
 def _by_kd_tree(query: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
     """Index and distance (N,) for queries (N, 3)."""
     # Splitting at the middle instead of the median builds faster, which counts as every tree is used once.
-    tree = cKDTree(reference.numpy(), balanced_tree=False, compact_nodes=False)
-    lengths, found = tree.query(query.numpy())
+    lengths, found = cKDTree(reference.numpy(), balanced_tree=False, compact_nodes=False).query(query.numpy())
     return torch.from_numpy(found), torch.from_numpy(lengths)
 
 
@@ -138,8 +126,7 @@ _TRANSLATION_M = 0.05
 _NEAR_ROTATION, _NEAR_TRANSLATION_M = math.radians(4.0), 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class Objective:
+class Objective(NamedTuple):
     """A loss and its parts, means over the valid pairs; parts that are switched off are zero."""
 
     total: Tensor
@@ -157,8 +144,11 @@ def objective(estimate: PairEstimate, batch: PairBatch, config: TrainingConfig, 
     total, alignment, confidence, turn, shift, planes, normals = (zero,) * 7
     if config.alignment_weight:
         error = motion_error(estimate.T_prev_curr, batch.T_prev_curr)
-        scale = _scale(batch)
-        is_near = _is_near(error, scale) if estimate.turn_scores.shape[1] else torch.ones_like(batch.valid)
+        scale = torch.ones_like(batch.T_prev_curr[:, 0, 0]) if batch.scale is None else batch.scale
+        is_near = torch.ones_like(batch.valid)
+        if estimate.turn_scores.shape[1]:  # the position of a wrong peak has no useful gradient
+            rotation, translation = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
+            is_near = (rotation < _NEAR_ROTATION) & (translation * scale < _NEAR_TRANSLATION_M)
         alignment = _mean_of_valid(_distance(error), batch.valid & is_near)
         confidence = _mean_of_valid(_negative_log_likelihood(error, estimate.log_sigma), batch.valid)
         if estimate.turn_scores.shape[1]:
@@ -168,9 +158,9 @@ def objective(estimate: PairEstimate, batch: PairBatch, config: TrainingConfig, 
             in_reach = cells.abs().amax(1) < bird_eye.MOST_CELLS - 1
             shift = _mean_of_valid(_shift_loss(estimate.shift_scores, cells), batch.valid & in_reach)
         total = total + config.alignment_weight * (0.3 * alignment + 0.1 * confidence + turn + shift)
-    if config.geometric is not None and batch.previous_surfaces is not None and batch.current_surfaces is not None:
-        current = _surfaces(batch.current_surfaces, _GEOMETRIC_POINTS, generator)
-        loss = geometric_loss(estimate.T_prev_curr, current, _surfaces(batch.previous_surfaces), config.geometric)
+    if config.geometric is not None and batch.surfaces is not None:
+        current = _surfaces(batch.surfaces[:, 1], _GEOMETRIC_POINTS, generator)
+        loss = geometric_loss(estimate.T_prev_curr, current, _surfaces(batch.surfaces[:, 0]), config.geometric)
         planes, normals = (_mean_of_valid(part, batch.valid) for part in (loss.point_to_plane, loss.plane_to_plane))
         total = total + _mean_of_valid(loss.total, batch.valid)
     return Objective(total, alignment, confidence, turn, shift, planes, normals)
@@ -181,11 +171,6 @@ def motion_error(T_prev_curr: Tensor, target: Tensor) -> Tensor:
     return log(T_prev_curr @ inverse(target))
 
 
-def _scale(batch: PairBatch) -> Tensor:
-    """(B,) of the scenes in the bird's-eye grids."""
-    return torch.ones_like(batch.T_prev_curr[:, 0, 0]) if batch.scale is None else batch.scale
-
-
 def _distance(error: Tensor) -> Tensor:
     """(B,) rotation and translation, each in its unit, squared when small and linear when large."""
     rotation = error[:, :3].norm(dim=1) / _ROTATION
@@ -193,13 +178,6 @@ def _distance(error: Tensor) -> Tensor:
     return functional.smooth_l1_loss(
         torch.stack([rotation, translation], dim=1), error.new_zeros(len(error), 2), reduction="none"
     ).sum(dim=1)
-
-
-def _is_near(error: Tensor, scale: Tensor) -> Tensor:
-    """(B,) whether the right peak was found; the position of a wrong one has no useful gradient."""
-    rotation, translation = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
-    near: Tensor = (rotation < _NEAR_ROTATION) & (translation * scale < _NEAR_TRANSLATION_M)
-    return near
 
 
 def _negative_log_likelihood(error: Tensor, log_sigma: Tensor) -> Tensor:
@@ -233,11 +211,10 @@ def _shift_loss(scores: Tensor, cells: Tensor) -> Tensor:
     column, row = low.long().unbind(1)
     likelihood = scores.flatten(1).log_softmax(dim=1)
     loss = torch.zeros_like(share[:, 0])
-    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        along_x = share[:, 0] if across else 1.0 - share[:, 0]
-        along_y = share[:, 1] if down else 1.0 - share[:, 1]
-        index = ((row + down) * count + column + across)[:, None]
-        loss = loss - along_x * along_y * likelihood.gather(1, index)[:, 0]
+    for down, along_y in enumerate((1.0 - share[:, 1], share[:, 1])):
+        for across, along_x in enumerate((1.0 - share[:, 0], share[:, 0])):
+            index = ((row + down) * count + column + across)[:, None]
+            loss = loss - along_x * along_y * likelihood.gather(1, index)[:, 0]
     return loss
 
 

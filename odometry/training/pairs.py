@@ -54,10 +54,8 @@ AUGMENTATION = Augmentation()
 class PairBatch(PairImages):
     """B pairs of scans: the raw sweeps, which the network sees, and the surfaces that the losses compare."""
 
-    # previous_surfaces, current_surfaces: (B, 6, H, W) points and normals as of the middle of each sweep; None
-    # where the losses do not need them
-    previous_surfaces: Tensor | None = None
-    current_surfaces: Tensor | None = None
+    # (B, 2, 6, H, W) points and normals as of the middle of each sweep; None where the losses do not need them
+    surfaces: Tensor | None = None
     T_prev_curr: Tensor  # (B, 4, 4) pseudo-labels
     valid: Tensor  # (B,) whether these are reliable
 
@@ -66,25 +64,16 @@ class PairBatch(PairImages):
         values = {name: value for name, value in vars(self).items() if value is not None}
         return replace(self, **{name: value.to(device, non_blocking=True) for name, value in values.items()})
 
-    def changed(
-        self, previous: Callable[[Tensor], Tensor], current: Callable[[Tensor], Tensor], T_prev_curr: Tensor
-    ) -> "PairBatch":
-        """The batch with its images changed, and the motions that follow from it."""
-        return replace(
-            self,
-            previous=previous(self.previous),
-            current=current(self.current),
-            previous_surfaces=None if self.previous_surfaces is None else previous(self.previous_surfaces),
-            current_surfaces=None if self.current_surfaces is None else current(self.current_surfaces),
-            T_prev_curr=T_prev_curr,
-        )
+    def changed(self, change: Callable[[Tensor], Tensor], T_prev_curr: Tensor) -> "PairBatch":
+        """The batch with its points and normals (B, 2, 6, H, W) changed, and the motions that follow from it."""
+        surfaces = None if self.surfaces is None else change(self.surfaces)
+        return replace(self, scans=change(self.scans), surfaces=surfaces, T_prev_curr=T_prev_curr)
 
 
 def augmented(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
     """Pairs changed at random, each separately."""
     batch = _scaled(_mirrored(_turned(batch, config, generator), config, generator), config, generator)
-    previous, current = (_worn(images, config, generator) for images in (batch.previous, batch.current))
-    return replace(batch, previous=previous, current=current)
+    return replace(batch, scans=torch.stack([_worn(images, config, generator) for images in batch.scans.unbind(1)], 1))
 
 
 def _uniform(generator: Generator, *shape: int) -> Tensor:
@@ -101,7 +90,7 @@ def _columns(generator: Generator, width: int, size: int) -> Tensor:
 
 def _turned(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
     """Both scans turned about z by whole columns, the current one by some more."""
-    size, width = len(batch.previous), batch.previous.shape[-1]
+    size, width = len(batch.scans), batch.scans.shape[-1]
     both = _columns(generator, width, size)
     both = torch.where(_uniform(generator, size) < config.heading, both, 0)
     more = _normal(generator, size) * (config.roll_deg * width / 360.0)
@@ -109,12 +98,8 @@ def _turned(batch: PairBatch, config: Augmentation, generator: Generator) -> Pai
     more = torch.where(anywhere, _columns(generator, width, size).float(), more.round())
     more = torch.where(_uniform(generator, size) < config.roll, more, 0.0).long()
     T = _turns(both, width) @ batch.T_prev_curr @ _turns(both + more, width).mT
-    return batch.changed(lambda images: _rotated(images, both), lambda images: _rotated(images, both + more), T)
-
-
-def _rotated(images: Tensor, columns: Tensor) -> Tensor:
-    """Points and normals (B, 6, H, W) turned about z."""
-    return torch.cat([rotate_columns(images[:, :3], columns), rotate_columns(images[:, 3:], columns)], dim=1)
+    columns = torch.stack([both, both + more], dim=1)[..., None]
+    return batch.changed(lambda images: rotate_columns(torch.unflatten(images, 2, (2, 3)), columns).flatten(2, 3), T)
 
 
 def _turns(columns: Tensor, width: int) -> Tensor:
@@ -123,32 +108,30 @@ def _turns(columns: Tensor, width: int) -> Tensor:
 
 
 def _mirrored(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
-    chosen = _uniform(generator, len(batch.previous)) < config.mirror
+    chosen = _uniform(generator, len(batch.scans)) < config.mirror
     M = torch.diag(batch.T_prev_curr.new_tensor([1.0, -1.0, 1.0, 1.0]))
 
-    def one(images: Tensor) -> Tensor:
-        flipped = torch.cat([mirror(images[:, :3]), mirror(images[:, 3:])], dim=1)
-        return torch.where(chosen[:, None, None, None], flipped, images)
+    def change(images: Tensor) -> Tensor:
+        flipped = mirror(torch.unflatten(images, 2, (2, 3))).flatten(2, 3)
+        return torch.where(chosen[:, None, None, None, None], flipped, images)
 
-    return batch.changed(one, one, torch.where(chosen[:, None, None], M @ batch.T_prev_curr @ M, batch.T_prev_curr))
+    return batch.changed(change, torch.where(chosen[:, None, None], M @ batch.T_prev_curr @ M, batch.T_prev_curr))
 
 
 def _scaled(batch: PairBatch, config: Augmentation, generator: Generator) -> PairBatch:
-    exponent = 2.0 * _uniform(generator, len(batch.previous)) - 1.0
+    exponent = 2.0 * _uniform(generator, len(batch.scans)) - 1.0
     scale = (1.0 + config.scale) ** exponent
-    factors = scale.new_ones(len(scale), 6, 1, 1)
-    factors[:, :3, 0, 0] = scale[:, None]
+    factors = scale.new_ones(len(scale), 1, 6, 1, 1)
+    factors[:, :, :3] = scale[:, None, None, None, None]
     T = batch.T_prev_curr.clone()
     T[:, :3, 3] *= scale[:, None]
-    return batch.changed(lambda images: images * factors, lambda images: images * factors, T)
+    return batch.changed(lambda images: images * factors, T)
 
 
 def _worn(images: Tensor, config: Augmentation, generator: Generator) -> Tensor:
     """Scans of a worse sensor: noise, missing points, beams and directions."""
     size, _, height, width = images.shape
-
     uniform = partial(_uniform, generator, size)
-
     kept = uniform(height, width) >= config.drop_points * uniform(1, 1)
     beams = uniform(height, 1) >= 0.5 * uniform(1, 1) * (uniform(1, 1) < config.drop_beams)
     hidden = 0.25 * uniform(1, 1) * (uniform(1, 1) < config.hide_sector)
@@ -189,23 +172,22 @@ def rotate_columns(images: Tensor, shift: Tensor) -> Tensor:
     """Images of the clouds turned about z by whole columns, to the left (x towards y) where positive.
 
     Args:
-        images: (B, C, H, W), C at least 2; channels 0 and 1 are components along x and y, of points or of normals.
-        shift: columns, (B,) integers.
+        images: (..., C, H, W), C at least 2; channels 0 and 1 are components along x and y, of points or of normals.
+        shift: columns, (...) integers.
     """
     width = images.shape[-1]
-    columns = (torch.arange(width, device=images.device) - shift[:, None]).remainder(width)
-    moved = images.gather(3, columns[:, None, None, :].expand(images.shape))
-    angles = shift.double()[:, None, None] * (2.0 * math.pi / width)
+    columns = (torch.arange(width, device=images.device) - shift[..., None]).remainder(width)
+    moved = images.gather(-1, columns[..., None, None, :].expand(images.shape))
+    angles = shift.double()[..., None, None] * (2.0 * math.pi / width)
     cos, sin = angles.cos().to(images.dtype), angles.sin().to(images.dtype)
-    x, y = moved[:, 0], moved[:, 1]
-    turned = torch.stack([cos * x - sin * y, sin * x + cos * y], dim=1)
-    return torch.cat([turned, moved[:, 2:]], dim=1)
+    x, y, *others = moved.unbind(-3)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y, *others], dim=-3)
 
 
 def mirror(images: Tensor) -> Tensor:
-    """Images (B, C, H, W) of the clouds with y negated; channel 1 is the component along y."""
-    flipped = images.flip(-1)
-    return torch.cat([flipped[:, :1], -flipped[:, 1:2], flipped[:, 2:]], dim=1)
+    """Images (..., C, H, W) of the clouds with y negated; channel 1 is the component along y."""
+    x, y, *others = images.flip(-1).unbind(-3)
+    return torch.stack([x, -y, *others], dim=-3)
 
 
 def compensated(points: Tensor, normals: Tensor, offsets: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
@@ -237,16 +219,13 @@ _SEEDS = 2**63
 
 
 class Pairs:
-    """Draws batches of pairs from recordings.
+    """Draws batches of pairs from recordings, a recording or more, and changes them on a device.
 
     Args:
-        recordings: to draw from.
-        seed: of all draws.
+        recordings, seed, augmentation, device: see above.
         surfaces: whether the losses need compensated scans.
         birds: whether the network looks from above.
         weights: how often each recording is drawn, relative to the others; None: equally often.
-        augmentation: how pairs are changed.
-        device: where they are changed.
     """
 
     def __init__(
@@ -259,15 +238,9 @@ class Pairs:
         augmentation: Augmentation = AUGMENTATION,
         device: torch.device | str = "cpu",
     ) -> None:
-        if not recordings:
-            raise ValueError("training needs a recording or more, got none")
-        self._recordings = recordings
-        self._seed = seed
-        self._surfaces = surfaces
-        self._birds = birds
+        self._recordings, self._seed, self._surfaces, self._birds = recordings, seed, surfaces, birds
         self._weights = torch.tensor([1.0] * len(recordings) if weights is None else weights, dtype=torch.float64)
-        self._augmentation = augmentation
-        self._device = torch.device(device)
+        self._augmentation, self._device = augmentation, torch.device(device)
 
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
         """The pairs of one step, on the device."""
@@ -288,27 +261,23 @@ class Pairs:
 
     def _seen_from_above(self, batch: PairBatch, generator: Generator) -> PairBatch:
         """The pairs with bird's-eye grids; the turn between the scans is known to within an error."""
-        size = len(batch.previous)
+        size = len(batch.scans)
         turns = torch.atan2(batch.T_prev_curr[:, 1, 0], batch.T_prev_curr[:, 0, 0])
         errors = _normal(generator, size) * math.radians(self._augmentation.bird_turn_deg)
         fits = 2.0 * batch.T_prev_curr[:, :2, 3].abs().amax(1) < (MOST_CELLS - 1) * CELL_M
         scale = 1.0 + (fits & (_uniform(generator, size) < self._augmentation.fine)).to(turns)
-        return replace(
-            batch,
-            bird_previous=birds(batch.previous, torch.zeros_like(turns), scale),
-            bird_current=birds(batch.current, turns + errors, scale),
-            scale=scale,
-        )
+        headings = torch.stack([torch.zeros_like(turns), turns + errors], dim=1)
+        return replace(batch, birds=birds(batch.scans, headings, scale[:, None].expand(-1, 2)), scale=scale)
 
 
-def birds(images: Tensor, headings: Tensor, scale: Tensor | None = None) -> Tensor:
-    """Bird's-eye grids (B, CHANNELS, CELLS, CELLS) of points and normals (B, 6, H, W), turned by headings (B,).
+def birds(images: Tensor, headings: Tensor, scale: Tensor) -> Tensor:
+    """Bird's-eye grids (B, 2, CHANNELS, CELLS, CELLS) of points and normals (B, 2, 6, H, W), turned by headings (B, 2).
 
-    As `images.bird_eye.bird_eye`, for a batch on any device; scale (B,) enlarges the scenes in the plane.
+    As `images.bird_eye.bird_eye`, for a batch on any device; scale (B, 2) enlarges the scenes in the plane.
     """
-    x, y, z, u, v, _ = images.flatten(2).unbind(1)  # (B, N)
-    c, s = headings.cos()[:, None], headings.sin()[:, None]
-    size_m = CELL_M / (torch.ones_like(c) if scale is None else scale[:, None])
+    x, y, z, u, v, _ = images.flatten(3).flatten(0, 1).unbind(1)  # (2 B, N)
+    c, s = headings.cos().flatten()[:, None], headings.sin().flatten()[:, None]
+    size_m = CELL_M / scale.flatten()[:, None]
     squared = x * x + y * y
     column = ((c * x - s * y) / size_m).floor() + CELLS // 2
     row = ((s * x + c * y) / size_m).floor() + CELLS // 2
@@ -332,7 +301,7 @@ def birds(images: Tensor, headings: Tensor, scale: Tensor | None = None) -> Tens
         0.5 * count.log1p(), 0.5 * density.log1p(), amount, facing * along, facing * across,
         (0.4 * mean).tanh(), (0.4 * high).tanh(), (high - low).tanh(),
     ]  # fmt: skip
-    return torch.stack(grids, dim=1)[..., :cells].reshape(len(x), -1, CELLS, CELLS)
+    return torch.stack(grids, dim=1)[..., :cells].reshape(*headings.shape, -1, CELLS, CELLS)
 
 
 def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces: bool = True) -> PairBatch:
@@ -340,21 +309,18 @@ def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces:
     T = torch.eye(4)
     for motion in recording.T_prev_curr[previous:current]:
         T = T @ motion
-    one, other = (torch.cat([recording.points[i], recording.normals[i].float()])[None] for i in (previous, current))
-    pair = PairBatch(
-        previous=one, current=other, T_prev_curr=T[None], valid=recording.valid[previous:current].all()[None]
+    both = [previous, current]
+    points, normals, offsets = recording.points[both], recording.normals[both].float(), recording.offsets[both].float()
+    still = None
+    if surfaces:
+        velocities = torch.stack([_velocity(recording, scan) for scan in both])
+        still = torch.cat(compensated(points, normals, offsets, velocities), dim=1)[None]
+    return PairBatch(
+        scans=torch.cat([points, normals], dim=1)[None],
+        surfaces=still,
+        T_prev_curr=T[None],
+        valid=recording.valid[previous:current].all()[None],
     )
-    if not surfaces:
-        return pair
-    still = [_compensated(recording, i) for i in (previous, current)]
-    return replace(pair, previous_surfaces=still[0], current_surfaces=still[1])
-
-
-def _compensated(recording: PreparedRecording, scan: int) -> Tensor:
-    """(1, 6, H, W) a scan as seen from the middle of its sweep."""
-    normals, offsets = recording.normals[scan, None].float(), recording.offsets[scan, None].float()
-    velocity = _velocity(recording, scan)[None]
-    return torch.cat(compensated(recording.points[scan, None], normals, offsets, velocity), dim=1)
 
 
 def _velocity(recording: PreparedRecording, scan: int) -> Tensor:
@@ -367,14 +333,7 @@ def _velocity(recording: PreparedRecording, scan: int) -> Tensor:
 
 def reversed_pair(pair: PairBatch) -> PairBatch:
     """The later scan first."""
-    return replace(
-        pair,
-        previous=pair.current,
-        current=pair.previous,
-        previous_surfaces=pair.current_surfaces,
-        current_surfaces=pair.previous_surfaces,
-        T_prev_curr=inverse(pair.T_prev_curr),
-    )
+    return pair.changed(lambda scans: scans.flip(1), inverse(pair.T_prev_curr))
 
 
 def stack(pairs: Sequence[PairBatch]) -> PairBatch:

@@ -8,11 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarslam.odometry.network.candidates import Search
 from lidarslam.odometry.network.checkpoint import torch_search
 from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.losses import motion_error
-from lidarslam.odometry.training.pairs import pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
 
 _LEAST_RATE = 0.01  # of the learning rate, at the end
@@ -50,19 +48,23 @@ def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Op
 
 
 def validate(
-    network: nn.Module, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
+    network: nn.Module, recordings: Sequence[PreparedRecording], device: torch.device | str = "cpu"
 ) -> Validation:
-    """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none.
+    """Every pair of consecutive scans whose label is valid, as it is.
 
     The network, in evaluation mode, answers as in use: by its most probable candidate.
     """
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
-    search = torch_search(network, device or torch.device("cpu"))
+    search = torch_search(network, device)
     for recording in recordings:
-        for first in range(gap):
-            error, sigma = _errors(search, recording, range(first, len(recording), gap))
-            errors.append(error)
-            sigmas.append(sigma)
+        points, normals = recording.points.numpy(), recording.normals.float().numpy()
+        before = search.describe(points[0], normals[0])
+        for number, (label, is_valid) in enumerate(zip(recording.T_prev_curr, recording.valid, strict=True), start=1):
+            candidates, before = search.compare(before, points[number], normals[number])
+            if is_valid:
+                T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
+                errors.append(motion_error(T_prev_curr[None], label[None]))
+                sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
     return summarise(torch.cat(errors), torch.cat(sigmas))
 
 
@@ -78,21 +80,3 @@ def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
         float(rotation.median()), float(translation.median()),
         (covered[0], covered[1], covered[2]), len(errors),
     )  # fmt: skip
-
-
-def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tuple[Tensor, Tensor]:
-    """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where labels are valid."""
-    errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
-    points, normals = recording.points.numpy(), recording.normals.float().numpy()
-    before = None
-    for number in chosen:
-        if before is None:
-            before = search.describe(points[number], normals[number])
-            continue
-        candidates, before = search.compare(before, points[number], normals[number])
-        pair = pair_of(recording, number - chosen.step, number, surfaces=False)
-        if bool(pair.valid):
-            T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
-            errors.append(motion_error(T_prev_curr[None], pair.T_prev_curr))
-            sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
-    return torch.cat(errors), torch.cat(sigmas)

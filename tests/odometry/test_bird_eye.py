@@ -70,8 +70,8 @@ def test_grids_of_a_batch_are_those_of_each_scan(rng, scale):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points[..., ::5], normals[..., ::3] = 0.0, 0.0
     headings = (0.0, 1.1, -2.7)
-    images = torch.from_numpy(np.concatenate([points, normals], axis=1))
-    grids = birds(images, torch.tensor(headings), torch.full((3,), scale)).numpy()
+    images = torch.from_numpy(np.concatenate([points, normals], axis=1))[:, None]
+    grids = birds(images, torch.tensor(headings)[:, None], torch.full((3, 1), scale)).numpy()[:, 0]
     for one, (cloud, directions, heading) in zip(grids, zip(points, normals, headings, strict=True), strict=True):
         alone = bird_eye(cloud * np.float32([[[scale]], [[scale]], [[1.0]]]), directions, heading)
         np.testing.assert_allclose(one[[0, 2, 3, 4, 5, 6, 7]], alone[[0, 2, 3, 4, 5, 6, 7]], atol=1e-5)
