@@ -119,8 +119,7 @@ def recorded(source: Path, reader: ReaderConfig) -> Stretch:
 def simulated(config: SimulatedConfig) -> list[Stretch]:
     """The simulated recordings; their worlds are built when they are needed.
 
-    Raises:
-        ConfigError: a world or sensor is not in the mixture, or no recording is of that kind.
+    ConfigError where a world or sensor is not in the mixture, or no recording is of that kind.
     """
     for key, names, known in (("worlds", config.worlds, MIXED_WORLDS), ("sensors", config.sensors, SENSOR_WEIGHTS)):
         for name in names or ():
@@ -151,8 +150,7 @@ def _build(number: int, scans: int) -> ScanSequence:
 def hold_out(stretches: Sequence[Stretch], share: float, seed: int) -> tuple[list[Stretch], list[Stretch]]:
     """Those to train on, and those kept for validation: whole recordings, or the end of the only one.
 
-    Raises:
-        InputError: the only recording is too short to be divided.
+    InputError where the only recording is too short to be divided.
     """
     if not share:
         return list(stretches), []

@@ -93,8 +93,7 @@ def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer,
 def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
     """Restore weights and moments; the network and the optimizer must be as they were made.
 
-    Raises:
-        InputError: the file is not usable, or belongs to another network.
+    InputError where the file is not usable, or belongs to another network.
     """
     tensors, content = read_tensor_file(path, _KIND)
     try:

@@ -32,8 +32,7 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 class Devices:
     """The `device` of this `process`, one of several `processes`, of which only the first, 0, writes and prints.
 
-    Raises:
-        ConfigError: the device is not available.
+    ConfigError where the device is not available.
     """
 
     def __init__(self, name: DeviceName) -> None:
@@ -123,11 +122,7 @@ class TrainingLoop:
     say: Callable[[str], None]  # prints a line
 
     def run(self, recordings: Recordings, is_interrupted: Callable[[], bool]) -> bool:
-        """Do the remaining steps; whether all of them were done.
-
-        Raises:
-            ConfigError: the loss is no longer a number.
-        """
+        """Do the remaining steps; whether all of them were done; ConfigError where the loss is no longer a number."""
         config, progress, devices = self.config, self.progress, self.devices
         self._module = devices.shared(_LossModule(self.network, config))
         is_new = not progress.step and progress.best is None  # or killed before its first state

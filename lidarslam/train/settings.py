@@ -30,8 +30,7 @@ class TrainConfig(Settings):
 def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) -> TrainConfig:
     """The defaults, changed by a YAML file and then by settings such as `training.batch=8`.
 
-    Raises:
-        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    ConfigError where the file is not readable YAML, a key does not exist, or a value does not fit.
     """
     return load_model(TrainConfig, path, settings, "training.batch=8")
 

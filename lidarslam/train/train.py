@@ -60,8 +60,7 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
 
     Ctrl-C ends the training after the current step, and it can be resumed.
 
-    Raises:
-        LidarSlamError: sources, configuration, weights or output directory are not usable.
+    LidarSlamError where sources, configuration, weights or output directory are not usable.
     """
     earlier = files.earlier_training(request.out, request.resume, request.overwrite)
     start = None if request.start_from is None else load_checkpoint(request.start_from)
@@ -101,8 +100,7 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
 def with_network_of(start: Checkpoint | None, config: TrainConfig) -> TrainConfig:
     """The configuration with network and images of the weights that are begun with.
 
-    Raises:
-        ConfigError: it asks for others itself.
+    ConfigError where it asks for others itself.
     """
     if start is None:
         return config
@@ -212,8 +210,7 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
 
     A resumed training keeps its settings, except those that are given again.
 
-    Raises:
-        LidarSlamError: options contradict each other, a value does not fit, or as `execute`.
+    LidarSlamError where options contradict each other, a value does not fit, or as `execute`.
     """
     out, start_from = options["out"], options["start_from"]
     if options["resume"] and options["overwrite"]:

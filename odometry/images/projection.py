@@ -44,8 +44,7 @@ _P0, _P1, _P2, _P3 = (
 class ImageGrid:
     """The pixels of a range image: rows by elevation from the lowest up, columns by azimuth, without a seam.
 
-    Raises:
-        ValueError: there are no pixels, or the elevations do not ascend.
+    ValueError where there are no pixels, or the elevations do not ascend.
     """
 
     rows: int  # H, 2 or more

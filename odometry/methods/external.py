@@ -27,8 +27,7 @@ class ExternalOdometry(Stateful):
         largest_interval_s: a scan in a longer gap between two poses is not covered; None: a second, or five times the
             trajectory's median step where that is longer.
 
-    Raises:
-        InputError: the trajectory has fewer than two poses.
+    InputError where the trajectory has fewer than two poses.
     """
 
     _T_odom_prev: Annotated[FloatArray, TRANSFORM] | None  # of the last scan that was covered
@@ -50,8 +49,7 @@ class ExternalOdometry(Stateful):
     def require_overlap(self, first_stamp: float, last_stamp: float) -> None:
         """Refuse scans of another time altogether.
 
-        Raises:
-            InputError: the trajectory begins after the last scan, or ends before the first.
+        InputError where the trajectory begins after the last scan, or ends before the first.
         """
         first, last = float(self._trajectory.stamps[0]), float(self._trajectory.stamps[-1])
         if first - self._tolerance_s > last_stamp or last + self._tolerance_s < first_stamp:

@@ -38,11 +38,7 @@ class Kind:
 
 
 def write_tensor_file(path: Path, kind: Kind, tensors: Mapping[str, Tensor], content: Mapping[str, Any]) -> None:
-    """Write the file, whole or not at all.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write the file, whole or not at all; OutputError where it cannot be written."""
     header = {"program": _PROGRAM, "kind": kind.name, "version": str(kind.version), "content": json.dumps(content)}
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     try:
@@ -57,8 +53,7 @@ def write_tensor_file(path: Path, kind: Kind, tensors: Mapping[str, Tensor], con
 def read_tensor_file(path: Path, kind: Kind) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The named tensors and the description that `write_tensor_file` wrote.
 
-    Raises:
-        InputError: there is no such file, or it is none of this kind, or of a newer version.
+    InputError where there is no such file, or it is none of this kind, or of a newer version.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -111,11 +106,7 @@ def checkpoint_of(
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write the file, whole or not at all.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write the file, whole or not at all; OutputError where it cannot be written."""
     content = describe(checkpoint.network, checkpoint.images) | {"about": checkpoint.about}
     write_tensor_file(path, WEIGHTS, checkpoint.weights, content)
 
@@ -123,8 +114,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read weights and check that they fit their network.
 
-    Raises:
-        InputError: there is no such file, it is no file of weights, or its weights do not fit or are not finite.
+    InputError where there is no such file, it is no file of weights, or its weights do not fit or are not finite.
     """
     weights, content = read_tensor_file(path, WEIGHTS)
     try:
@@ -142,8 +132,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def network_of(checkpoint: Checkpoint) -> nn.Module:
     """The trained network, a `PairNetwork`, ready for use on the CPU.
 
-    Raises:
-        RuntimeError: the weights are not those of this network, which no file that was loaded can have.
+    RuntimeError where the weights are not those of this network, which no file that was loaded can have.
     """
     with torch.device("meta"):  # no random weights, which would be thrown away
         network = make_network(checkpoint.network)

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from lidarslam.core.files import cannot_write
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.network.checkpoint import Checkpoint, network_of
 from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
-from lidarslam.odometry.network.networks import CircularConv, ColumnEncoder, CorrelationNetwork, of_two_images
+from lidarslam.odometry.network.networks import CorrelationNetwork, of_two_images
 
 # Not a size of anything else, so that no dimension is taken for another.
 _EXAMPLE_BATCH = 2
@@ -54,8 +53,7 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
 
     The number of scans and pairs stays free, the size of the images does not.
 
-    Raises:
-        OutputError: the folder cannot be written.
+    OutputError where the folder cannot be written.
     """
     network = network_of(checkpoint)
     graphs = _graphs(network, checkpoint.images.rows, checkpoint.images.columns)
@@ -86,9 +84,7 @@ def _graphs(network: nn.Module, rows: int, columns: int) -> list[_Graph]:
     grids = torch.rand(_EXAMPLE_BATCH, bird_eye.CHANNELS, bird_eye.CELLS, bird_eye.CELLS)
     scores = torch.rand(_EXAMPLE_BATCH, features.shape[-1]), torch.rand(_EXAMPLE_BATCH, SHIFTS, SHIFTS)
     return [
-        _Graph(
-            COLUMNS, InferenceColumns(network.columns).eval(), (points, normals), ["points", "normals"], ["features"]
-        ),
+        _Graph(COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
         _Graph(TURNS, network.turn_scores, (features, features.flip(0)), ["previous", "current"], ["scores"]),
         _Graph(BIRD, network.bird, (grids,), ["grids"], ["features"]),
         _Graph(PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),
@@ -127,83 +123,3 @@ def _forget_origin(path: Path) -> None:
     for value in (*model.graph.value_info, *model.graph.initializer, *model.graph.input, *model.graph.output):
         value.ClearField("metadata_props")
     onnx.save(model, str(path))
-
-
-# Columns to either side by which an image goes round: the encoder sees 28 of them, and four make one of its features.
-_AROUND, _COLUMNS_PER_FEATURE = 32, 4
-# Where `seen` is among the channels of `column_channels`. The first convolution takes the eight others together.
-_SEEN = 4
-
-
-class InferenceColumns(nn.Module):
-    """`ColumnEncoder`, trained."""
-
-    def __init__(self, encoder: ColumnEncoder) -> None:
-        super().__init__()
-        first, _, second, _, block, third, _, other_block, last = encoder.layers
-        self.first, self.seen = _divided(_folded(first))
-        self.second, self.third, self.last = _folded(second), _folded(third), last
-        halves = [half for one in (block, other_block) for half in one.children()]
-        self.blocks = nn.ModuleList([_folded(half) for half in halves])
-
-    def forward(self, points: Tensor, normals: Tensor) -> Tensor:
-        """(B, 3, H, W) twice -> (B, C, H/4, W/4)."""
-        image = torch.cat([points, normals], dim=1)
-        together, seen = _channels(torch.cat([image[..., -_AROUND:], image, image[..., :_AROUND]], dim=-1))
-        x = functional.relu(self.first(together) + self.seen(seen))
-        x = functional.relu(self.second(x))
-        x = functional.relu(x + self.blocks[1](functional.relu(self.blocks[0](x))))
-        x = functional.relu(self.third(x))
-        x = functional.relu(x + self.blocks[3](functional.relu(self.blocks[2](x))))
-        cut = _AROUND // _COLUMNS_PER_FEATURE
-        return functional.normalize(self.last(x)[..., cut:-cut], dim=1)
-
-
-def _channels(image: Tensor) -> tuple[Tensor, Tensor]:
-    """`column_channels` of points and normals (B, 6, H, W): (B, 8, H, W), and (B, 1, H, W) which pixels are seen."""
-    x, y, z, u, v, w = image.chunk(6, dim=1)
-    level = (x * x + y * y).sqrt()
-    r = (level * level + z * z).sqrt()
-    seen = r.sign()
-    each = level.clamp(min=1e-6).reciprocal()
-    cosine, sine = x * each, y * each
-    channels = (
-        (1.0 + level).log() - 2.0 * seen,
-        2.0 * (z * each).atan(),  # of an empty pixel zero
-        (0.5 * z).tanh(),
-        4.0 * seen / (1.0 + r),
-        u * cosine + v * sine,
-        v * cosine - u * sine,
-        w,
-        (u * u + v * v + w * w > 0.5).to(image.dtype),
-    )
-    return torch.cat(channels, dim=1), seen
-
-
-def _folded(layer: nn.Module) -> nn.Conv2d:
-    """A convolution and its normalisation as one convolution, which sees zeros at all borders."""
-    if not isinstance(layer, CircularConv):
-        raise TypeError(f"expected a CircularConv, got {type(layer).__name__}")
-    conv, norm = layer.conv, layer.norm
-    if norm.running_mean is None or norm.running_var is None:
-        raise TypeError("expected a normalisation with statistics")
-    gain = norm.weight / (norm.running_var + norm.eps).sqrt()
-    return _convolution(conv.weight * gain[:, None, None, None], norm.bias - norm.running_mean * gain, conv)
-
-
-def _divided(whole: nn.Conv2d) -> tuple[nn.Conv2d, nn.Conv2d]:
-    """Two convolutions, the second of `seen` alone, whose sum is this one."""
-    others = [channel for channel in range(whole.in_channels) if channel != _SEEN]
-    first = _convolution(whole.weight[:, others], whole.bias, whole)
-    return first, _convolution(whole.weight[:, [_SEEN]], None, whole)
-
-
-def _convolution(weight: Tensor, bias: Tensor | None, like: nn.Conv2d) -> nn.Conv2d:
-    """A convolution with these weights (C', C, rows, columns) and the stride of another."""
-    rows, columns = weight.shape[2:]
-    size, stride, around = (rows, columns), (like.stride[0], like.stride[1]), (rows // 2, columns // 2)
-    made = nn.Conv2d(weight.shape[1], weight.shape[0], size, stride, around, bias=bias is not None)
-    made.weight.data = weight.detach()
-    if made.bias is not None and bias is not None:
-        made.bias.data = bias.detach()
-    return made

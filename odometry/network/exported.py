@@ -43,11 +43,7 @@ def describe(network: NetworkConfig, images: ImageConfig) -> dict[str, Any]:
 
 
 def read_description(content: dict[str, Any]) -> tuple[NetworkConfig, ImageConfig]:
-    """The network and the size of its images, as `describe` wrote them.
-
-    Raises:
-        ValueError: it is no such description.
-    """
+    """The network and the size of its images, as `describe` wrote them; ValueError where it is no such description."""
     try:
         network = NetworkConfig(name=content["network"]["name"])
         return network, ImageConfig(rows=content["images"]["rows"], columns=content["images"]["columns"])
@@ -56,11 +52,7 @@ def read_description(content: dict[str, Any]) -> tuple[NetworkConfig, ImageConfi
 
 
 def read_exported(folder: Path) -> Exported:
-    """The network in a folder.
-
-    Raises:
-        InputError: it holds no exported network, or one of another version.
-    """
+    """The network in a folder; InputError where it holds no exported network, or one of another version."""
     try:
         content = read_json(folder / DESCRIPTION, ANY_OBJECT)
         if {key: content[key] for key in _HEADER} != _HEADER:
@@ -77,8 +69,7 @@ def read_exported(folder: Path) -> Exported:
 def onnx_search(exported: Exported, threads: int) -> Search:
     """The search for candidates with an exported network, with `threads` threads for each graph.
 
-    Raises:
-        InputError: a graph is missing or cannot be used.
+    InputError where a graph is missing or cannot be used.
     """
     if exported.network.name != "correlation":
         return WholePairs(_Graph(exported.folder / PAIR, threads))

@@ -10,8 +10,7 @@ from lidarslam.core.errors import ConfigError
 def default_weights() -> Path:
     """The file of weights, for training and for accelerators.
 
-    Raises:
-        ConfigError: the program was installed without it.
+    ConfigError where the program was installed without it.
     """
     return _required("correlation.safetensors")
 
@@ -37,8 +36,7 @@ _LIBRARIES = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript")
 def require_train_extra(purpose: str) -> None:
     """Check that the libraries of the extra are installed; the message names the purpose.
 
-    Raises:
-        ConfigError: one is missing.
+    ConfigError where one is missing.
     """
     for name in _LIBRARIES:
         try:

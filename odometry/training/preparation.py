@@ -60,11 +60,7 @@ class PreparedRecording:
 
 
 def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:
-    """Images of all scans, and each aligned with the one before.
-
-    Raises:
-        ValueError: there are fewer than two scans.
-    """
+    """Images of all scans, and each aligned with the one before; ValueError where there are fewer than two scans."""
     imager, T_last, last = Imager(config), np.eye(4), None
     images, middles, found = list[SweepImages](), list[float](), list[Alignment]()
     previous: SweepImages | None = None
