@@ -35,16 +35,43 @@ from mapping_accuracy import (
     recordings,
     true_trajectory,
 )
-from odometry_accuracy import SIGMAS, estimated_motions, shares_within_sigmas, squared_errors
+from scipy.special import erf
+from scipy.stats import chi2
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
+from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.simulation.world import WORLDS
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]
+# Numbers of standard deviations, and the share of errors that should lie within each.
+SIGMAS = (1, 2, 3)
+EXPECTED_SHARES = tuple(float(erf(sigma / np.sqrt(2.0))) for sigma in SIGMAS)
+
+
+def estimated_motions(config: OdometryConfig, scans: Sequence[Scan]) -> list[Motion]:
+    """What an odometry alone says of each scan."""
+    odometry = make_odometry(config)
+    try:
+        return [odometry.estimate(scan) for scan in scans]
+    finally:
+        odometry.close()
+
+
+def squared_errors(covariances: Sequence[FloatArray | None], errors: FloatArray) -> FloatArray:
+    """(N,) of errors (N, 6), in standard deviations, summed over the six directions; NaN without a covariance."""
+    pairs = zip(covariances, errors, strict=True)
+    return np.array([np.nan if sigma is None else error @ np.linalg.solve(sigma, error) for sigma, error in pairs])
+
+
+def shares_within_sigmas(squared: FloatArray) -> list[float]:
+    """Of squared errors (N,) as above, the shares that lie within each of `SIGMAS`."""
+    return [float(np.mean(squared <= chi2.ppf(share, 6))) for share in EXPECTED_SHARES]
 
 
 def nees_of_poses(results: Sequence[ScanEstimate], truth: FloatArray) -> FloatArray:

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from covariance import estimated_motions, shares_within_sigmas, squared_errors
 from mapping_accuracy import METHODS, Recorded, pipeline_results, print_header, print_row, read, true_trajectory
-from odometry_accuracy import estimated_motions, rms, shares_within_sigmas, squared_errors
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
@@ -81,6 +81,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for method, config in methods.items():
                 outcome = joined([judged(part, estimated_motions(config, part.scans)) for part in parts])
                 print_row([recorded.name, label, f"{step_m:.2f}", method, *outcome.cells()])
+
+
+def rms(values: FloatArray) -> float:
+    """The root of the mean of their squares."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def with_truth(source: Path) -> Recorded:

@@ -1,4 +1,4 @@
-"""Motions between sweeps that are exact, and what is said where they cannot be found."""
+"""Motions between sweeps that are exact, and what is said and searched where they cannot be found."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,15 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.odometry.alignment import alignment as module
-from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align
+from lidarslam.odometry.alignment.alignment import (
+    DOUBTFUL,
+    Alignment,
+    Effort,
+    InitialEstimate,
+    align,
+    align_best,
+    try_instead,
+)
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
 
@@ -20,19 +28,21 @@ TURNING = (0.1, 0.1, math.radians(80.0), 1.0, 0.3, 0.1)
 WRONG = (0.012, -0.012, 0.030, 0.06, -0.06, 0.05)
 
 
-def moved(twist: tuple[float, ...]) -> FloatArray:
-    """The true motion (4, 4) from one sweep to the next."""
-    return exp(0.1 * np.array(twist))
-
-
-def guess(twist: tuple[float, ...], wrong: tuple[float, ...] = WRONG) -> FloatArray:
-    return exp(wrong) @ moved(twist)
+def moved(twist: tuple[float, ...], wrong: tuple[float, ...] = (0.0,) * 6) -> FloatArray:
+    """The true motion (4, 4) from one sweep to the next, or a guess off by so much."""
+    return exp(wrong) @ exp(0.1 * np.array(twist))
 
 
 def errors(T: FloatArray, truth: FloatArray) -> tuple[float, float]:
     """Degrees and metres."""
     error = log(T @ inverse(truth))
     return float(np.rad2deg(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
+
+
+def assert_close(T: FloatArray, truth: FloatArray, rotation_deg: float, translation_m: float) -> None:
+    found_deg, found_m = errors(T, truth)
+    assert found_deg < rotation_deg
+    assert found_m < translation_m
 
 
 def second_on_first(sweeps: list[SweepImages], last: SweepMotion | None = None) -> SweepPair:
@@ -47,35 +57,32 @@ def one_on_the_other(sweeps: list[SweepImages], T: FloatArray, effort: Effort = 
 
 @pytest.mark.parametrize("rolling", [False, True])
 def test_a_known_motion_is_found_from_a_wrong_guess(box_room, rolling):
-    found = one_on_the_other(box_room.sweeps(2, TWIST, rolling=rolling), guess(TWIST))
-    rotation_deg, translation_m = errors(found.T_prev_curr, moved(TWIST))
-    assert rotation_deg < 0.01
-    assert translation_m < 5e-4
+    found = one_on_the_other(box_room.sweeps(2, TWIST, rolling=rolling), moved(TWIST, WRONG))
+    assert_close(found.T_prev_curr, moved(TWIST), 0.01, 5e-4)
     assert found.inlier_share > 0.97
     assert found.residual_m < 1e-3
 
 
 def test_turning_sweeps_are_compensated(box_room):
-    sweeps = box_room.sweeps(2, TURNING)
-    assert errors(one_on_the_other(sweeps, guess(TURNING)).T_prev_curr, moved(TURNING)) < (0.03, 0.002)
+    sweeps, start = box_room.sweeps(2, TURNING), moved(TURNING, WRONG)
+    assert_close(one_on_the_other(sweeps, start).T_prev_curr, moved(TURNING), 0.03, 0.002)
     as_if_at_once = [replace(sweep, offsets=np.zeros_like(sweep.offsets)) for sweep in sweeps]
-    assert errors(one_on_the_other(as_if_at_once, guess(TURNING)).T_prev_curr, moved(TURNING))[0] > 0.1
+    assert errors(one_on_the_other(as_if_at_once, start).T_prev_curr, moved(TURNING))[0] > 0.1
 
 
-def test_a_guess_is_held_as_firmly_as_its_information_says(box_room):
-    sweeps = box_room.sweeps(2, TWIST)
-    close = guess(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
-    certain = align(InitialEstimate(close, 1e9 * np.eye(6)), second_on_first(sweeps), FINE)
-    assert errors(certain.T_prev_curr, close) < (0.01, 5e-4)
-    uncertain = align(InitialEstimate(close, 1e-3 * np.eye(6)), second_on_first(sweeps), FINE)
-    assert errors(uncertain.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
+@pytest.mark.parametrize("certain", [True, False])
+def test_a_guess_is_held_as_firmly_as_its_information_says(box_room, certain):
+    close = moved(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
+    start = InitialEstimate(close, (1e9 if certain else 1e-3) * np.eye(6))
+    found = align(start, second_on_first(box_room.sweeps(2, TWIST)), FINE).T_prev_curr
+    assert_close(found, close if certain else moved(TWIST), 0.01, 5e-4)
 
 
 def test_the_information_of_a_guess_is_of_changes_from_the_left(box_room):
     """Turned by a right angle in between, the previous scan's x is the current one's y: the former is held."""
     twist = (0.0, 0.0, 0.5 * math.pi / 0.1, 0.5, 0.2, 0.0)
     sweeps = box_room.sweeps(2, twist, rolling=False)
-    T = guess(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
+    T = moved(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
     holds_x = np.zeros((6, 6))
     holds_x[3, 3] = 1e9
     found = align(InitialEstimate(T, holds_x), second_on_first(sweeps), FINE)
@@ -89,7 +96,7 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
     """The walls say nothing of x; all else is found."""
     twist, wrong = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0), (0.01, 0.01, 0.02, 0.10, 0.06, 0.05)
     sweeps = corridor.sweeps(2, twist)
-    T = guess(twist, wrong)
+    T = moved(twist, wrong)
     kept = align(InitialEstimate(T, np.eye(6)), second_on_first(sweeps), FINE)
     error = log(kept.T_prev_curr @ inverse(moved(twist)))
     # Turning it back about the origin moves it along x by less than a millimetre.
@@ -114,7 +121,7 @@ def test_little_is_explained_along_the_way_that_a_scan_is_off(box_room):
     for axis in range(3):
         wrong = [0.0] * 6
         wrong[3 + axis] = 0.4
-        shifted = one_on_the_other(sweeps, guess(TWIST, tuple(wrong)), NO_STEP)
+        shifted = one_on_the_other(sweeps, moved(TWIST, tuple(wrong)), NO_STEP)
         assert shifted.explained < 0.3
         assert abs(shifted.weakest[axis]) > 0.9
         assert shifted.inlier_share > 0.35  # the other walls go along
@@ -124,10 +131,9 @@ def test_little_is_explained_along_the_way_that_a_scan_is_off(box_room):
 def test_empty_images_move_nothing(box_room, empty):
     full = box_room.sweeps(1, TWIST)[0]
     nothing = replace(full, **{name: 0.0 * getattr(full, name) for name in ("points", "normals", "offsets")})
-    current = full if empty == "previous" else nothing
-    previous = full if empty == "current" else nothing
-    found = align(InitialEstimate(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), FINE)
-    np.testing.assert_allclose(found.T_prev_curr, guess(TWIST))
+    sweeps = [full if empty == "current" else nothing, full if empty == "previous" else nothing]
+    found = one_on_the_other(sweeps, moved(TWIST, WRONG))
+    np.testing.assert_allclose(found.T_prev_curr, moved(TWIST, WRONG))
     assert (found.inlier_share, found.residual_m, found.inliers) == (0.0, 0.0, 0)
     assert not found.information.any()
 
@@ -136,8 +142,8 @@ def test_what_leaves_the_elevations_takes_no_part(box_room):
     """Pitched by 20 degrees a third of the points fall above or below the other image; the rest are right."""
     twist = (0.0, math.radians(200.0), 0.0, 0.0, 0.0, 0.0)
     sweeps = box_room.sweeps(2, twist, rolling=False)
-    found = one_on_the_other(sweeps, guess(twist, (0.0, 0.01, 0.0, 0.01, 0.0, 0.0)))
-    assert errors(found.T_prev_curr, moved(twist)) < (0.01, 1e-3)
+    found = one_on_the_other(sweeps, moved(twist, (0.0, 0.01, 0.0, 0.01, 0.0, 0.0)))
+    assert_close(found.T_prev_curr, moved(twist), 0.01, 1e-3)
     assert 0.5 < found.inlier_share < 0.85
     assert found.residual_m < 2e-3
 
@@ -166,7 +172,7 @@ def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room, monkeyp
     off = InitialEstimate(exp([0.02, 0.0, -0.02, 0.05, 0.03, 0.0]) @ motion)
     for last in (None, SweepMotion(velocity, np.zeros(6), INTERVAL_S)):
         found = align(off, second_on_first(sweeps, last), FINE)
-        assert errors(found.T_prev_curr, motion) < (0.06, 0.004)
+        assert_close(found.T_prev_curr, motion, 0.06, 0.004)
         np.testing.assert_allclose(found.velocity_change, half_a_change, atol=0.06)
     # Held at none, the motion is off by more.
     even(monkeypatch)
@@ -175,7 +181,7 @@ def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room, monkeyp
     assert errors(stiff.T_prev_curr, motion)[0] > 3.0 * errors(found.T_prev_curr, motion)[0]
     # Held at what the motion before tells, it is nearly as good.
     told = align(off, second_on_first(sweeps, SweepMotion(velocity, np.zeros(6), INTERVAL_S)), FINE)
-    assert errors(told.T_prev_curr, motion) < (0.06, 0.004)
+    assert_close(told.T_prev_curr, motion, 0.06, 0.004)
 
 
 def test_what_a_change_of_velocity_could_be_as_well_is_not_known(box_room, monkeypatch):
@@ -188,3 +194,78 @@ def test_what_a_change_of_velocity_could_be_as_well_is_not_known(box_room, monke
     firm = one_on_the_other(part, moved(TWIST), NO_STEP).information
     assert np.linalg.eigvalsh(firm - loose).min() > -1e-3 * firm.trace()
     assert loose[5, 5] < 0.2 * firm[5, 5]
+
+
+REST = np.eye(4)
+
+
+@pytest.fixture(scope="module")
+def street(box_room) -> list[SweepImages]:
+    """Two sweeps between facades with a pilaster every 3 m; four poles tell where one is."""
+    pilasters = [((x, y, -5.0), (x + 1.0, y + 1.2, 30.0)) for x in range(-36, 37, 3) for y in (-7.0, 5.8)]
+    poles = [(3.1, 4.2), (-5.2, -4.0), (8.3, -4.4), (-9.6, 4.1)]
+    boxes = [((x - 0.15, y - 0.15, -5.0), (x + 0.15, y + 0.15, 5.0)) for x, y in poles]
+    scene = type(box_room)((-np.inf, -6.0, -1.8), (np.inf, 6.0, np.inf), (*pilasters, *boxes))
+    return scene.sweeps(2, (0.0, 0.0, 0.0, 14.0, 0.0, 0.0))
+
+
+def best_of(sweeps: list[SweepImages], *guesses: FloatArray, information: FloatArray | None = None) -> Alignment:
+    """The second of two sweeps on the first; the information is about the first guess."""
+    first, *others = guesses
+    starts = [InitialEstimate(first, information), *(InitialEstimate(guess) for guess in others)]
+    return align_best(starts, second_on_first(sweeps), FINE)
+
+
+def ahead(along_m: float) -> FloatArray:
+    """(4, 4)."""
+    return exp([0.0, 0.0, 0.0, along_m, 0.0, 0.0])
+
+
+def wrong_by_m(aligned: Alignment) -> float:
+    return errors(aligned.T_prev_curr, ahead(1.4))[1]
+
+
+def test_alignment_from_rest_stays_there_and_knows_it(street):
+    found = one_on_the_other(street, REST)
+    assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
+    assert found.inlier_share > 0.3  # the ground and the walls go along
+    assert found.explained < DOUBTFUL - 0.2
+    np.testing.assert_allclose(np.abs(found.weakest), [1.0, 0.0, 0.0], atol=0.05)
+
+
+def test_a_good_alignment_is_not_searched_around(street):
+    found = best_of(street, ahead(1.35))
+    alone = one_on_the_other(street, ahead(1.35))
+    assert np.array_equal(found.T_prev_curr, alone.T_prev_curr)
+
+
+def test_of_guesses_that_explain_as_much_the_first_is_taken(corridor):
+    """Nothing tells how far ahead one is, and all guesses lie well."""
+    sweeps = corridor.sweeps(2, (0.0,) * 6)
+    for first, second in ((-0.2, 0.2), (0.2, -0.2)):
+        found = best_of(sweeps, ahead(first), ahead(second))
+        assert found.T_prev_curr[0, 3] == pytest.approx(first, abs=0.01)
+
+
+@pytest.mark.parametrize(("sigma_m", "found"), [(0.7, True), (0.03, False)])
+def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m, found):
+    """The motion is 1.4 m from the guess: two standard deviations, or fifty."""
+    information = np.eye(6) / sigma_m**2
+    searched = best_of(street, REST, information=information)
+    assert (wrong_by_m(searched) < 0.02) == (searched.explained > DOUBTFUL) == found
+
+
+def test_the_best_of_many_guesses_is_found_roughly(street):
+    guesses = [ahead(0.1 * x) for x in (-20, -10, 0, 13, 25)]
+    found = try_instead(one_on_the_other(street, REST), guesses, second_on_first(street), FINE)
+    assert found is not None
+    assert wrong_by_m(found) < 0.02
+
+
+def test_the_less_likely_a_guess_the_more_it_must_explain(street, monkeypatch):
+    """From rest hardly anything fits; what lies beside it is right, and taken unless it is held next to impossible."""
+    monkeypatch.setattr(module, "STEPS_M", ())
+    for odds, wrong in ((0.0, False), (1.0, False), (30.0, True)):
+        starts = [InitialEstimate(REST), InitialEstimate(ahead(1.3), sigmas=odds)]
+        found = align_best(starts, second_on_first(street), FINE)
+        assert (wrong_by_m(found) > 0.5) == wrong

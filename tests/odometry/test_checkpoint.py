@@ -2,9 +2,7 @@
 
 import os
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -23,95 +21,85 @@ from lidarslam.odometry.network.checkpoint import (
 )
 from lidarslam.odometry.network.networks import make_network
 
-IMAGES = ImageConfig(rows=16, columns=96)
+BIAS = "columns.layers.8.bias"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def trained() -> Checkpoint:
     config = NetworkConfig()
     torch.manual_seed(3)
-    return checkpoint_of(make_network(config), config, IMAGES, {"steps": 7, "sources": ["office"]})
+    about = {"steps": 7, "sources": ["office"]}
+    return checkpoint_of(make_network(config), config, ImageConfig(rows=16, columns=96), about)
 
 
-@pytest.fixture
-def file(trained: Checkpoint, tmp_path: Path) -> Path:
+def test_what_is_saved_comes_back(trained, tmp_path):
     save_checkpoint(tmp_path / "weights.safetensors", trained)
-    return tmp_path / "weights.safetensors"
-
-
-def test_what_is_saved_comes_back(trained: Checkpoint, file: Path) -> None:
-    loaded = load_checkpoint(file)
+    loaded = load_checkpoint(tmp_path / "weights.safetensors")
     assert (loaded.network, loaded.images, loaded.about) == (trained.network, trained.images, trained.about)
     points = 5.0 * torch.randn(2, 3, 16, 96)
+    networks = [network_of(one) for one in (trained, loaded)]
+    assert not any(network.training for network in networks)
     with torch.no_grad():
-        results = []
-        for one in (trained, loaded):
-            network = network_of(one)
-            assert not network.training
-            results.append(network.columns(points, torch.zeros_like(points)))
-    assert torch.equal(results[0], results[1])
+        one, other = (network.columns(points, torch.zeros_like(points)) for network in networks)
+    assert torch.equal(one, other)
 
 
-class _Malicious:
+class Malicious:
     """Makes a folder when it is unpickled."""
 
-    def __init__(self, trace: Path) -> None:
+    def __init__(self, trace):
         self.trace = trace
 
-    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+    def __reduce__(self):
         return os.mkdir, (str(self.trace),)
 
 
 @pytest.mark.parametrize("how", ["pickle", "archive"])
-def test_a_pickle_is_refused_unopened(how: str, tmp_path: Path) -> None:
+def test_a_pickle_is_refused_unopened(how, tmp_path):
     path, trace = tmp_path / "weights.pt", tmp_path / "trace"
     if how == "pickle":
-        path.write_bytes(pickle.dumps(_Malicious(trace)))
+        path.write_bytes(pickle.dumps(Malicious(trace)))
     else:
-        torch.save({"weight": _Malicious(trace)}, path)
+        torch.save({"weight": Malicious(trace)}, path)
     with pytest.raises(InputError, match="is no safetensors file"):
         load_checkpoint(path)
     assert not trace.exists()
 
 
-def test_what_is_no_weights_file_is_told(tmp_path: Path, trained: Checkpoint) -> None:
-    missing = tmp_path / "missing.safetensors"
-    with pytest.raises(InputError, match="no such file"):
-        load_checkpoint(missing)
-    text = tmp_path / "notes.txt"
-    text.write_text("some notes that are long enough")
-    with pytest.raises(InputError, match="is no safetensors file"):
-        load_checkpoint(text)
-    other = tmp_path / "other.safetensors"
-    save_file(trained.weights, other)
-    with pytest.raises(InputError, match="holds tensors of another program, not weights"):
-        load_checkpoint(other)
-    with pytest.raises(InputError, match="is no safetensors file"):
-        load_checkpoint(tmp_path)
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda _, __: None, "no such file"),
+        (lambda path, _: path.write_text("some notes that are long enough"), "is no safetensors file"),
+        (lambda path, _: path.mkdir(), "is no safetensors file"),
+        (lambda path, weights: save_file(weights, path), "holds tensors of another program, not weights"),
+        (
+            lambda path, weights: write_tensor_file(path, Kind("the state of a training", 1), weights, {}),
+            "holds the state of a training, not weights",
+        ),
+        (
+            lambda path, weights: write_tensor_file(path, Kind("weights", 99), weights, {}),
+            "version 99, this program reads 1 at most; use a newer",
+        ),
+    ],
+)
+def test_other_files_kinds_and_versions_are_told(trained, tmp_path, make, told):
+    make(tmp_path / "weights.safetensors", trained.weights)
+    with pytest.raises(InputError, match=told):
+        load_checkpoint(tmp_path / "weights.safetensors")
 
 
-def test_other_kinds_and_newer_versions_are_told(tmp_path: Path, trained: Checkpoint) -> None:
-    path = tmp_path / "w.safetensors"
-    write_tensor_file(path, Kind("the state of a training", 1), trained.weights, {})
-    with pytest.raises(InputError, match="holds the state of a training, not weights"):
-        load_checkpoint(path)
-    write_tensor_file(path, Kind("weights", 99), trained.weights, {})
-    with pytest.raises(InputError, match="version 99, this program reads 1 at most; use a newer"):
-        load_checkpoint(path)
-
-
-def test_weights_that_do_not_fit_are_told(trained: Checkpoint, file: Path) -> None:
-    def saved(change: Callable[[dict[str, torch.Tensor]], object]) -> Path:
-        weights = dict(trained.weights)
-        change(weights)
-        save_checkpoint(file, replace(trained, weights=weights))
-        return file
-
-    with pytest.raises(InputError, match=r"Missing key.*columns\.layers\.8\.bias"):
-        load_checkpoint(saved(lambda w: w.pop("columns.layers.8.bias")))
-    with pytest.raises(InputError, match=r"size mismatch for columns\.layers\.8\.bias"):
-        load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.zeros(5)})))
-    with pytest.raises(InputError, match=r"columns\.layers\.8\.bias is torch.float32, or not finite"):
-        load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.full((32,), torch.nan)})))
-    with pytest.raises(InputError, match=r"Unexpected key.*surplus"):
-        load_checkpoint(saved(lambda w: w.update({"surplus": torch.zeros(1)})))
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({BIAS: None}, r"Missing key.*columns\.layers\.8\.bias"),
+        ({BIAS: torch.zeros(5)}, r"size mismatch for columns\.layers\.8\.bias"),
+        ({BIAS: torch.full((32,), torch.nan)}, r"columns\.layers\.8\.bias is torch.float32, or not finite"),
+        ({"surplus": torch.zeros(1)}, r"Unexpected key.*surplus"),
+    ],
+)
+def test_weights_that_do_not_fit_are_told(trained, tmp_path, changed, told):
+    weights = {name: value for name, value in {**trained.weights, **changed}.items() if value is not None}
+    save_checkpoint(tmp_path / "weights.safetensors", replace(trained, weights=weights))
+    with pytest.raises(InputError, match=told):
+        load_checkpoint(tmp_path / "weights.safetensors")

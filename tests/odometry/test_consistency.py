@@ -25,7 +25,7 @@ def fit(check: ConsistencyCheck, scans: list[Scan], truth: Trajectory, error: li
     return check.check(points[1], T_prev_curr @ exp(error))
 
 
-def test_the_true_motion_fits(check: ConsistencyCheck, room_scans: list[Scan], room_truth: Trajectory) -> None:
+def test_the_true_motion_fits(check, room_scans, room_truth):
     result = fit(check, room_scans, room_truth, [0.0] * 6)
     assert result.status is Status.OK
     assert result.inlier_ratio is not None
@@ -45,21 +45,17 @@ def test_the_true_motion_fits(check: ConsistencyCheck, room_scans: list[Scan], r
     ],
     ids=["yaw", "pitch", "forwards", "sideways", "up"],
 )
-def test_a_wrong_motion_is_found_in_every_direction(
-    check: ConsistencyCheck, room_scans: list[Scan], room_truth: Trajectory, error: list[float]
-) -> None:
+def test_a_wrong_motion_is_found_in_every_direction(check, room_scans, room_truth, error):
     assert fit(check, room_scans, room_truth, error).status is Status.LOST
 
 
-def test_without_points_a_scan_is_lost(check: ConsistencyCheck, room_scans: list[Scan]) -> None:
+def test_without_points_a_scan_is_lost(check, room_scans):
     check.check(room_scans[0].points, np.eye(4))
     result = check.check(np.empty((0, 3)), np.eye(4))
     assert result == Consistency(None, None, Status.LOST)
 
 
-def test_after_an_empty_scan_the_one_before_it_is_held_against(
-    check: ConsistencyCheck, room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_after_an_empty_scan_the_one_before_it_is_held_against(check, room_scans, room_truth):
     motions = [np.eye(4), *room_truth.relative_motions()[:2]]
     points = [room_scans[0].points, np.empty((0, 3)), room_scans[2].points]
     results = [check.check(p, T).status for p, T in zip(points, motions, strict=True)]
@@ -67,7 +63,7 @@ def test_after_an_empty_scan_the_one_before_it_is_held_against(
     assert check.check(room_scans[3].points, exp([0.0, 0.0, 0.4, 0.0, 0.0, 0.0])).status is Status.LOST
 
 
-def test_distances_to_planes_are_exact() -> None:
+def test_distances_to_planes_are_exact():
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, 21), np.linspace(-1.0, 1.0, 21))
     plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     queries = np.array([[0.13, 0.21, 0.3], [0.5, -0.4, -0.05]])
@@ -76,6 +72,6 @@ def test_distances_to_planes_are_exact() -> None:
     np.testing.assert_array_equal(facing, [2, 2])
 
 
-def test_a_cloud_without_planes_gives_no_distance(rng: np.random.Generator) -> None:
+def test_a_cloud_without_planes_gives_no_distance(rng):
     distances, _ = plane_distances(rng.uniform(-1.0, 1.0, (50, 3)), rng.uniform(-1.0, 1.0, (500, 3)))
     assert np.isnan(distances).mean() > 0.5

@@ -56,7 +56,7 @@ CONFIGS = pytest.mark.parametrize(
 
 
 @CONFIGS
-def test_zero_at_the_truth_and_growing_away_from_it(config: LossConfig) -> None:
+def test_zero_at_the_truth_and_growing_away_from_it(config):
     target, T_true = room(), exp(XI)[None]
     source = moved(target, inverse(T_true))
     axis = torch.tensor([0.5, -0.3, 0.8, 0.4, 0.2, -0.6], dtype=torch.float64)
@@ -68,7 +68,7 @@ def test_zero_at_the_truth_and_growing_away_from_it(config: LossConfig) -> None:
 
 
 @pytest.mark.parametrize("displacement", [0.02, -0.05, 0.3])
-def test_displaced_plane(displacement: float) -> None:
+def test_displaced_plane(displacement):
     d, source, target = abs(displacement), floor(displacement), floor(0.0)
     squared = geometric_loss(EYE, source, target, PAPER)
     assert squared.point_to_plane.item() == pytest.approx(d**2, abs=1e-12)
@@ -77,7 +77,7 @@ def test_displaced_plane(displacement: float) -> None:
     assert robust == pytest.approx(d**2 if d < 0.1 else 2 * 0.1 * d - 0.1**2, abs=1e-12)
 
 
-def test_paper_settings_are_the_papers_formulas() -> None:
+def test_paper_settings_are_the_papers_formulas():
     rng = np.random.default_rng(9)
     S, M = rng.normal(size=(80, 3)) * 5, rng.normal(size=(100, 3)) * 5
     N_s, N_m = (rng.normal(size=(count, 3)) for count in (80, 100))
@@ -96,7 +96,7 @@ def test_paper_settings_are_the_papers_formulas() -> None:
     assert [one.item() for one in loss] == pytest.approx([p2n + n2n, p2n, n2n], rel=1e-12)
 
 
-def test_points_without_a_normal_and_pixels_without_a_point_are_left_out() -> None:
+def test_points_without_a_normal_and_pixels_without_a_point_are_left_out():
     source, target = floor(1.05), floor(1.0)
     source.points[0, :30, 2], source.valid[0, :30] = 1.9, False  # within the gate
     source.points[0, 40] = 0.01
@@ -108,7 +108,7 @@ def test_points_without_a_normal_and_pixels_without_a_point_are_left_out() -> No
 
 
 @pytest.mark.parametrize("config", [PAPER, ROBUST])
-def test_gradient_agrees_with_finite_differences(config: LossConfig) -> None:
+def test_gradient_agrees_with_finite_differences(config):
     """While the correspondences stay, the loss is smooth, and its gradient that of the moved points and normals."""
     target = room(count=60)
     source = moved(target, inverse(exp(XI)[None]))
@@ -117,7 +117,7 @@ def test_gradient_agrees_with_finite_differences(config: LossConfig) -> None:
 
 
 @CONFIGS
-def test_items_of_a_batch_do_not_see_each_other(config: LossConfig) -> None:
+def test_items_of_a_batch_do_not_see_each_other(config):
     target = room(batch=3)
     target.valid[1, ::2] = False
     source = moved(target, inverse(exp(torch.stack([XI, -XI, 2 * XI]))))
@@ -133,7 +133,7 @@ def test_items_of_a_batch_do_not_see_each_other(config: LossConfig) -> None:
 
 @pytest.mark.parametrize("max_distances", [None, 1, 90, 10**6])
 @pytest.mark.parametrize("offset", [0.0, 100.0])
-def test_the_nearest_of_the_valid_is_found(max_distances: int | None, offset: float, monkeypatch) -> None:
+def test_the_nearest_of_the_valid_is_found(max_distances, offset, monkeypatch):
     """By a k-d tree, and as on other devices by all distances, however these are split; what is not finite, never."""
     if max_distances is not None:
         monkeypatch.setattr(module, "_MAX_DISTANCES", max_distances)

@@ -150,7 +150,7 @@ def positive(rng: np.random.Generator, size: int, weakest: float = 1.0) -> np.nd
 
 @pytest.mark.parametrize("weakest", [1.0, 1e-6])
 @pytest.mark.parametrize("size", [0.01, 30.0])
-def test_a_step_solves_the_normal_equations_with_both_priors(weakest: float, size: float) -> None:
+def test_a_step_solves_the_normal_equations_with_both_priors(weakest, size):
     rng = np.random.default_rng(0)
     H, g = positive(rng, 12, weakest), size * rng.normal(size=12)
     information, expected = positive(rng, 6), positive(rng, 6)
@@ -170,7 +170,7 @@ def test_a_step_solves_the_normal_equations_with_both_priors(weakest: float, siz
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.5, 2.0, 3.14])
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8)])
-def test_velocities_are_the_logarithm_and_a_change(angle: float, axis: tuple[float, float, float]) -> None:
+def test_velocities_are_the_logarithm_and_a_change(angle, axis):
     xi = np.array([*(angle * np.array(axis)), 1.0, -2.0, 0.5])
     innovation, last = np.arange(6.0), np.ones(6)
     early, late = np.empty(6), np.empty(6)
