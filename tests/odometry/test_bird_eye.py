@@ -39,18 +39,6 @@ def test_the_heading_turns_points_and_normals(heading):
     )
 
 
-def test_a_displacement_by_whole_cells_shifts_the_grid(rng):
-    points = np.stack([rng.uniform(-8.0, 8.0, 300), rng.uniform(-8.0, 8.0, 300), rng.uniform(-1.0, 2.0, 300)])
-    normals = rng.normal(size=(3, 300))
-    normals = np.where(rng.random(300) < 0.3, 0.0, normals / np.linalg.norm(normals, axis=0))
-    here = bird_eye(points[:, None], normals[:, None], 0.0)
-    moved = points + np.array([[3 * CELL_M], [-5 * CELL_M], [0.0]])
-    there = bird_eye(moved[:, None], normals[:, None], 0.0)
-    shifted = np.roll(here, (-5, 3), (1, 2))
-    # All but the density, which knows how far away the sensor is.
-    np.testing.assert_allclose(np.delete(there, 1, 0), np.delete(shifted, 1, 0), atol=1e-4)
-
-
 def test_walls_differ_from_ground_and_are_the_same_from_both_sides():
     def cell(normal: tuple[float, float, float]):
         return bird_eye(*image([(5.1, 5.1, 0.0)], [normal]), 0.0)[:, MIDDLE + 5, MIDDLE + 5]

@@ -182,18 +182,6 @@ def test_where_nothing_is_seen_along_a_direction_the_motion_goes_on_as_before(bo
     assert max(motion.covariance[4, 4] for motion in inside if motion.covariance is not None) < 0.01**2
 
 
-@pytest.mark.parametrize("rows", [(1, 2, 3), (5, 6, 7), (13, 14, 15)])
-def test_a_scan_of_which_a_few_rows_are_left_does_no_harm(box_room, rows):
-    """The rest of the view is covered; whether that is enough to go on with is another matter."""
-    scans = box_room.scans(5, TWIST)
-    edges = np.linspace(-19.2, 19.2, 17)
-    for number in (2, 3):
-        elevations = np.rad2deg(np.arctan2(scans[number].points[:, 2], np.hypot(*scans[number].points[:, :2].T)))
-        scans[number] = scans[number].select(np.isin(np.digitize(elevations, edges) - 1, rows))
-        assert len(scans[number]) > 500
-    assert all(np.isfinite(motion.T_prev_curr).all() for motion in estimates(scans, Told(moved())))
-
-
 @pytest.fixture(scope="module")
 def walls(box_room):
     """Two walls along x, and nothing else."""

@@ -41,13 +41,10 @@ class SlowSums:
         self.target = sweeps.previous
         height, width = self.target.offsets.shape
         self.grid = ImageGrid(height, width, self.target.low, self.target.high)
-        chosen = [
-            (sweeps.current.points[:, i, j], sweeps.current.normals[:, i, j], sweeps.current.offsets[i, j])
-            for i in range(sweeps.current.offsets.shape[0])
-            for j in range(0, sweeps.current.offsets.shape[1], STEP)
-        ]
-        chosen = [(p.astype(float), n.astype(float), float(t)) for p, n, t in chosen if n.any()]
-        self.points = chosen
+        images = (sweeps.current.points, sweeps.current.normals, sweeps.current.offsets[None])
+        points, normals, offsets = (np.moveaxis(one[..., ::STEP], 0, -1).astype(float) for one in images)
+        there = normals.any(axis=-1)
+        self.points = list(zip(points[there], normals[there], offsets[there, 0], strict=True))
         self.source = np.array([[self.filled(i, j) for j in range(width)] for i in range(height)])
 
     def filled(self, i: int, j: int) -> int:
@@ -75,11 +72,8 @@ class SlowSums:
             pixel, _ = self.pixel(moved)
             time = float(self.target.offsets[pixel])
             seen = seen_at(moved, -time, early)
-            pixel, inside = self.pixel(seen)
-            plane, difference = (
-                self.target.normals[(slice(None), *pixel)],
-                seen - self.target.points[(slice(None), *pixel)],
-            )
+            (i, j), inside = self.pixel(seen)
+            plane, difference = self.target.normals[:, i, j], seen - self.target.points[:, i, j]
             distance = np.linalg.norm(seen)
             across = max(abs(seen @ plane), 0.2 * distance)
             gate = GATE_M + GATE_PER_M * distance**2 / across + scale_m
