@@ -12,14 +12,11 @@ from lidarslam.odometry.network.shipped import default_weights, require_train_ex
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
     """The configured method, ready for the first scan.
 
-    Args:
-        config: names the method and sets it.
-        prior: T_odom_lidar, for the method `external`.
+    The prior is T_odom_lidar, for the method `external` and no other.
 
     Raises:
-        ConfigError: the method is `external` and there is no prior, or the other way round; or the learned odometry's
-            device, its shipped weights or the libraries for a file of weights are missing; or another package's cannot
-            be loaded.
+        ConfigError: a prior is missing, or given to another method; or the learned odometry's device, its shipped
+            weights or the libraries for a file of weights are missing; or another package's cannot be loaded.
         InputError: the learned odometry's weights are invalid.
     """
     if (config.method == "external") != (prior is not None):

@@ -135,12 +135,11 @@ def simulated(config: SimulatedConfig) -> list[Stretch]:
         raise ConfigError(
             f"simulated.recordings={config.recordings}: none is of the worlds and sensors asked for; ask for more"
         )
-    return [_simulation(number, config.scans) for number in chosen]
-
-
-def _simulation(number: int, scans: int) -> Stretch:
-    identity = {"simulated": number, "seed": _SIMULATION_SEED, "scans": scans}
-    return Stretch(f"simulation {number}", identity, partial(_build, number, scans), 0, scans)
+    about = {"seed": _SIMULATION_SEED, "scans": config.scans}
+    return [
+        Stretch(f"simulation {n}", {"simulated": n, **about}, partial(_build, n, config.scans), 0, config.scans)
+        for n in chosen
+    ]
 
 
 def _build(number: int, scans: int) -> ScanSequence:

@@ -62,10 +62,7 @@ class StampInterpolator(Stateful):
     ) -> FloatArray:
         """The motion (4, 4) between the stamps of two scans, the previous first, from that between their middles.
 
-        Args:
-            T_prev_curr: (4, 4) from the middle of the current sweep to that of the previous one.
-            change: (6,) `velocity_change` of that motion.
-            middles, stamps: of the previous and of the current scan, seconds; middles increase.
+        `change` (6,) is the `velocity_change` of T_prev_curr (4, 4), the motion between the middles, which increase.
         """
         interval_s = middles[1] - middles[0]
         motion = SweepMotion(log(T_prev_curr) / interval_s, change, interval_s)

@@ -59,12 +59,8 @@ FINE_PATCHES = (
 def surface_normals(image: Floats, patches: Sequence[Patch] = PATCHES) -> Floats:
     """Unit normals (3, H, W) float32 that face the sensor, zero where no patch is a plane.
 
-    Patches wrap around the seam of azimuth; above and below the image they are empty.
-
-    Args:
-        image: (4, H, W) float32 of x, y, z and range in metres in the sensor's frame, zero where empty; wider than the
-            patches.
-        patches: of the tries, in turn.
+    Patches are tried in turn, wrap around the seam of azimuth, and are empty above and below the image (4, H, W): x, y,
+    z and range in metres, zero where empty.
     """
     rows, columns = max((one.rows for one in patches), default=0), max((one.columns for one in patches), default=0)
     height, width = image.shape[1:]

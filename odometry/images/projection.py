@@ -138,9 +138,9 @@ def _keep_nearest(
             pixel = pixels[i - begin]
             if pixel == _UNSURE:
                 px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-                row = row_of(math.atan2(pz, math.sqrt(px * px + py * py)), low, per_radian)
+                row = np.floor((math.atan2(pz, math.sqrt(px * px + py * py)) - low) * per_radian + 0.5)
                 inside = row >= 0.0 and row < height
-                pixel = int(row) * width + int(column_of(math.atan2(py, px), width)) if inside else _OUTSIDE
+                pixel = int(row) * width + int(_column_of(math.atan2(py, px), width)) if inside else _OUTSIDE
             if pixel != _OUTSIDE:
                 # Without a branch on which is nearer, which would be mispredicted.
                 nearest[pixel] = min(nearest[pixel], (np.int64(bits[i]) << _INDEX_BITS) | i)
@@ -179,13 +179,7 @@ def _write_pixels(
 
 
 @compiled_part
-def row_of(elevation: float, low: float, rows_per_radian: float) -> float:
-    """A whole number, which may lie outside of the image."""
-    return float(np.floor((elevation - low) * rows_per_radian + 0.5))
-
-
-@compiled_part
-def column_of(azimuth: float, width: int) -> float:
+def _column_of(azimuth: float, width: int) -> float:
     """A whole number inside the image."""
     azimuth = azimuth + _TURN if azimuth < 0.0 else azimuth
     column = np.floor(azimuth * (width / _TURN))

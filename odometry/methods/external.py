@@ -19,30 +19,23 @@ _SAME_INSTANT_S = 1e-3
 
 
 class ExternalOdometry(Stateful):
-    """Motions of a given trajectory, interpolated at the scans' stamps.
+    """Motions of a given trajectory T_odom_lidar, interpolated at the scans' stamps.
 
-    Args:
-        trajectory: T_odom_lidar at its own stamps; its world does not matter, only its motions do.
-        tolerance_s: largest time outside the trajectory's over which a scan is extrapolated.
-        largest_interval_s: a scan in a longer gap between two poses is not covered; None: a second, or five times the
-            trajectory's median step where that is longer.
-
-    InputError where the trajectory has fewer than two poses.
+    A scan is extrapolated over `tolerance_s` at most, and not covered in a gap between two poses of more than a second,
+    or five of the trajectory's median steps. InputError where there are fewer than two poses.
     """
 
     _T_odom_prev: Annotated[FloatArray, TRANSFORM] | None  # of the last scan that was covered
     _scans: int
     _uncovered: int  # scans without a pose
 
-    def __init__(
-        self, trajectory: Trajectory, tolerance_s: float = 0.1, largest_interval_s: float | None = None
-    ) -> None:
+    def __init__(self, trajectory: Trajectory, tolerance_s: float = 0.1) -> None:
         if len(trajectory) < 2:
             raise InputError(f"a prior trajectory needs two poses or more, this one has {len(trajectory)}")
         self._trajectory = trajectory
         self._tolerance_s = tolerance_s
         median_step_s = float(np.median(np.diff(trajectory.stamps)))
-        self._largest_interval_s = largest_interval_s or max(_LEAST_GAP_S, _LEAST_GAP_STEPS * median_step_s)
+        self._largest_interval_s = max(_LEAST_GAP_S, _LEAST_GAP_STEPS * median_step_s)
         self._T_odom_prev = None
         self._scans = self._uncovered = 0
 

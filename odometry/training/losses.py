@@ -78,16 +78,10 @@ _MAX_DISTANCES = 1 << 26
 
 @torch.no_grad()
 def nearest(query: Tensor, reference: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest valid reference point of each query: by a k-d tree on the CPU, by all distances on other devices.
+    """The nearest valid (B, M) of finite reference points (B, M, 3) to each query (B, N, 3): index and distance (B, N).
 
-    Args:
-        query: (B, N, 3), metres.
-        reference: (B, M, 3), finite, in the same frame.
-        valid: (B, M) bool, which reference points may be found.
-
-    Returns:
-        Index (B, N) int64 into M, and distance (B, N) in the dtype of the query. Without a valid reference, or where
-        the query is not finite, the index is 0 and the distance infinite.
+    By a k-d tree on the CPU, by all distances on other devices. Without a valid reference, or where the query is not
+    finite, the index is 0 and the distance infinite.
     """
     index = torch.zeros(query.shape[:2], dtype=torch.int64, device=query.device)
     distance = query.new_full(query.shape[:2], torch.inf)

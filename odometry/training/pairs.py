@@ -218,54 +218,43 @@ _STREAM = 1_000_003
 _SEEDS = 2**63
 
 
+@dataclass(frozen=True, eq=False)
 class Pairs:
-    """Draws batches of pairs from recordings, a recording or more, and changes them on a device.
+    """Draws batches of pairs from recordings, and changes them on a device."""
 
-    Args:
-        recordings, seed, augmentation, device: see above.
-        surfaces: whether the losses need compensated scans.
-        birds: whether the network looks from above.
-        weights: how often each recording is drawn, relative to the others; None: equally often.
-    """
-
-    def __init__(
-        self,
-        recordings: Sequence[PreparedRecording],
-        seed: int,
-        surfaces: bool = True,
-        birds: bool = True,
-        weights: Sequence[float] | None = None,
-        augmentation: Augmentation = AUGMENTATION,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self._recordings, self._seed, self._surfaces, self._birds = recordings, seed, surfaces, birds
-        self._weights = torch.tensor([1.0] * len(recordings) if weights is None else weights, dtype=torch.float64)
-        self._augmentation, self._device = augmentation, torch.device(device)
+    recordings: Sequence[PreparedRecording]  # one or more
+    seed: int  # of all draws
+    surfaces: bool = True  # whether the losses need compensated scans
+    birds: bool = True  # whether the network looks from above
+    weights: Sequence[float] | None = None  # how often each recording is drawn, relative to the others; None: equally
+    augmentation: Augmentation = AUGMENTATION
+    device: torch.device | str = "cpu"
 
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
         """The pairs of one step, on the device."""
-        seed = (self._seed * _STREAM**2 + step * _STREAM + process) % _SEEDS
-        choice, generator = torch.Generator().manual_seed(seed), torch.Generator(self._device).manual_seed(seed)
-        drawn = stack([self._draw(choice) for _ in range(size)]).to(self._device)
-        pairs = augmented(drawn, self._augmentation, generator)
-        return self._seen_from_above(pairs, generator) if self._birds else pairs
+        seed = (self.seed * _STREAM**2 + step * _STREAM + process) % _SEEDS
+        choice, generator = torch.Generator().manual_seed(seed), torch.Generator(self.device).manual_seed(seed)
+        drawn = stack([self._draw(choice) for _ in range(size)]).to(torch.device(self.device))
+        pairs = augmented(drawn, self.augmentation, generator)
+        return self._seen_from_above(pairs, generator) if self.birds else pairs
 
     def _draw(self, generator: Generator) -> PairBatch:
-        recording = self._recordings[int(torch.multinomial(self._weights, 1, generator=generator))]
-        most = min(self._augmentation.max_gap, len(recording) - 1)
+        weights = torch.tensor(self.weights or [1.0] * len(self.recordings), dtype=torch.float64)
+        recording = self.recordings[int(torch.multinomial(weights, 1, generator=generator))]
+        most = min(self.augmentation.max_gap, len(recording) - 1)
         gap = int(torch.randint(1, most + 1, (), generator=generator))
         first = int(torch.randint(len(recording) - gap, (), generator=generator))
-        pair = pair_of(recording, first, first + gap, self._surfaces)
-        is_reversed = float(torch.rand((), generator=generator)) < self._augmentation.reverse
+        pair = pair_of(recording, first, first + gap, self.surfaces)
+        is_reversed = float(torch.rand((), generator=generator)) < self.augmentation.reverse
         return reversed_pair(pair) if is_reversed else pair
 
     def _seen_from_above(self, batch: PairBatch, generator: Generator) -> PairBatch:
         """The pairs with bird's-eye grids; the turn between the scans is known to within an error."""
         size = len(batch.scans)
         turns = torch.atan2(batch.T_prev_curr[:, 1, 0], batch.T_prev_curr[:, 0, 0])
-        errors = _normal(generator, size) * math.radians(self._augmentation.bird_turn_deg)
+        errors = _normal(generator, size) * math.radians(self.augmentation.bird_turn_deg)
         fits = 2.0 * batch.T_prev_curr[:, :2, 3].abs().amax(1) < (MOST_CELLS - 1) * CELL_M
-        scale = 1.0 + (fits & (_uniform(generator, size) < self._augmentation.fine)).to(turns)
+        scale = 1.0 + (fits & (_uniform(generator, size) < self.augmentation.fine)).to(turns)
         headings = torch.stack([torch.zeros_like(turns), turns + errors], dim=1)
         return replace(batch, birds=birds(batch.scans, headings, scale[:, None].expand(-1, 2)), scale=scale)
 

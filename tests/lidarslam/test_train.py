@@ -34,13 +34,9 @@ from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_r
 from lidarslam.train.settings import LOSSES, load_train_config
 from lidarslam.train.train import TrainRequest, execute
 
-TINY = (
-    "training.images.columns=96",
-    "training.batch=2",
-    "training.steps=8",
-    "training.warmup_steps=2",
-    "training.hold_out=0.3",
-)
+SIZES = ("images.columns=96", "batch=2", "steps=8", "warmup_steps=2", "hold_out=0.3")
+TINY = [f"training.{size}" for size in SIZES]
+OPTIONS = [word for setting in TINY for word in ("--set", setting)]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -106,15 +102,11 @@ def losses(out: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k != "pairs_per_s"} for row in csv.DictReader(file)]
 
 
-def same_weights(one: Path, other: Path) -> bool:
-    a, b = (load_checkpoint(path / "weights_last.safetensors").weights for path in (one, other))
-    return all(torch.equal(a[name], b[name]) for name in a)
-
-
 def assert_same(found: Path, expected: Path) -> None:
     assert losses(found) == losses(expected), found.name
     assert (found / "validation.csv").read_bytes() == (expected / "validation.csv").read_bytes(), found.name
-    assert same_weights(found, expected), found.name
+    a, b = (load_checkpoint(path / "weights_last.safetensors").weights for path in (found, expected))
+    assert all(torch.equal(a[name], b[name]) for name in a), found.name
 
 
 @pytest.mark.usefixtures("interruptible")
@@ -125,7 +117,7 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder, tmp_
     assert not any("best so far" in line for line in console.lines if line.startswith("validation after 0 steps"))
     assert console.lines[-1].startswith("4 steps done; weights written to")
     assert "--resume" in console.lines[-1]
-    assert execute(request(room_folder, parts, ready, resume=True), Console())
+    assert execute(request(room_folder, parts, ready, resume=True), print)
     assert [row["step"] for row in losses(parts)] == ["3", "6", "8"]
     assert_same(parts, whole[0])
 
@@ -152,12 +144,12 @@ def copied_before_each_change(out: Path, copies: Path) -> Iterator[None]:
 def test_a_killed_training_goes_on_to_the_same_weights(room_folder, tmp_path, ready, whole):
     parts, copies = tmp_path / "parts", tmp_path / "copies"
     with copied_before_each_change(parts, copies):
-        assert execute(request(room_folder, parts, ready), Console())
-        assert execute(request(room_folder, parts, ready, resume=True), Console())
+        assert execute(request(room_folder, parts, ready), print)
+        assert execute(request(room_folder, parts, ready, resume=True), print)
     killed = sorted(copies.iterdir())
     assert len(killed) > 9
     for left in [*killed[1:8:3], *killed[-3:]]:
-        assert execute(request(room_folder, left, ready, resume=True), Console())
+        assert execute(request(room_folder, left, ready, resume=True), print)
         assert_same(left, whole[0])
         assert not list(left.glob(".partial*"))
 
@@ -193,9 +185,7 @@ def test_where_no_held_out_pair_can_be_aligned_the_last_weights_are_kept(room_fo
     console = Console()
     execute(request(room_folder, tmp_path / "out", ready), console)
     assert any("nothing to compare with" in line for line in console.lines)
-    kept, last = (
-        load_checkpoint(tmp_path / "out" / name) for name in ("weights.safetensors", "weights_last.safetensors")
-    )
+    kept, last = (load_checkpoint(tmp_path / "out" / f"{name}.safetensors") for name in ("weights", "weights_last"))
     assert all(torch.equal(kept.weights[name], last.weights[name]) for name in last.weights)
     assert kept.about["validation"] is None
     assert not any("nan" in line for line in console.lines)
@@ -240,7 +230,7 @@ def test_nothing_is_prepared_behind_a_link(room_folder, tmp_path):
     (tmp_path / "out" / "prepared").symlink_to(tmp_path / "outside")
     linked = replace(request(room_folder, tmp_path / "out", tmp_path), prepared=None)
     with pytest.raises(OutputError, match="is a link to another place"):
-        execute(linked, Console())
+        execute(linked, print)
     assert not any((tmp_path / "outside").iterdir())
 
 
@@ -254,8 +244,7 @@ def test_prepared_recordings_that_do_not_fit_are_made_anew(kept, name):
 
 
 def test_long_recordings_become_pieces():
-    stretch = Stretch("long", {}, lambda: pytest.fail("opened"), 100, 1301)
-    pieces = list(stretch.pieces())
+    pieces = list(Stretch("long", {}, lambda: pytest.fail("opened"), 100, 1301).pieces())
     assert [len(piece) for piece in pieces] == [400, 400, 401]
     assert (pieces[0].first, pieces[-1].stop) == (100, 1301)
 
@@ -263,8 +252,7 @@ def test_long_recordings_become_pieces():
 def test_whole_recordings_are_held_out_and_the_end_of_a_single_one():
     many = [Stretch(str(number), {}, lambda: pytest.fail("opened"), 0, 50) for number in range(10)]
     learned, held_out = hold_out(many, 0.2, seed=0)
-    assert (len(learned), len(held_out)) == (8, 2)
-    assert sorted(stretch.name for stretch in [*learned, *held_out]) == [str(number) for number in range(10)]
+    assert (len(learned), len(held_out), len({*learned, *held_out})) == (8, 2, 10)
     assert hold_out(many, 0.2, seed=0) == (learned, held_out)
     assert any(hold_out(many, 0.2, seed=seed) != (learned, held_out) for seed in range(1, 4))
     assert len(hold_out(many[:2], 0.01, seed=0)[1]) == 1
@@ -277,15 +265,13 @@ def test_whole_recordings_are_held_out_and_the_end_of_a_single_one():
 
 def test_of_the_simulated_recordings_some_kinds_can_be_chosen():
     """Those chosen are the same recordings as among all, so that what was prepared serves again."""
+    worlds, sensors = ("street", "park"), ("vlp-16", "os1-64")
     everything = simulated(SimulatedConfig(recordings=60))
-    chosen = simulated(SimulatedConfig(recordings=60, worlds=("street", "park"), sensors=("vlp-16", "os1-64")))
-    assert len(everything) == 60
-    numbers = [int(stretch.identity["simulated"]) for stretch in chosen]
-    assert 0 < len(numbers) < 20
-    for number in range(60):
-        of = ingredients_of(number, 0)
-        assert (number in numbers) == (of.world in ("street", "park") and of.sensor in ("vlp-16", "os1-64"))
-    assert all(stretch.identity == everything[number].identity for stretch, number in zip(chosen, numbers, strict=True))
+    chosen = simulated(SimulatedConfig(recordings=60, worlds=worlds, sensors=sensors))
+    kinds = [ingredients_of(number, 0) for number in range(60)]
+    expected = [n for n, kind in enumerate(kinds) if kind.world in worlds and kind.sensor in sensors]
+    assert 0 < len(expected) < 20
+    assert [stretch.identity for stretch in chosen] == [everything[number].identity for number in expected]
     with pytest.raises(ConfigError, match=r"simulated\.worlds: there is no 'strete'; choose from street, office"):
         simulated(SimulatedConfig(recordings=1, worlds=("strete",)))
     with pytest.raises(ConfigError, match=r"simulated\.recordings=1: none is of the worlds"):
@@ -312,15 +298,15 @@ def train(*arguments: object) -> Result:
 
 
 def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
-    out, settings = tmp_path / "out", [word for setting in TINY for word in ("--set", setting)]
+    out = tmp_path / "out"
     options = ("--out", out, "--prepared", ready, "--device", "cpu")
-    result = train(room_folder, *options, *settings, "--steps", 3)
+    result = train(room_folder, *options, *OPTIONS, "--steps", 3)
     assert result.exit_code == 0, result.output
     for words in ("training on 1 recording: 7 scans to learn from, 3 more", "step 3/3  loss", "validation after 0"):
         assert words in result.output
     assert f"lidarslam run SOURCE --weights {out / 'weights.safetensors'}" in result.output
     first = losses(out)
-    result = train(room_folder, *options, *settings)
+    result = train(room_folder, *options, *OPTIONS)
     assert result.exit_code == 1
     assert "holds a training already" in result.output
     result = train(*options, "--resume", "--steps", 5)  # on what, and how, is remembered
@@ -331,7 +317,7 @@ def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     assert result.exit_code == 0, result.output
     assert [row["step"] for row in losses(out)] == ["2"]
     assert load_checkpoint(out / "weights.safetensors").images.columns == 96
-    result = train(room_folder, *options, "--overwrite", "--steps", 3, "--set", "training.seed=1", *settings)
+    result = train(room_folder, *options, "--overwrite", "--steps", 3, "--set", "training.seed=1", *OPTIONS)
     assert result.exit_code == 0, result.output
     assert losses(out) != first
 
@@ -359,16 +345,16 @@ def test_mistakes_are_told_in_one_line(arguments, told, tmp_path):
 
 def test_other_recordings_or_files_are_not_gone_on_with(room_folder, tmp_path, ready):
     out = tmp_path / "out"
-    execute(request(room_folder, out, ready, "training.steps=1"), Console())
+    execute(request(room_folder, out, ready, "training.steps=1"), print)
     with pytest.raises(ConfigError, match="not those that this training was begun with"):
-        execute(request(room_folder, out, ready, "reader.rate_hz=5", resume=True), Console())
+        execute(request(room_folder, out, ready, "reader.rate_hz=5", resume=True), print)
     (out / "state.safetensors").write_bytes(pickle.dumps({"a": 1}))
     with pytest.raises(InputError, match="is no safetensors file"):
-        execute(request(room_folder, out, ready, resume=True), Console())
+        execute(request(room_folder, out, ready, resume=True), print)
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "weights.safetensors").write_text("mine")
     with pytest.raises(OutputError, match="not those of a training"):
-        execute(request(room_folder, tmp_path / "foreign", ready), Console())
+        execute(request(room_folder, tmp_path / "foreign", ready), print)
 
 
 @pytest.mark.slow
@@ -376,10 +362,9 @@ def test_two_processes_train_one_network(room_folder, tmp_path, ready):
     """The first process validates, writes and speaks; gradients are averaged, so that both have the same weights."""
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", "--no-python"]
     program = [sys.executable, "-c", "from lidarslam.cli import main; main()"]
-    settings = [word for setting in TINY for word in ("--set", setting)]
-    options = ["--out", str(tmp_path / "out"), "--prepared", str(ready), "--device", "cpu", "--steps", "2"]
+    options = ["--out", str(tmp_path / "out"), "--prepared", str(ready), "--device", "cpu", *OPTIONS, "--steps", "2"]
     result = subprocess.run(
-        [*torchrun, *program, "train", str(room_folder), *options, *settings],
+        [*torchrun, *program, "train", str(room_folder), *options],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -391,12 +376,11 @@ def test_two_processes_train_one_network(room_folder, tmp_path, ready):
 @pytest.mark.slow
 def test_a_short_recording_is_learnt_by_heart(room_folder, tmp_path, ready, monkeypatch):
     """Labels play no part: alignment found the motions that the error is measured against."""
-    plain = ("roll", "any_roll", "mirror", "scale", "drop_beams", "drop_points", "hide_sector")
-    unchanged = AUGMENTATION._replace(**dict.fromkeys(plain, 0.0))
+    unchanged = AUGMENTATION._replace(roll=0.0, any_roll=0.0, mirror=0.0, scale=0.0, drop_beams=0.0, hide_sector=0.0)
     monkeypatch.setattr("lidarslam.train.loop.Pairs", partial(Pairs, augmentation=unchanged))
     monkeypatch.setattr("lidarslam.train.loop.VALIDATE_EVERY", 100)
     settings = ("training.steps=300", "training.batch=8", "training.hold_out=0.0")
-    execute(request(room_folder, tmp_path / "out", ready, *settings), Console())
+    execute(request(room_folder, tmp_path / "out", ready, *settings), print)
     trained = load_checkpoint(tmp_path / "out" / "weights.safetensors")
     config = load_train_config(None, TINY)
     recording = prepared([recorded(room_folder, config.reader)], config.training, ready, lambda _: None)
