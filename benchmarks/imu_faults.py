@@ -22,30 +22,14 @@ from lidarslam.cli import main as lidarslam
 from lidarslam.core.geometry import FloatArray
 
 # Rows of `imu.csv`: stamp, angular velocity (rad/s), specific force (m/s^2).
-RATE, FORCE = slice(1, 4), slice(4, 7)
+STAMP, RATE, FORCE = slice(0, 1), slice(1, 4), slice(4, 7)
 # What names a fault.
 ANY = ("IMU", "gyroscope", "accelerometer")
 
 
-def _plus(columns: slice, value: float) -> Callable[[FloatArray], FloatArray]:
+def _changed(columns: slice, times: float = 1.0, plus: float = 0.0) -> Callable[[FloatArray], FloatArray]:
     def change(rows: FloatArray) -> FloatArray:
-        rows[:, columns] += value / np.sqrt(3.0)
-        return rows
-
-    return change
-
-
-def _times(columns: slice, value: float) -> Callable[[FloatArray], FloatArray]:
-    def change(rows: FloatArray) -> FloatArray:
-        rows[:, columns] *= value
-        return rows
-
-    return change
-
-
-def _later(seconds: float) -> Callable[[FloatArray], FloatArray]:
-    def change(rows: FloatArray) -> FloatArray:
-        rows[:, 0] += seconds
+        rows[:, columns] = times * rows[:, columns] + plus
         return rows
 
     return change
@@ -68,16 +52,16 @@ def _saturated(rows: FloatArray) -> FloatArray:
 
 FAULTS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "none": lambda rows: rows,
-    "0.1 g bias": _plus(FORCE, 0.981),
-    "1 deg/s bias": _plus(RATE, float(np.deg2rad(1.0))),
-    "20 ms late": _later(0.02),
-    "20 ms early": _later(-0.02),
+    "0.1 g bias": _changed(FORCE, plus=0.981 / np.sqrt(3.0)),
+    "1 deg/s bias": _changed(RATE, plus=np.deg2rad(1.0) / np.sqrt(3.0)),
+    "20 ms late": _changed(STAMP, plus=0.02),
+    "20 ms early": _changed(STAMP, plus=-0.02),
     "10 % dropped": _dropped,
     "saturated": _saturated,
-    "deg/s": _times(RATE, float(np.rad2deg(1.0))),
-    "g": _times(FORCE, 1.0 / 9.80665),
-    "gyroscope reversed": _times(RATE, -1.0),
-    "accelerometer reversed": _times(FORCE, -1.0),
+    "deg/s": _changed(RATE, times=np.rad2deg(1.0)),
+    "g": _changed(FORCE, times=1.0 / 9.80665),
+    "gyroscope reversed": _changed(RATE, times=-1.0),
+    "accelerometer reversed": _changed(FORCE, times=-1.0),
     "x and y swapped": _swapped,
 }
 

@@ -17,7 +17,6 @@ first confirmation. Milliseconds are wall time of one scan that is tracked (medi
 """
 
 import argparse
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -86,7 +85,6 @@ class Outcome:
     lost: int = 0
     tracked_ms: list[float] = field(default_factory=list)
     search_ms: list[float] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
 
     def add(self, localiser: MapLocaliser, scans: list[Scan], config: Config, truth: FloatArray | None) -> None:
         """Localise a recording; truth (N, 4, 4) in the map's frame, None where the map is of another place."""
@@ -96,7 +94,6 @@ class Outcome:
         self.recordings += 1
         poses = np.array([result.T_world_lidar for result in results])
         statuses = [result.status for result in results]
-        self.reasons += [reason for _, reason in localiser.refusals]
         ms = np.array([result.stage_ms["refine"] for result in results])
         self.tracked_ms += [one for one, status in zip(ms, statuses, strict=True) if status is Status.OK]
         self.search_ms.append(float(ms.max()))
@@ -151,9 +148,7 @@ def of_worlds(arguments: argparse.Namespace, config: Config) -> None:
     """Rows of simulated worlds."""
     for world in arguments.worlds:
         sensor, seed = arguments.sensor, arguments.seed
-        began = time.perf_counter()
         fixed_map = draw_map(simulate(world, seed, seed, sensor), arguments.map_every)
-        drawn_s = time.perf_counter() - began
         for name, recording, is_there in cases(world, sensor, seed):
             if arguments.cases and name not in arguments.cases:
                 continue
@@ -163,8 +158,6 @@ def of_worlds(arguments: argparse.Namespace, config: Config) -> None:
                 truth = recording.ground_truth.T_world_lidar[first : first + arguments.scans] if is_there else None
                 outcome.add(MapLocaliser(config.mapping, fixed_map), scans, config, truth)
             print_row([world, f"{sensor}, {name}", *outcome.cells()])
-            if arguments.reasons:
-                print(f"  {drawn_s:.0f} s for the map of {len(fixed_map):,} points; {sorted(set(outcome.reasons))}")
 
 
 def of_run(arguments: argparse.Namespace, config: Config) -> None:
@@ -193,7 +186,6 @@ def main() -> None:
     parser.add_argument("--odometry", default="learned", choices=["learned", "constant-velocity", "kiss-icp"])
     parser.add_argument("--run", type=Path, help="a run directory, instead of simulated worlds")
     parser.add_argument("--source", type=Path, help="the recording of that run")
-    parser.add_argument("--reasons", action="store_true", help="print why searches found no place")
     arguments = parser.parse_args()
     config = Config(odometry=OdometryConfig(method=arguments.odometry))
     print_header(

@@ -11,13 +11,11 @@ Prints a Markdown table, a row for each recording. ATE is of all scans, after SE
 its relative pose is off the truth by more than 0.5 m or 3 degrees; the first number is of those that the detector
 accepted, the second of those that the optimiser kept in the end. A keyframe is a revisit when the truth was within
 half the median range of it before, a loop's least way ago; it is found when a closure was kept within 5 m of way of
-it. Milliseconds are of the processor. At the end, what false ones there are, and why true ones were refused.
+it. Milliseconds are of the processor.
 """
 
 import argparse
-import re
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -221,28 +219,6 @@ def row(lap: Lap, estimates: FloatArray, followed: Followed) -> list[str]:
     ]
 
 
-def refusals(lap: Lap, followed: Followed) -> list[str]:
-    """Every false closure that was accepted, and for how many that were right what spoke against them."""
-    result = followed.result
-    truth = lap.truth[result.keyframe_scans]
-    lines: list[str] = []
-    reasons: Counter[str] = Counter()
-    errors = errors_of(result.closures, truth)
-    for closure, (off_m, off_deg), wrong in zip(result.closures, errors, is_false(errors), strict=True):
-        if wrong and closure.accepted:
-            lines.append(
-                f"false: {closure.first} and {closure.second}, {_found_by(closure)}, off by {off_m:.2f} m"
-                f" {off_deg:.1f} deg, overlap {closure.overlap:.2f}, {closure.consistent} agree"
-            )
-        elif not wrong and not closure.accepted:
-            reasons[re.sub(r"[0-9.]+", "N", closure.reason)] += 1
-    return lines + [f"right but refused, {count}: {reason}" for reason, count in reasons.most_common()]
-
-
-def _found_by(closure: LoopClosure) -> str:
-    return "by appearance" if closure.by_appearance else "nearby"
-
-
 def _squared(closure: LoopClosure, truth: FloatArray) -> float:
     """The error against its covariance; 5.3 in the median if that were right."""
     xi = log(inverse(closure.T_first_second) @ inverse(truth[closure.first]) @ truth[closure.second])
@@ -283,13 +259,10 @@ def main() -> None:
     header += ["off by, median / max", "degrees", "squared over covariance", "revisits found, %"]
     header += ["ms a keyframe, median / 95 % / mean"]
     print_header(header)
-    notes: list[str] = []
     for lap in laps(arguments):
         estimates = drifting(lap.truth, lap.way_m, arguments.drift, arguments.seed)
         followed = follow(lap, estimates, config)
         print_row(row(lap, estimates, followed))
-        notes += [f"{lap.name}: {line}" for line in refusals(lap, followed)]
-    print("", *notes, sep="\n")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Whether a long run takes more and more memory.
 
     python benchmarks/memory.py lap --world hall --motion tracked --scans 20000 [--columns 200]
-    python benchmarks/memory.py rooms --scans 20000 [--lost-every 600] [--points 1000] [--keep-free]
+    python benchmarks/memory.py rooms --scans 20000 [--lost-every 600] [--points 1000]
     python benchmarks/memory.py still --scans 100000 [--graph]
 
 - lap: a sensor goes round and round in a simulated place;
 - rooms: it stands in a made-up room, and with `--lost-every` wakes up in another one every so many scans, where after
-  20 lost scans a map begins; with `--keep-free`, free memory stays with the process;
+  20 lost scans a map begins;
 - still: a few hundred points per scan, always the same but for the noise, without mapping: what a run keeps of each.
   The global map merges its points after 20,000 instead of a million, or its saw teeth would hide everything else.
 
@@ -37,7 +37,6 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map import global_map
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline import threads
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.odometry_gate import where_needed
@@ -102,8 +101,6 @@ def lap(options: argparse.Namespace) -> Case:
 
 def rooms(options: argparse.Namespace) -> Case:
     """One room, or one after another."""
-    if options.keep_free:
-        threads.EVERY_SCANS = options.scans + 1
 
     def scans() -> Iterator[Scan]:
         rng = np.random.default_rng(0)
@@ -219,7 +216,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--points", type=int, default=1_000, help="of a scan of a room")
     parser.add_argument("--lost-every", type=int, help="scans from one room to the next")
-    parser.add_argument("--keep-free", action="store_true")
     parser.add_argument("--graph", action="store_true", help="with a pose graph, standing still")
     options = parser.parse_args()
     print_header(list(Row.__dataclass_fields__))

@@ -169,7 +169,7 @@ def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
     return results, points[~seen_through(points, views, pipeline.map.global_map.voxel_size_m)]
 
 
-def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) -> list[str]:
+def row(case: Case, name: str, wrong_m: float, keep_moved: bool) -> list[str]:
     """The cells of one method on one recording."""
     kept = GlobalMapConfig(leave_out_moved=not keep_moved)
     results, points = run(case, METHODS[name].model_copy(update={"global_map": kept}))
@@ -179,8 +179,6 @@ def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) 
     off = inverse(true) @ poses
     distance, angle = np.linalg.norm(off[:, :3, 3], axis=1), np.rad2deg(rotation_angle(off))
     status = np.array([result.status.value for result in results])
-    if verbose:
-        _tell(results, distance, angle, recorded)
     after = np.arange(len(results)) >= min(recorded.after + _BACK_AFTER, len(results) - 5)
     estimate = Trajectory(truth_stamps := recorded.truth.stamps[after], poses[after])
     shape = evaluate_trajectory(estimate, Trajectory(truth_stamps, truth[after])).errors.ate_rmse_m
@@ -203,16 +201,6 @@ def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) 
 def _counts(status: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> str:
     lost, degraded = int((status == "lost").sum()), int((status == "degraded").sum())
     return f"{lost} lost, {degraded} degraded of {len(status)}"
-
-
-def _tell(results: list[ScanEstimate], distance: FloatArray, angle: FloatArray, recorded: Faulty) -> None:
-    previous = ""
-    for k, result in enumerate(results):
-        if result.message != previous or k % 20 == 0:
-            mark, off = "*" if recorded.concerned[k] else " ", f"{distance[k]:7.3f} m {angle[k]:6.2f} deg"
-            inliers = "" if result.inlier_ratio is None else f"{result.inlier_ratio:.2f}"
-            print(f"  {k:3d}{mark} {result.status.value:8s} {off} {inliers} {result.message}")
-        previous = result.message
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
@@ -238,14 +226,13 @@ def main() -> None:
     parser.add_argument("--wrong-m", type=float, default=0.2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep-moved", action="store_true", help="what was seen through stays in the map")
-    parser.add_argument("--verbose", action="store_true", help="every scan that is not ok")
     arguments = parser.parse_args()
     header = ["fault", "place", "method", "concerned", "elsewhere", "believed and wrong", "worst, after"]
     header += ["shape, after, m", "polluted, %"]
     print_header(header)
     for case in cases(arguments):
         for method in arguments.methods:
-            print_row(row(case, method, arguments.wrong_m, arguments.keep_moved, arguments.verbose))
+            print_row(row(case, method, arguments.wrong_m, arguments.keep_moved))
 
 
 if __name__ == "__main__":
