@@ -42,9 +42,6 @@ def fetched(source: str | os.PathLike[str]) -> Path:
     """The path of a source, which is fetched first where it is named by URL and not there yet.
 
     Over http a folder is known by the slash at the end of its URL.
-
-    Raises:
-        InputError: its kind of storage is not one of these, or it cannot be fetched.
     """
     parts = _URL.fullmatch(os.fspath(source))
     if parts is None:
@@ -71,9 +68,6 @@ def fetch(url: str, path: Path) -> None:
     """Fetch a file or a folder, unless it is there; of several processes that need it, one does so.
 
     An interrupted download is continued, where the storage can read from the middle of a file.
-
-    Raises:
-        InputError: fsspec or the library for this kind of URL is not installed, or it cannot be fetched.
     """
     if path.exists():
         return

@@ -104,11 +104,7 @@ def find_imu_file(folders: Sequence[Path]) -> Path | None:
 
 
 def read_imu_csv(path: Path) -> ImuSamples | None:
-    """The samples of a table; None of a table without any.
-
-    Raises:
-        InputError: the file cannot be read, or a line is no sample.
-    """
+    """The samples of a table; None of a table without any."""
     lines = list(bounded_lines(path))
     comments = [line for line in lines if line.startswith("#")]
     rows = [line for line in lines if line.strip() and not line.startswith("#")]

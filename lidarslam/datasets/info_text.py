@@ -23,11 +23,7 @@ _CHOOSE = "Choose one of them with --topic, such as --topic {}"
 
 
 def describe_source(source: Path, config: ReaderConfig) -> str:
-    """The contents of a recording; of a bag whose topic is still to be chosen, the topics alone.
-
-    Raises:
-        InputError: the source cannot be read.
-    """
+    """The contents of a recording; of a bag whose topic is still to be chosen, the topics alone."""
     try:
         return format_info(source, open_recording(source, config).describe())
     except SeveralTopicsError as error:
@@ -40,11 +36,7 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
 
 
 def describe_as_json(source: Path, config: ReaderConfig) -> str:
-    """The same as JSON with the keys of docs/command_line.md, all of them always; null for unknown values.
-
-    Raises:
-        InputError: the source cannot be read.
-    """
+    """The same as JSON with the keys of docs/command_line.md, all of them always; null for unknown values."""
     content = _content(source, choose_reader(source, config.name))
     try:
         content |= _known(open_recording(source, config).describe())

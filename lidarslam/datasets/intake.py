@@ -60,11 +60,7 @@ _ONE_PLACE = "scans have all their points at one place and carry no geometry"
 
 
 def choose_scans(recording: Recording, source: Path, start: int, stop: int | None, step: int) -> range:
-    """Indices of the scans that --start, --stop and --step choose.
-
-    Raises:
-        InputError: none is left.
-    """
+    """Indices of the scans that --start, --stop and --step choose."""
     chosen = range(len(recording))[start:stop:step]
     if not chosen:
         raise InputError(f"{source}: none of its {len(recording)} scans is left after --start, --stop and --step")
@@ -72,11 +68,7 @@ def choose_scans(recording: Recording, source: Path, start: int, stop: int | Non
 
 
 def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Scan]:
-    """The chosen scans of a recording, in the order of time, of bounded size; faults are counted.
-
-    Raises:
-        InputError: the recording is damaged where no scan can be left out, or its clock was set back.
-    """
+    """The chosen scans of a recording, in the order of time, of bounded size; faults are counted."""
     scans = recording.scans(chosen.start, chosen.stop, chosen.step, faults)
     if np.array_equal(recorded_axes(recording)[1], np.eye(4)):
         scans = _with_turns_checked(scans, faults)

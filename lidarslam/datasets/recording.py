@@ -10,6 +10,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 
@@ -33,14 +34,6 @@ class SeveralTopicsError(InputError):
 
 # Of the points of KITTI, and of the .bin files of others.
 KITTI_FIELDS = ("x", "y", "z", "intensity")
-
-
-@dataclass(frozen=True)
-class PointField:
-    """One field of the points as stored, such as `intensity`, `float32`."""
-
-    name: str
-    type_name: str
 
 
 @dataclass(frozen=True)
@@ -96,11 +89,7 @@ class Recording(ScanSequence, Protocol):
 
     @property
     def imu(self) -> ImuSamples | None:
-        """The samples of the IMU; None without one.
-
-        Raises:
-            InputError: they cannot be read.
-        """
+        """The samples of the IMU; None without one."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -112,14 +101,7 @@ class Recording(ScanSequence, Protocol):
         """The scans with the indices of `range(start, stop, step)`.
 
         Those that cannot be read are left out and counted in `faults`; without it the first of them is an error.
-
-        Raises:
-            InputError: the range makes no sense, a scan cannot be read, or nothing more can be.
         """
 
     def describe(self) -> RecordingInfo:
-        """The contents of the recording, by its first scan too.
-
-        Raises:
-            InputError: no scan can be read, or a file that belongs to the recording is damaged.
-        """
+        """The contents of the recording, by its first scan too."""

@@ -119,11 +119,7 @@ ALL_READERS = PlugPoint("reader", tuple(READERS))
 
 
 def choose_reader(source: Path, name: str | None = None) -> str:
-    """The name of the reader for a source: the given one, else the first in the table that recognises it.
-
-    Raises:
-        InputError: no such source, no such reader, or no reader recognises the source.
-    """
+    """The name of the reader for a source: the given one, else the first in the table that recognises it."""
     source = located(source)
     try:
         exists = source.exists()
@@ -184,12 +180,7 @@ def _reader(name: str) -> Reader:
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
-    """Open a recording, in upright axes, elevations corrected; scans are read later, one at a time.
-
-    Raises:
-        InputError: the source cannot be read by the chosen reader.
-        ConfigError: the reader is another package's, and cannot be loaded.
-    """
+    """Open a recording, in upright axes, elevations corrected; scans are read later, one at a time."""
     config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
     reader = _reader(name)

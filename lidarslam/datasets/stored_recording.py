@@ -14,8 +14,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.imu_samples import summarise
-from lidarslam.datasets.recording import KITTI_FIELDS, ImuSummary, PointField, RecordingInfo, Topic
+from lidarslam.datasets.recording import KITTI_FIELDS, ImuSummary, RecordingInfo, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "grou
 class StoredRecording:
     """A file or folder; implements `Recording`.
 
-    A reader adds `__len__`, `_items`, `_read`, `_fields` and `_last_stamp`, and truth, IMU and notes where they exist.
+    A reader adds `__len__`, `_items`, `_read`, `_fields` and `_last_stamp`, and sets or overrides what else there is.
     """
 
     reader: str
@@ -44,26 +45,42 @@ class StoredRecording:
         """The folder's name, or the file's without its suffix."""
         return self._source.resolve().name if self._source.is_dir() else self._source.stem
 
-    @property
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at the truth's own stamps."""
+        return None if self._truth_path is None else read_tum(self._truth_path)
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """No IMU."""
+        return None
+
+    @cached_property
     def T_cam_lidar(self) -> FloatArray | None:
         """No camera."""
         return None
 
     @cached_property
-    def ground_truth(self) -> Trajectory | None:
-        """T_world_lidar at the truth's own stamps."""
-        path = self._truth_path()
-        return None if path is None else read_tum(path)
-
-    @property
-    def imu(self) -> ImuSamples | None:
-        """The samples of the IMU."""
-        return None
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """Faults of the recording as a whole."""
         return ()
+
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        return ()
+
+    @cached_property
+    def _truth_path(self) -> Path | None:
+        return None
+
+    @cached_property
+    def _point_time(self) -> PointTimeModel | None:
+        return None
+
+    @cached_property
+    def _rate_is_assumed(self) -> bool:
+        """Whether the stamps follow from the rate of the settings."""
+        return False
 
     def __len__(self) -> int:
         raise NotImplementedError
@@ -100,12 +117,12 @@ class StoredRecording:
             scans=len(self),
             first=first,
             last_stamp=self._last_stamp(first),
-            ground_truth=self._truth_path(),
-            point_time=self._point_time_model(),
+            ground_truth=self._truth_path,
+            point_time=self._point_time,
             topic=self.topic,
             topics=self.topics,
             fields=self._fields(item),
-            notes=(*self._notes(), *self.warnings, *faults.warnings()),
+            notes=(*self._notes, *self.warnings, *faults.warnings()),
             rate_is_assumed=self._rate_is_assumed,
             imu=self._imu_summary(),
         )
@@ -127,32 +144,16 @@ class StoredRecording:
         raise NotImplementedError
 
     def _read(self, item: Any, faults: Faults) -> Scan:
-        """The scan; an InputError where it cannot be read."""
         raise NotImplementedError
 
     def _fields(self, item: Any) -> tuple[PointField, ...]:
-        """The fields of its points as stored."""
         raise NotImplementedError
 
     def _last_stamp(self, first: Scan) -> float:
         raise NotImplementedError
 
-    @property
-    def _rate_is_assumed(self) -> bool:
-        """Whether the stamps follow from the rate of the settings."""
-        return False
-
-    def _truth_path(self) -> Path | None:
-        return None
-
-    def _point_time_model(self) -> PointTimeModel | None:
-        return None
-
     def _imu_summary(self) -> ImuSummary | None:
         return summarise(self.imu_name, self.imu)
-
-    def _notes(self) -> Iterator[str]:
-        return iter(())
 
 
 class FileRecording(StoredRecording):
@@ -160,6 +161,8 @@ class FileRecording(StoredRecording):
 
     stamps: FloatArray
     """(N,) seconds."""
+    _stored: tuple[tuple[str, str], ...] = tuple((name, "float32") for name in KITTI_FIELDS)
+    """Names and types of the fields of its points."""
 
     def __init__(self, folder: Path, config: ReaderConfig, files: Sequence[Path]) -> None:
         super().__init__(folder, config)
@@ -172,18 +175,14 @@ class FileRecording(StoredRecording):
         return iter(wanted)
 
     def _fields(self, item: int) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(name, "float32") for name in KITTI_FIELDS)
+        return tuple(PointField(*field) for field in self._stored)
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
         return float(self.stamps[-1])
 
 
 def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
-    """The indices `range(start, stop, step)` of a recording of `count` scans, a stop past the end being the end.
-
-    Raises:
-        InputError: a negative start or stop, or a step below one.
-    """
+    """The indices `range(start, stop, step)` of a recording of `count` scans, a stop past the end being the end."""
     if start < 0 or step < 1 or (stop is not None and stop < 0):
         raise InputError(
             f"expected start >= 0, stop >= 0 and step >= 1, got start {start}, stop {stop} and step {step}"
@@ -191,12 +190,31 @@ def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
     return range(start, count if stop is None else min(stop, count), step)
 
 
-def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun: str = "sequence") -> str:
-    """Of the names of a data set's sequences the only one, or the wanted one: by name, or by the last number in it.
+def find_sequence(source: Path, folder: Path, marker: str, wanted: str | None, noun: str = "sequence") -> Path:
+    """The sequence of a data set: the source, or one of those in a folder, which are known by a file or folder in them.
 
-    Raises:
-        InputError: there is no such sequence, or several to choose from.
+    Args:
+        source: as given.
+        folder: with the sequences, where the source is no sequence.
+        marker: the path in a sequence by which it is known.
+        wanted: its name, or the last number in it; None: the only one.
+        noun: the name of a sequence in this data set.
     """
+    if (source / marker).exists():
+        name = source.resolve().name
+        if wanted is not None and wanted.zfill(len(name)) != name:
+            raise InputError(
+                f"{source}: is the {noun} {name}, not {wanted}; leave --sequence out or give the folder above"
+            )
+        return source
+    names = sorted(path.name for path in folder.glob("*") if (path / marker).exists())
+    if not names:
+        raise InputError(f"{source}: expected {marker} in it, or in folders in {folder}; found neither")
+    return folder / choose_sequence(source, names, wanted, noun)
+
+
+def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun: str = "sequence") -> str:
+    """Of the names of a data set's sequences the only one, or the wanted one: by name, or by the last number in it."""
     number = int(wanted) if wanted is not None and wanted.isdecimal() else None
     fitting = [name for name in names if wanted in (None, name)] or [
         name for name in names if number is not None and _last_number(name) == number

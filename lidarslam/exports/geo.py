@@ -187,12 +187,12 @@ def read_gnss(source: Path, config: ReaderConfig) -> GnssTrack:
 
 
 def _of_drive(drive: KittiRawRecording) -> GnssTrack | None:
-    if drive.oxts is None:
+    rows = drive.oxts
+    if rows is None:
         return None
-    rows, stamps = drive.oxts
     T_lidar_imu = None if drive.imu is None else drive.imu.T_lidar_imu
-    timed = np.isfinite(stamps)
-    return GnssTrack(stamps[timed], rows.geodetic[timed], rows.accuracy_m[timed], *_antenna(T_lidar_imu))
+    timed = np.isfinite(rows.stamps)
+    return GnssTrack(rows.stamps[timed], rows.geodetic[timed], rows.accuracy_m[timed], *_antenna(T_lidar_imu))
 
 
 def _of_bag(bag: BagFile, lidar_frame: str) -> GnssTrack | None:

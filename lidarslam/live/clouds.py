@@ -6,11 +6,12 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import RawCloud
 from lidarslam.datasets.mounting import corrected, transform_of
 from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
-from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, TimedCloud, learn_point_time
+from lidarslam.datasets.times.azimuth import PointTiming
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
 
 # Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
 _MOST_LOOKED_AT = 10
@@ -50,8 +51,8 @@ class CloudDecoder:
         self._doubtful: tuple[int, int] | None = None  # stamp and publication of a first message from the future
         self._last_published_ns = self._ahead = 0  # and the number of stamps in a row ahead of it
         self._has_header_stamps = True
-        self._clouds: list[TimedCloud] = []
-        self._point_time: PointTimeModel | None = None
+        self._clouds: list[tuple[RawCloud, float]] = []
+        self._timing = PointTiming()
         self._is_settled = config.time_reference == "none"
         self.T_upright_recorded = transform_of(config.mounting)
 
@@ -70,9 +71,7 @@ class CloudDecoder:
         self._learn(cloud, stamp)
         self._last_ns, self._last_published_ns, self._frame_id = stamp_ns, published_ns, frame_id
         self._ahead = 0
-        model = self._point_time
-        offsets = None if model is None else cloud.offsets(model, stamp)
-        scan = cloud.scan(stamp, offsets, model is not None, self._faults)
+        scan = self._timing.scan(cloud, stamp, self._faults, f"{stamp:.9f}")
         scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
         return LiveScan(scan, stamp_ns, frame_id)
 
@@ -106,7 +105,7 @@ class CloudDecoder:
             return True
         return before is not None and 0 < stamp_ns - before[0] < published_ns - before[1] + _AHEAD_NS
 
-    def _decode(self, message: BagMessage) -> DecodedCloud:
+    def _decode(self, message: BagMessage) -> RawCloud:
         """Decode the points; InputError where the message is damaged or lacks a field."""
         try:
             return decode(message, True, self._config.time_field)
@@ -115,19 +114,19 @@ class CloudDecoder:
         except Exception as error:  # of a message that breaks off: an assertion, struct.error, IndexError
             raise InputError(f"a message cannot be decoded ({error or type(error).__name__})") from error
 
-    def _learn(self, cloud: DecodedCloud, stamp: float) -> None:
+    def _learn(self, cloud: RawCloud, stamp: float) -> None:
         """Infer unit and reference of the time field, until they are clear."""
         if self._is_settled:
             return
         unit, reference, defined_unit = self._config.time_unit, self._config.time_reference, None
         if self._type in driver_messages.CUSTOM_MESSAGE_TYPES:
             reference, defined_unit = "absolute", driver_messages.TIME_UNIT
-        self._clouds.append(cloud.timed(stamp))
-        stamps = [cloud.stamp for cloud in self._clouds if cloud.stamp is not None]
-        period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) if len(stamps) > 1 else None
+        self._clouds.append((cloud, stamp))
+        before = len(self._clouds) - 1
+        period_s = (stamp - self._clouds[0][1]) / before if before else None
         learned = learn_point_time(self._clouds, unit, reference, period_s, defined_unit)
-        self._point_time = learned.model
-        is_clear = self._point_time is not None and stamp > 2 * CLOCK_LIMIT_S
+        self._timing = PointTiming(learned.model)
+        is_clear = learned.model is not None and stamp > 2 * CLOCK_LIMIT_S
         self._is_settled = is_clear or len(self._clouds) == _MOST_LOOKED_AT
         if self._is_settled:
             self._clouds.clear()

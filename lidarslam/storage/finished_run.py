@@ -139,8 +139,8 @@ def load_map(path: Path) -> PointCloud:
         raise InputError(f"{file}: not a readable point cloud; no point is finite")
     names = scalar_fields(table)
     attributes = PointAttributes(
-        intensity=read_intensities(table, names),
-        rgb=read_colours(table, names),
+        intensity=read_intensities(table),
+        rgb=read_colours(table),
         ring=table["ring"].astype(np.int32) if "ring" in names else None,
         time=table["time"].astype(np.float64) if "time" in names else None,
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.folders.point_table import RawCloud
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.times.azimuth import are_as_measured, offsets_from_order, sweep_order
 
@@ -71,7 +72,7 @@ def record(folder: Path, every=1, stamps=True, rings=True, count=30, **options) 
 @pytest.mark.parametrize("with_rings", [True, False])
 def test_times_of_a_sweep(direction, start, with_rings):
     points, times, rings = sweep(0.0, direction=direction, start=start)
-    found = offsets_from_order(points, rings if with_rings else None, PERIOD_S)
+    found = offsets_from_order(RawCloud(points, rings=rings if with_rings else None), PERIOD_S)
     expected = (times - times.min()) * PERIOD_S / np.ptp(times)
     np.testing.assert_allclose(found, expected, atol=PERIOD_S / COLUMNS)
 
@@ -79,14 +80,14 @@ def test_times_of_a_sweep(direction, start, with_rings):
 def test_angles_between_the_lasers_of_one_firing_are_removed_by_rings():
     points, times, rings = sweep(0.0, start=0.5)
     points = _turned(points, np.radians(np.where(rings % 2, 6.0, -6.0)))
-    found = offsets_from_order(points, rings, PERIOD_S)
+    found = offsets_from_order(RawCloud(points, rings=rings), PERIOD_S)
     np.testing.assert_allclose(found, (times - times.min()) * PERIOD_S / np.ptp(times), atol=2 * PERIOD_S / COLUMNS)
 
 
 def test_places_without_a_return_have_no_time():
     points, _, rings = sweep(0.0)
     points[::5], points[1::5] = 0.0, np.nan
-    found = offsets_from_order(points, rings, PERIOD_S)
+    found = offsets_from_order(RawCloud(points, rings=rings), PERIOD_S)
     assert np.isnan(found[::5]).all()
     assert np.isnan(found[1::5]).all()
     assert np.isfinite(found[2::5]).all()
@@ -158,10 +159,10 @@ def test_formats_with_rings_alone(formats, tmp_path, suffix, order):
 
 def test_ranges_that_contradict_one_another_are_not_taken_for_compensation():
     # As where little but other cars moves: as many ranges speak for it as against it.
-    measured = [sweep_order(points, rings) for points, _, rings in (sweep(number * PERIOD_S) for number in range(30))]
+    measured = [sweep_order(RawCloud(points)) for points, _, _ in (sweep(number * PERIOD_S) for number in range(30))]
     compensated = [
-        sweep_order(points, rings)
-        for points, _, rings in (sweep(n * PERIOD_S, compensated=True, speed=10.0, turn_rate=0.0) for n in range(4))
+        sweep_order(RawCloud(points))
+        for points, _, _ in (sweep(n * PERIOD_S, compensated=True, speed=10.0, turn_rate=0.0) for n in range(4))
     ]
     pairs = [*pairwise(measured)]
     assert are_as_measured(pairs) is True

@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarslam.datasets.folders.point_table import (
-    find_colour_fields,
-    find_intensity_field,
-    read_colours,
-    read_intensities,
-)
+from lidarslam.datasets.folders.point_table import raw_cloud, read_colours, read_intensities
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.driver_messages import decode_custom_message
@@ -31,29 +26,30 @@ def table(columns: dict[str, np.ndarray]) -> np.ndarray:
 @pytest.mark.parametrize(
     ("names", "field"),
     [
-        (["x", "y", "z", "intensity"], "intensity"),
         (["reflectivity", "Intensity"], "Intensity"),
-        (["x", "scalar_Intensity"], "scalar_Intensity"),
+        (["scalar_Intensity"], "scalar_Intensity"),
         (["reflectivity", "signal"], "reflectivity"),
-        (["x", "time", "ring"], None),
+        (["time", "ring"], None),
     ],
 )
 def test_the_field_of_intensity(names, field):
-    assert find_intensity_field(names) == field
+    read = read_intensities(table({name: np.full(4, place, "f4") for place, name in enumerate(names)}))
+    assert (read is None) if field is None else read[0] == names.index(field)
 
 
 @pytest.mark.parametrize(
-    ("names", "fields"),
+    ("names", "colour"),
     [
-        (["red", "green", "blue", "alpha"], ("red", "green", "blue")),
-        (["R", "G", "B"], ("R", "G", "B")),
-        (["rgb", "rgba"], ("rgb",)),
-        (["red", "green"], ()),
-        (["rgba", "intensity"], ("rgba",)),
+        (["red", "green", "blue", "alpha"], [0, 1, 2]),
+        (["R", "G", "B"], [0, 1, 2]),
+        (["rgba", "rgb"], [0, 0, 1]),
+        (["red", "green"], None),
+        (["rgba", "intensity"], [0, 0, 0]),
     ],
 )
-def test_the_fields_of_colour(names, fields):
-    assert find_colour_fields(names) == fields
+def test_the_fields_of_colour(names, colour):
+    read = read_colours(table({name: np.full(4, place, "u4") for place, name in enumerate(names)}))
+    assert (read is None) if colour is None else read[0].tolist() == colour
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2", "u4", "i4", "f4", "f8"])
@@ -62,7 +58,7 @@ def test_intensities_keep_their_scale(kind, highest):
     if highest > np.iinfo("u1").max and kind == "u1":
         pytest.skip("holds no such number")
     recorded = (np.array([0.0, 0.25, 0.5, 1.0]) * highest).astype(kind)
-    read = read_intensities(table({"intensity": recorded}), ["intensity"])
+    read = read_intensities(table({"intensity": recorded}))
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read, recorded.astype(np.float32))
 
@@ -84,12 +80,11 @@ COLOURS = {
 
 @pytest.mark.parametrize("columns", COLOURS.values(), ids=list(COLOURS))
 def test_colours_of_every_type(columns):
-    np.testing.assert_array_equal(read_colours(table(columns), list(columns)), RGB)
+    np.testing.assert_array_equal(read_colours(table(columns)), RGB)
 
 
 def test_a_packed_colour_of_another_size_is_none():
-    assert read_colours(table({"rgb": PACKED.astype(np.uint64)}), ["rgb"]) is None
-    assert read_colours(table({"rgb": PACKED}), []) is None
+    assert read_colours(table({"rgb": PACKED.astype(np.uint64)})) is None
 
 
 @pytest.mark.parametrize("columns", COLOURS.values(), ids=list(COLOURS))
@@ -161,6 +156,5 @@ def test_ply_of_cloud_compare(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     header += "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty float scalar_Intensity\n"
     (tmp_path / "a.ply").write_text(header + "end_header\n1 2 3 10 20 30 0.5\n")
-    read = read_ply(tmp_path / "a.ply")
-    assert read_intensities(read, read.dtype.names).tolist() == [0.5]
-    assert read_colours(read, read.dtype.names).tolist() == [[10, 20, 30]]
+    cloud = raw_cloud(read_ply(tmp_path / "a.ply"))
+    assert (cloud.intensities.tolist(), cloud.colours.tolist()) == ([0.5], [[10, 20, 30]])

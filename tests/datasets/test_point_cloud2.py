@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.ros.driver_messages import decode_custom_message
 from lidarslam.datasets.ros.point_cloud2 import decode_point_cloud2
 

@@ -8,14 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarslam.core.scan import Scan
+from lidarslam.datasets.folders.point_table import TIME_FIELDS, RawCloud, raw_cloud
 from lidarslam.datasets.times.point_time import (
-    TIME_FIELD_NAMES,
     UNITS_PER_SECOND,
     LearnedTime,
     PointTimeModel,
-    TimedCloud,
-    find_ring_field,
-    find_time_field,
     infer_point_time,
     learn_point_time,
     value_spread,
@@ -29,6 +26,10 @@ SWEEP_NS = np.round(SWEEP * 1e9).astype(np.int64)
 
 def inferred(*args, **kwargs):
     return infer_point_time(*args, **kwargs).model
+
+
+def timed_cloud(field, values):
+    return RawCloud(np.ones((len(values), 3)), field, values)
 
 
 def exact_offsets(values, unit, stamp):
@@ -147,7 +148,7 @@ def test_a_scale_in_doubt_is_not_corrected(scale):
     ],
 )
 def test_what_is_no_time_is_said(values, said):
-    clouds = [TimedCloud("stamps", values, STAMP + 0.1 * number) for number in range(5)]
+    clouds = [(timed_cloud("stamps", values), STAMP + 0.1 * number) for number in range(5)]
     learned = learn_point_time(clouds)
     assert learned.model is None
     assert learned.warning.startswith("The time field 'stamps'")
@@ -155,7 +156,7 @@ def test_what_is_no_time_is_said(values, said):
 
 
 def test_a_first_cloud_without_times_is_no_fault_of_the_recording():
-    clouds = [TimedCloud("t", values, STAMP) for values in (np.zeros(1001), SWEEP)]
+    clouds = [(timed_cloud("t", values), STAMP) for values in (np.zeros(1001), SWEEP)]
     assert learn_point_time(clouds) == LearnedTime(PointTimeModel("t", "s", "relative"))
 
 
@@ -220,22 +221,18 @@ def test_another_clock_starts_at_the_earliest_point():
     assert offsets[0] == pytest.approx(0.1, abs=3e-7)
 
 
-@pytest.mark.parametrize("name", TIME_FIELD_NAMES)
-def test_time_fields_are_found(name):
-    assert find_time_field(["x", "y", "z", "intensity", name]) == name
-    assert find_time_field(["x", "y", "z", name.upper()]) == name.upper()
+@pytest.mark.parametrize("names", [*([name] for name in TIME_FIELDS), ["T"], ["t", "timestamp"], ["t", "range"]])
+def test_time_fields_are_found(names):
+    table = np.zeros(3, [(name, "f4") for name in ("x", "y", "z", *reversed(names))])
+    assert raw_cloud(table).time_field == names[0]
+    assert raw_cloud(table, "z").time_field == "z"
 
 
-def test_time_field_of_several_and_of_none():
-    assert find_time_field(["x", "timestamp", "t"]) == "t"
-    assert find_time_field(["x", "y", "z", "range"]) is None
-    assert find_time_field(["x", "t", "laser_time"], wanted="laser_time") == "laser_time"
-
-
-@pytest.mark.parametrize("name", ["ring", "channel", "line", "laser_id"])
+@pytest.mark.parametrize("name", ["ring", "channel", "line", "laser_id", "range"])
 def test_ring_fields_are_found(name):
-    assert find_ring_field(["x", "y", "z", name]) == name
-    assert find_ring_field(["x", "y", "z"]) is None
+    cloud = raw_cloud(np.zeros(3, [(name, "f4") for name in ("x", "y", "z", name)]))
+    assert (cloud.rings is None) == (name == "range")
+    assert cloud.time_field is None
 
 
 def test_a_few_strays_do_not_count() -> None:

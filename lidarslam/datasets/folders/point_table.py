@@ -1,19 +1,87 @@
-"""Fields of points in a structured array."""
+"""The points of a scan as stored: the fields of a structured array by their meaning."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
 
 # In the order of preference; compared without regard to case. CloudCompare writes scalar_Intensity.
-_INTENSITY = (
+TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "stamps", "offset_time", "time_offset", "time_stamp")
+_RINGS = ("ring", "channel", "line", "laser_id", "laser", "ring_id", "beam_id", "beam")
+_INTENSITIES = (
     "intensity", "intensities", "scalar_intensity", "reflectivity", "reflectance", "remission", "remissions", "i",
 )  # fmt: skip
 _COLOUR_CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))
 # One number with the bytes 0xAARRGGBB, often kept as a float32 with the same bits.
 _PACKED_COLOURS = ("rgb", "rgba")
+
+
+@dataclass(frozen=True)
+class PointField:
+    """One field of the points as stored, such as `intensity`, `float32`."""
+
+    name: str
+    type_name: str
+
+
+@dataclass(frozen=True, eq=False)
+class RawCloud:
+    """The points of one scan, invalid ones included, in the order in which they are stored."""
+
+    points: FloatArray  # (N, 3) float64, metres, in the LiDAR frame
+    time_field: str | None = None  # name of the field the times come from; None without per-point time
+    times: NDArray[np.generic] | None = None  # (N,) as stored
+    rings: NDArray[np.generic] | None = None  # (N,) as stored, the number of each point's laser
+    fields: tuple[PointField, ...] = ()  # all that are stored
+    intensities: NDArray[np.float32] | None = None  # (N,) on the scale of the recording
+    colours: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue
+
+    @property
+    def returns(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the points that are returns of the laser; drivers leave any time in the others."""
+        return np.asarray(np.isfinite(self.points).all(axis=1) & self.points.any(axis=1))
+
+    def scan(self, stamp: float, offsets: FloatArray | None) -> Scan:
+        """The valid points, with the seconds (N,) from the stamp at which they were measured."""
+        return Scan.from_raw(self.points, stamp, offsets, self.rings, self.intensities, self.colours)
+
+
+def raw_cloud(
+    table: NDArray[np.void], time_field: str | None = None, fields: tuple[PointField, ...] | None = None
+) -> RawCloud:
+    """The points of a table (...), copied out of it.
+
+    Args:
+        table: of any byte order.
+        time_field: field with the per-point time; None: found by its name.
+        fields: all that are stored; None: those of the table.
+    """
+    names = scalar_fields(table)
+    time_field, ring_field = find_time_field(names, time_field), _first(names, _RINGS)
+    try:
+        points = coordinates(table)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    return RawCloud(
+        points,
+        time_field,
+        None if time_field is None else _column(table[time_field]),
+        None if ring_field is None else _column(table[ring_field]),
+        fields_of(table) if fields is None else fields,
+        read_intensities(table),
+        read_colours(table),
+    )
+
+
+def fields_of(table: NDArray[np.void]) -> tuple[PointField, ...]:
+    """The names and types of a table's fields."""
+    types = ((name, table.dtype[name].base.newbyteorder("=")) for name in table.dtype.names or ())
+    return tuple(PointField(name, str(kind)) for name, kind in types)
 
 
 def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:
@@ -22,12 +90,22 @@ def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:
     return tuple(name for name in plain if table.dtype[name].kind in "fiu")
 
 
-def coordinates(table: NDArray[np.void]) -> FloatArray:
-    """The fields x, y and z of a table (...) as (N, 3) float64.
+def find_time_field(names: Sequence[str], wanted: str | None = None) -> str | None:
+    """The field with the per-point time: the wanted one, which has to be there, else the first of `TIME_FIELDS`."""
+    if wanted is None:
+        return _first(names, TIME_FIELDS)
+    if wanted not in names:
+        raise InputError(f"the points have no time field {wanted!r}; their fields are: {', '.join(names)}")
+    return wanted
 
-    Raises:
-        ValueError: a field is missing or is no number.
-    """
+
+def _first(names: Sequence[str], wanted: Sequence[str]) -> str | None:
+    present = {name.lower(): name for name in reversed(names)}
+    return next((present[name] for name in wanted if name in present), None)
+
+
+def coordinates(table: NDArray[np.void]) -> FloatArray:
+    """The fields x, y and z of a table (...) as (N, 3) float64; ValueError where one is missing or no number."""
     names = scalar_fields(table)
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"expected the point fields x, y and z, each one number, got {', '.join(names)}")
@@ -38,41 +116,32 @@ def coordinates(table: NDArray[np.void]) -> FloatArray:
     return points.reshape(-1, 3)
 
 
-def find_intensity_field(names: Sequence[str]) -> str | None:
-    """The field with the intensity; None without any."""
-    present = {name.lower(): name for name in reversed(names)}
-    return next((present[name] for name in _INTENSITY if name in present), None)
+def _column(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """A flat copy in the machine's own byte order."""
+    return values.astype(values.dtype.newbyteorder("=")).reshape(-1)
 
 
-def find_colour_fields(names: Sequence[str]) -> tuple[str, ...]:
-    """The fields with the colour: three channels, or one that packs them; empty without any."""
-    present = {name.lower(): name for name in reversed(names)}
-    for channels in _COLOUR_CHANNELS:
-        if set(channels) <= set(present):
-            return tuple(present[name] for name in channels)
-    return tuple(present[name] for name in _PACKED_COLOURS if name in present)[:1]
-
-
-def read_intensities(table: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float32] | None:
-    """The intensities (N,) of records with these readable fields, on the scale they are recorded in."""
-    field = find_intensity_field(names)
+def read_intensities(table: NDArray[np.void]) -> NDArray[np.float32] | None:
+    """The intensities (N,) of a table, on the scale they are recorded in; None without any."""
+    field = _first(scalar_fields(table), _INTENSITIES)
     if field is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):  # damaged bytes may be any number
         return table[field].reshape(-1).astype(np.float32)
 
 
-def read_colours(table: NDArray[np.void], names: Sequence[str]) -> NDArray[np.uint8] | None:
-    """The colours (N, 3) of records with these readable fields; None without any, or of an unknown type."""
-    fields = find_colour_fields(names)
-    if len(fields) == 1:
-        return _unpacked(table[fields[0]].reshape(-1))
-    columns = [_as_bytes(table[field].reshape(-1)) for field in fields]
-    return np.column_stack(columns) if columns else None
+def read_colours(table: NDArray[np.void]) -> NDArray[np.uint8] | None:
+    """The colours (N, 3) of a table: of three channels, or of one that packs them; None without any."""
+    present = {name.lower(): name for name in reversed(scalar_fields(table))}
+    for channels in _COLOUR_CHANNELS:
+        if set(channels) <= set(present):
+            return np.column_stack([_as_bytes(table[present[name]].reshape(-1)) for name in channels])
+    packed = next((present[name] for name in _PACKED_COLOURS if name in present), None)
+    return None if packed is None else _unpacked(table[packed].reshape(-1))
 
 
 def _unpacked(values: NDArray[np.generic]) -> NDArray[np.uint8] | None:
-    if values.dtype.kind not in "fiu" or values.dtype.itemsize != 4:
+    if values.dtype.itemsize != 4:
         return None
     bits = values.astype(values.dtype.newbyteorder("=")).view(np.uint32)
     return np.column_stack([(bits >> shift).astype(np.uint8) for shift in (16, 8, 0)])

@@ -53,9 +53,6 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
     """The scan files of a folder with numbers for names, such as 000004.bin, in their order, and the numbers.
 
     The number is the scan's row in the stamp and pose files, since recordings may have gaps.
-
-    Raises:
-        InputError: there are none, a name is not a number, or a number occurs twice.
     """
     files = sorted(
         (f for f in folder.glob(f"*{suffix}") if not f.name.startswith(".")), key=lambda f: natural_key(f.stem)
@@ -76,11 +73,7 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a scan file.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """The content of a scan file."""
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
@@ -93,11 +86,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_bin(path: Path, columns: int = len(KITTI_FIELDS)) -> NDArray[np.float32]:
-    """The (N, columns) little-endian float32 numbers of a `.bin` scan; an empty file is a scan of no points.
-
-    Raises:
-        InputError: the file cannot be read or its size is no whole number of points.
-    """
+    """The (N, columns) little-endian float32 numbers of a `.bin` scan; an empty file is a scan of no points."""
     data = read_bytes(path)
     if len(data) % (4 * columns):
         raise InputError(
@@ -132,11 +121,7 @@ def _require_points(body: bytes, rows: int) -> None:
 
 
 def table_reader(files: Sequence[Path]) -> TableReader:
-    """The reader for scan files, all with one suffix.
-
-    Raises:
-        InputError: the number of values per point of a `.bin` file is ambiguous.
-    """
+    """The reader for scan files, all with one suffix."""
     suffix = files[0].suffix.lower()
     if suffix == ".bin":
         fields = _BIN_FIELDS[_bin_columns(files)]
@@ -172,9 +157,6 @@ def read_npy(path: Path) -> NDArray[np.void]:
     """The points (N,) of a .npy file: a structured array with fields, or (N, >=3) numbers that begin with x, y, z.
 
     Four columns are x, y, z and intensity. Organised arrays are flattened.
-
-    Raises:
-        InputError: the file is damaged or holds another array.
     """
     data = read_bytes(path)
     try:
@@ -203,11 +185,7 @@ def _as_table(numbers: NDArray[np.generic], names: tuple[str, ...]) -> NDArray[n
 
 
 def read_ply(path: Path) -> NDArray[np.void]:
-    """The vertices (N,) of a PLY file, ascii or binary; other elements, such as faces, are left out.
-
-    Raises:
-        InputError: the file cannot be read, is no PLY file, or is damaged.
-    """
+    """The vertices (N,) of a PLY file, ascii or binary; other elements, such as faces, are left out."""
     data = read_bytes(path)
     try:
         lines, length = _split_header(data, "end_header")
@@ -283,11 +261,7 @@ class _Header:
 
 
 def read_pcd(path: Path) -> NDArray[np.void]:
-    """The points (N,) of a PCD file, ascii, binary or binary_compressed; organised clouds are flattened.
-
-    Raises:
-        InputError: the file cannot be read, is no PCD file, or is damaged.
-    """
+    """The points (N,) of a PCD file, ascii, binary or binary_compressed; organised clouds are flattened."""
     data = read_bytes(path)
     try:
         header = _pcd_header(data)

@@ -1,46 +1,32 @@
 """A folder of scan files: .bin, .pcd, .ply or .npy, one sweep each; their stamps, and the files next to them."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
+from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import NO_POINT_TIME, Faults
-from lidarslam.datasets.folders.point_table import coordinates, read_colours, read_intensities, scalar_fields
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import RawCloud, raw_cloud
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key, table_reader
 from lidarslam.datasets.imu_samples import IMU_FILE, find_imu_file, read_imu_csv
-from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import FileRecording, find_truth_file
-from lidarslam.datasets.times.azimuth import (
-    PointTiming,
-    Sweep,
-    pair_starts,
-    point_timing,
-)
-from lidarslam.datasets.times.point_time import (
-    CLOCK_LIMIT_S,
-    LearnedTime,
-    PointTimeModel,
-    TimedCloud,
-    find_ring_field,
-    find_time_field,
-    is_return,
-    learn_point_time,
-)
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S
 from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate, stamps_from_names
 
 _STAMP_FILES = ("timestamps.txt", "times.txt")
+# Pairs of consecutive scans that are compared at their seams, spread over the recording.
+_PAIRS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +43,7 @@ class FolderLayout:
 
 
 def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
-    """The layout by names and the stamp file; no scan is opened.
-
-    Raises:
-        InputError: there is no scan, or the stamp file does not match the scans.
-    """
+    """The layout by names and the stamp file; no scan is opened."""
     files, notes, warnings = _find_scans(folder)
     places = (folder, folder.resolve().parent)
     stamp_file = next((place / name for place in places for name in _STAMP_FILES if (place / name).is_file()), None)
@@ -143,17 +125,13 @@ def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a folder of scans.
-
-    Raises:
-        InputError: it holds no scans, or its stamp file does not match them.
-    """
+    """Open a folder of scans."""
     if not source.is_dir():
         raise InputError(f"{source}: expected a folder of scans, got a file; give the folder it lies in")
     return ScanFolderRecording(source, config)
 
 
-class ScanFolderRecording(FileRecording):
+class ScanFolderRecording(CloudRecording, FileRecording):
     """The scans of one folder."""
 
     reader = "scan-folder"
@@ -163,6 +141,8 @@ class ScanFolderRecording(FileRecording):
         self._layout = find_layout(folder, config.rate_hz)
         super().__init__(folder, config, self._layout.files)
         self.stamps = self._layout.stamps
+        self._has_stamps = self._layout.from_clock
+        self._truth_path, self._layout_notes = self._layout.truth, self._layout.notes
         self._read_table = table_reader(self._layout.files)
 
     @cached_property
@@ -170,86 +150,60 @@ class ScanFolderRecording(FileRecording):
         """The table imu.csv in the folder or the one above."""
         return None if self._layout.imu is None else read_imu_csv(self._layout.imu)
 
-    @property
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """An assumed rate, the repairs of the stamps, and faults of the points' times."""
-        assumed = assumed_rate("The scans have no stamps", self._config) if self._rate_is_assumed else None
-        assumed_warnings = () if assumed is None else (assumed,)
-        return (*self._layout.warnings, *assumed_warnings, *self._point_time.warnings)
+        """The repairs of the stamps, an assumed rate, and faults of the points' times."""
+        assumed = (assumed_rate("The scans have no stamps", self._config),) if self._rate_is_assumed else ()
+        return (*self._layout.warnings, *assumed, *self._timing.warnings)
 
-    def _table(self, index: int) -> tuple[NDArray[np.void], FloatArray]:
-        path = self._files[index]
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        return (*self._layout_notes, *self._timing.notes)
+
+    def _decode(self, item: int) -> RawCloud:
+        path = self._files[item]
         table = self._read_table(path)
         try:
-            return table, coordinates(table)
-        except ValueError as error:
+            return raw_cloud(table, self._config.time_field)
+        except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
-    def _read(self, index: int, faults: Faults) -> Scan:
-        table, points = self._table(index)
-        stamp, offsets = self._stamp_and_offsets(index, table, points)
-        names = scalar_fields(table)
-        rings = _rings(table)
-        if offsets is None:
-            offsets = self._point_time.azimuth.offsets(Sweep(points, rings))
-        scan = Scan.from_raw(points, stamp, offsets, rings, read_intensities(table, names), read_colours(table, names))
-        if self._point_time.model is not None and scan.time_offsets is None and len(scan):
-            faults.note(NO_POINT_TIME, str(self._files[index]))
-        return scan
+    def _stamp(self, item: int) -> float:
+        return float(self.stamps[item])
 
-    def _stamp_and_offsets(
-        self, index: int, table: NDArray[np.void], points: FloatArray
-    ) -> tuple[float, FloatArray | None]:
-        stamp, model = float(self.stamps[index]), self._learned.model
-        if model is None or not len(table) or model.field not in scalar_fields(table):
-            return stamp, None
-        values = table[model.field]
-        if model.reference == "absolute" and not self._layout.from_clock:
-            # The points' clock is better than an assumed rate: the sweep's first point gives the stamp.
-            seconds = values[is_return(points)].astype(np.float64) / model.units_per_second
-            seconds = seconds[np.isfinite(seconds)]
-            if not len(seconds):
-                return stamp, None
-            stamp = float(seconds[np.abs(seconds - np.median(seconds)) <= CLOCK_LIMIT_S].min())
-        return stamp, model.offsets(values, stamp)
+    def _sound_items(self) -> Iterable[int]:
+        return range(len(self))
 
-    @cached_property
-    def _learned(self) -> LearnedTime:
-        """Inferred once, so that all scans are read in the same way."""
-        config = self._config
-        if config.time_reference == "none":
-            return LearnedTime()
-        rate = scan_rate(self.stamps) if self._layout.from_clock else None
-        period_s = None if rate is None else 1.0 / rate
-        return learn_point_time(self._timed_clouds(), config.time_unit, config.time_reference, period_s)
+    def _runs(self) -> Iterable[Iterable[int]]:
+        starts = sorted({int(index) for index in np.linspace(0, max(0, len(self) - 2), _PAIRS)})
+        return (range(first, min(first + 2, len(self))) for first in starts)
 
     @property
-    def _rate_is_assumed(self) -> bool:
-        model = self._learned.model
-        return not (self._layout.from_clock or (model is not None and model.reference == "absolute"))
+    def _period_s(self) -> float | None:
+        rate = scan_rate(self.stamps)
+        return None if rate is None else 1.0 / rate
 
     @cached_property
-    def _point_time(self) -> PointTiming:
-        rate = scan_rate(self.stamps)
-        runs = (self._sweeps(index) for index in pair_starts(len(self)))
-        return point_timing(self._learned, runs, None if rate is None else 1.0 / rate, self._config.time_reference)
+    def _rate_is_assumed(self) -> bool:
+        model = self._learned.model
+        return not (self._has_stamps or (model is not None and model.reference == "absolute"))
 
-    def _sweeps(self, first: int) -> Iterator[Sweep]:
-        """Two consecutive scans, as far as they can be read."""
-        for index in (first, first + 1):
-            with suppress(InputError):  # counted when it is its turn
-                table, points = self._table(index)
-                yield Sweep(points, _rings(table))
+    def _read(self, item: int, faults: Faults) -> Scan:
+        cloud, stamp = self._decode(item), self._stamp(item)
+        if not self._has_stamps:
+            stamp = self._first_point(cloud, stamp)
+        return self._timing.scan(cloud, stamp, faults, str(self._files[item]))
 
-    def _timed_clouds(self) -> Iterator[TimedCloud]:
-        for index, stamp in enumerate(self.stamps):
-            try:
-                table, points = self._table(index)
-            except InputError:
-                continue  # counted when it is its turn
-            field = find_time_field(scalar_fields(table), self._config.time_field)
-            values = None if field is None else table[field][is_return(points)]
-            yield TimedCloud(field, values, float(stamp) if self._layout.from_clock else None)
+    def _first_point(self, cloud: RawCloud, stamp: float) -> float:
+        """The earliest reading of the points' clock, which is better than the stamp by an assumed rate."""
+        model = self._learned.model
+        if model is None or model.reference != "absolute" or cloud.times is None or cloud.time_field != model.field:
+            return stamp
+        seconds = cloud.times[cloud.returns].astype(np.float64) / model.units_per_second
+        seconds = seconds[np.isfinite(seconds)]
+        if not len(seconds):
+            return stamp
+        return float(seconds[np.abs(seconds - np.median(seconds)) <= CLOCK_LIMIT_S].min())
 
     def _last_stamp(self, first: Scan) -> float:
         """By its points' clock, which may be better than the rate."""
@@ -257,22 +211,3 @@ class ScanFolderRecording(FileRecording):
             return self._read(len(self) - 1, Faults()).stamp
         except InputError:
             return super()._last_stamp(first)
-
-    def _truth_path(self) -> Path | None:
-        return self._layout.truth
-
-    def _point_time_model(self) -> PointTimeModel | None:
-        return self._point_time.model
-
-    def _fields(self, item: int) -> tuple[PointField, ...]:
-        table, _ = self._table(item)
-        return tuple(PointField(name, str(table.dtype[name].base)) for name in table.dtype.names or ())
-
-    def _notes(self) -> Iterator[str]:
-        return iter((*self._layout.notes, *self._point_time.notes))
-
-
-def _rings(table: NDArray[np.void]) -> NDArray[np.generic] | None:
-    """The numbers (N,) of the points' lasers, as stored."""
-    field = find_ring_field(scalar_fields(table))
-    return None if field is None else table[field]

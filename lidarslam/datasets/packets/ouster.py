@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.packets.packet_recording import PacketRecording, require
-from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.packets.packet_recording import PacketRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # A sensor's metadata is some tens of kilobytes of JSON with the beams' angles.
@@ -50,11 +48,8 @@ def _is_metadata(path: Path) -> bool:
 class OusterRecording(PacketRecording):
     """The sweeps of one sensor, stamped at their first column by the sensor's clock, in the sensor's frame."""
 
+    library = "ouster.sdk", "packets of an Ouster"
     point_time = PointTimeModel("timestamp", "ns", "relative")
-
-    def __init__(self, source: Path, config: ReaderConfig) -> None:
-        require("ouster.sdk", "packets of an Ouster")
-        super().__init__(source, config)
 
     @cached_property
     def sensor(self) -> Any:
@@ -74,11 +69,11 @@ class OusterRecording(PacketRecording):
         points = self._directions(np.where(valid, ranges, 0))
         stamps_ns = frame.timestamp.astype(np.int64)
         first_ns = int(stamps_ns[valid].min()) if valid.any() else 0
-        offsets = self._offsets(np.broadcast_to((stamps_ns - first_ns) / 1e9, ranges.shape))
+        offsets = np.broadcast_to((stamps_ns - first_ns) / 1e9, ranges.shape).T
         rings = np.broadcast_to(np.arange(len(ranges))[:, np.newaxis], ranges.shape)
         # Columns one after the other, in the order of firing.
         intensity = next((frame.field(name).T for name in _INTENSITIES if frame.has_field(name)), None)
-        times = None if offsets is None else offsets.T
+        times = offsets if self._has_times else None
         return Scan.from_raw(points.transpose(1, 0, 2), first_ns / 1e9, times, rings.T, intensity)
 
     def _fields(self, item: Any) -> tuple[PointField, ...]:
@@ -86,7 +81,7 @@ class OusterRecording(PacketRecording):
 
     def _packets_of_imu(self) -> Iterator[Any]:
         """The library's ImuPackets."""
-        return iter(())
+        raise NotImplementedError
 
     @cached_property
     def imu(self) -> ImuSamples | None:
@@ -97,21 +92,13 @@ class OusterRecording(PacketRecording):
         stamps = np.concatenate([packet.timestamp() for packet in packets]).astype(np.int64) / 1e9
         accelerations = np.concatenate([packet.accel() for packet in packets]).astype(np.float64)
         rates = np.concatenate([packet.gyro() for packet in packets]).astype(np.float64)
-        return usable_samples(stamps, rates, accelerations, self._T_sensor_imu)
-
-    @property
-    def _T_sensor_imu(self) -> FloatArray:
         T_sensor_imu = np.array(self.sensor.imu_to_sensor_transform, dtype=np.float64)
         T_sensor_imu[:3, 3] /= 1000.0  # the metadata is in millimetres
-        return T_sensor_imu
+        return usable_samples(stamps, rates, accelerations, T_sensor_imu)
 
 
 def read_sensor(text: str) -> Any:
-    """The library's SensorInfo of a metadata text.
-
-    Raises:
-        InputError: it is none.
-    """
+    """The library's SensorInfo of a metadata text."""
     from ouster.sdk.core import SensorInfo
 
     try:
@@ -177,7 +164,7 @@ class OusterFile(OusterRecording):
         """See `OusterRecording`."""
         return self._frame_sets.sensor_info[0]
 
-    @property
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
         """That sensors are left out."""
         count = len(self._frame_sets.sensor_info)
@@ -186,7 +173,7 @@ class OusterFile(OusterRecording):
     @cached_property
     def _extent(self) -> tuple[int, float]:
         count = len(self._frame_sets.single(0))
-        last = next(self._scans(range(count - 1, count), Faults()), None) if count else None
+        last = next(self._scans(range(max(0, count - 1), count), Faults()), None)
         return count, 0.0 if last is None else last.stamp
 
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002

@@ -7,8 +7,8 @@ from importlib import import_module
 from pathlib import Path
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.stored_recording import StoredRecording, scan_indices, truth_beside
 from lidarslam.datasets.times.point_time import PointTimeModel
@@ -22,11 +22,7 @@ _INSTALL = {
 
 
 def require(library: str, purpose: str) -> None:
-    """Check that a library is installed; the message names the purpose.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """Check that a library is installed; the message names the purpose."""
     try:
         import_module(library)
     except ModuleNotFoundError as error:
@@ -39,7 +35,15 @@ class PacketRecording(StoredRecording):
 
     reader = "packets"
     imu_name = "the sensor's own"
+    library: tuple[str, str]  # that decodes the packets, and whose packets
     point_time: PointTimeModel
+
+    def __init__(self, source: Path, config: ReaderConfig) -> None:
+        require(*self.library)
+        super().__init__(source, config)
+        self._truth_path = truth_beside(source, self.name)
+        self._has_times = config.time_reference != "none"
+        self._point_time = self.point_time if self._has_times else None
 
     def __len__(self) -> int:
         return self._extent[0]
@@ -53,16 +57,10 @@ class PacketRecording(StoredRecording):
     @cached_property
     def _extent(self) -> tuple[int, float]:
         """Number of sweeps, and the stamp of the last one."""
-        raise NotImplementedError
+        count, last = 0, 0.0
+        for scan in self.scans(faults=Faults()):
+            count, last = count + 1, scan.stamp
+        return count, last
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
         return self._extent[1]
-
-    def _truth_path(self) -> Path | None:
-        return truth_beside(self._source, self.name)
-
-    def _point_time_model(self) -> PointTimeModel | None:
-        return None if self._config.time_reference == "none" else self.point_time
-
-    def _offsets(self, offsets: FloatArray) -> FloatArray | None:
-        return None if self._config.time_reference == "none" else offsets

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
@@ -13,17 +12,17 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import coordinates
+from lidarslam.datasets.folders.point_table import PointField, fields_of, raw_cloud
 from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
-from lidarslam.datasets.packets.packet_recording import PacketRecording, require
-from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.packets.packet_recording import PacketRecording
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # Beyond the range of any model; the library's own limit is less than that of some.
 _FARTHEST_M = 1000.0
 _PACKETS_LOOKED_AT = 2000
-# First bytes and lengths of other makers' packets.
-_HESAI, _ROBOSENSE = b"\xee\xff", (b"\x55\xaa", b"\xa5\xff")
+# First bytes of other makers' packets.
+_OTHER_MAKERS = {"Hesai": (b"\xee\xff",), "RoboSense": (b"\x55\xaa", b"\xa5\xff")}
 
 _StampedCloud = tuple[float, NDArray[np.void]]
 
@@ -31,33 +30,18 @@ _StampedCloud = tuple[float, NDArray[np.void]]
 class VelodyneCapture(PacketRecording):
     """The sweeps of a .pcap file, stamped by the host at their first packet."""
 
+    library = "velodyne_decoder", "packets of a Velodyne"
     point_time = PointTimeModel("time", "s", "relative")
-
-    def __init__(self, source: Path, config: ReaderConfig) -> None:
-        require("velodyne_decoder", "packets of a Velodyne")
-        super().__init__(source, config)
-
-    @cached_property
-    def _extent(self) -> tuple[int, float]:
-        count, last = 0, 0.0
-        for stamp, _ in self._clouds():
-            count, last = count + 1, stamp
-        return count, last
 
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[_StampedCloud]:  # noqa: ARG002
         return islice(self._clouds(), wanted.start, wanted.stop, wanted.step)
 
     def _read(self, item: _StampedCloud, faults: Faults) -> Scan:  # noqa: ARG002
-        stamp, cloud = item
-        offsets = self._offsets(cloud["time"].astype(np.float64))
-        return Scan.from_raw(coordinates(cloud), stamp, offsets, cloud["ring"], cloud["intensity"])
+        stamp, table = item
+        return raw_cloud(table).scan(stamp, table["time"].astype(np.float64) if self._has_times else None)
 
     def _clouds(self) -> Iterator[_StampedCloud]:
-        """Stamp and points of each sweep.
-
-        Raises:
-            InputError: the file is damaged, of another format, or holds no packets of a Velodyne.
-        """
+        """Stamp and points of each sweep."""
         import velodyne_decoder
 
         config = velodyne_decoder.Config(max_range=_FARTHEST_M, timestamp_first_packet=True)
@@ -83,9 +67,6 @@ def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> _StampedCloud:
 
     Args:
         packets: stamps in seconds, and data of 1206 bytes each.
-
-    Raises:
-        InputError: the library cannot decode them.
     """
     import velodyne_decoder
 
@@ -96,11 +77,6 @@ def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> _StampedCloud:
     except RuntimeError as error:
         raise InputError(f"packets of a Velodyne cannot be decoded ({error})") from error
     return stamp.host, cloud
-
-
-def fields_of(cloud: NDArray[np.void]) -> tuple[PointField, ...]:
-    """The fields of decoded points."""
-    return tuple(PointField(name, str(cloud.dtype[name])) for name in cloud.dtype.names or ())
 
 
 def _reason(path: Path, error: Exception) -> str:
@@ -119,15 +95,12 @@ def _other_sensor(path: Path) -> str:
     with suppress(Exception):  # damaged; the packets found so far are judged
         for _, payload in islice(velodyne_decoder.util.iter_pcap(path), _PACKETS_LOOKED_AT):
             payloads.append(bytes(payload)) if isinstance(payload, bytes) else None
-    maker = None
-    if any(payload.startswith(_HESAI) for payload in payloads):
-        maker = "Hesai"
-    elif any(payload.startswith(_ROBOSENSE) for payload in payloads):
-        maker = "RoboSense"
-    if maker is not None:
-        return (
-            f"holds packets of a {maker}, which are not decoded; play it through the sensor's driver, and record a bag"
-        )
+    for maker, begins in _OTHER_MAKERS.items():
+        if any(payload.startswith(begins) for payload in payloads):
+            return (
+                f"holds packets of a {maker}, which are not decoded; play it through the sensor's driver, and record a"
+                " bag"
+            )
     return (
         "holds no packets of a Velodyne; for an Ouster, put the sensor's metadata beside it as"
         f" {path.with_suffix('.json').name}; else play it through the sensor's driver, and record a bag"
@@ -135,12 +108,7 @@ def _other_sensor(path: Path) -> str:
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a capture of a Velodyne's or an Ouster's packets.
-
-    Raises:
-        ConfigError: the library that decodes them is not installed.
-        InputError: the source is no file, or of another sensor.
-    """
+    """Open a capture of a Velodyne's or an Ouster's packets."""
     if not source.is_file():
         raise InputError(f"{source}: expected a file of packets, got a folder")
     if source.suffix.lower() == ".osf" or find_metadata(source) is not None:

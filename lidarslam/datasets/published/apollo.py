@@ -1,6 +1,5 @@
 """Apollo-SouthBay: `pcds/*.pcd` and `poses/gt_poses.txt`, a line of index, stamp, position and quaternion per scan."""
 
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,61 +12,43 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
 from lidarslam.datasets.published.stamped_files import poses_wxyz
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import choose_sequence
+from lidarslam.datasets.stored_recording import find_sequence
 from lidarslam.datasets.times.stamps import increasing_rows
 
 _COLUMNS = 9
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a folder with pcds and poses, or `config.sequence` of one above several such.
-
-    Raises:
-        InputError: no such sequence, or its poses do not match its scans.
-    """
-    return ApolloRecording(_find_sequence(source, config.sequence), config)
-
-
-def is_sequence(folder: Path) -> bool:
-    """Whether a folder has Apollo's layout."""
-    return (folder / "pcds").is_dir() and (folder / "poses" / "gt_poses.txt").is_file()
-
-
-def _find_sequence(source: Path, wanted: str | None) -> Path:
-    if is_sequence(source):
-        if wanted not in (None, source.resolve().name):
-            raise InputError(f"{source}: is one sequence, not {wanted}; leave --sequence out or give the folder above")
-        return source
-    names = sorted(folder.name for folder in source.iterdir() if is_sequence(folder)) if source.is_dir() else []
-    if not names:
-        raise InputError(f"{source}: expected pcds and poses/gt_poses.txt in it, or in folders in it; found neither")
-    return source / choose_sequence(source, names, wanted)
+    """Open a folder with pcds and poses, or `config.sequence` of one above several such."""
+    return ApolloRecording(find_sequence(source, source, "poses/gt_poses.txt", config.sequence), config)
 
 
 class ApolloRecording(ScanFolderRecording):
     """One sequence; its scans are read as those of any folder."""
 
     reader = "apollo"
+    _truth_path: Path
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         super().__init__(folder / "pcds", config)
         self._sequence = folder
+        self._truth_path = folder / "poses" / "gt_poses.txt"
         self._rows = self._read_poses()
         self.stamps = self._rows[:, 1]
-        self._layout = replace(self._layout, stamps=self.stamps, from_clock=True, notes=())
+        self._has_stamps, self._layout_notes = True, ()
         if not increasing_rows(self.stamps).all():
-            raise InputError(f"{self._truth_path()}: expected stamps that increase from line to line; mend it")
+            raise InputError(f"{self._truth_path}: expected stamps that increase from line to line; mend it")
 
     def _read_poses(self) -> FloatArray:
         """The rows (N, 9) of the scans; by the index where the scans are named so, else in their order."""
-        rows = parse_numbers(self._truth_path(), _COLUMNS)
+        rows = parse_numbers(self._truth_path, _COLUMNS)
         numbers = [int(path.stem) if path.stem.isdecimal() else -1 for path in self._files]
         by_index = {int(row[0]): row for row in rows}
         if all(number in by_index for number in numbers):
             return np.array([by_index[number] for number in numbers])
         if len(rows) != len(self._files):
             raise InputError(
-                f"{self._truth_path()}: expected a line for each of the {len(self._files)} scans, by its index or in"
+                f"{self._truth_path}: expected a line for each of the {len(self._files)} scans, by its index or in"
                 f" their order, got {len(rows)} lines; download it again"
             )
         return rows
@@ -80,12 +61,6 @@ class ApolloRecording(ScanFolderRecording):
     @cached_property
     def ground_truth(self) -> Trajectory:
         """T_world_lidar at every scan; the poses are taken for those of the scans' frame."""
-        try:
-            # The scalar is the last of the file's four numbers.
-            poses = poses_wxyz(self._rows[:, 2:5], np.roll(self._rows[:, 5:9], 1, axis=1))
-        except ValueError as error:
-            raise InputError(f"{self._truth_path()}: {error}; download it again") from error
-        return Trajectory(self.stamps, poses)
-
-    def _truth_path(self) -> Path:
-        return self._sequence / "poses" / "gt_poses.txt"
+        # The scalar is the last of the file's four numbers.
+        quaternions = np.roll(self._rows[:, 5:9], 1, axis=1)
+        return Trajectory(self.stamps, poses_wxyz(self._truth_path, self._rows[:, 2:5], quaternions))

@@ -4,7 +4,6 @@ Points are published in the vehicle's frame at the rear axle, compensated to the
 frame of the upper LiDAR, from where rings and elevations are those of a sensor.
 """
 
-from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.published.stamped_files import poses_wxyz
-from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.folders.point_table import PointField
+from lidarslam.datasets.published.stamped_files import first_file, increasing, poses_wxyz
 from lidarslam.datasets.stored_recording import FileRecording
-from lidarslam.datasets.times.stamps import increasing_rows
 
 _NANOSECOND = 1e-9
 _POINT = ("x", "y", "z", "intensity", "laser_number")
@@ -33,6 +31,7 @@ class Argoverse2Recording(FileRecording):
     """One log: the folder with sensors/lidar."""
 
     reader = "argoverse-2"
+    _notes = ("The scans are motion compensated by the publishers; their per-point times are not needed.",)
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         files = sorted((folder / "sensors" / "lidar").glob("*.feather"), key=lambda path: path.stem.zfill(20))
@@ -42,6 +41,7 @@ class Argoverse2Recording(FileRecording):
             raise InputError(f"{wrong}: expected a name that is the sweep's stamp in nanoseconds; move it away")
         super().__init__(folder, config, files)
         self.stamps = np.array([int(path.stem) for path in files]) * _NANOSECOND
+        self._truth_path = first_file("city_SE3_egovehicle.feather", folder)
 
     @property
     def name(self) -> str:
@@ -64,15 +64,14 @@ class Argoverse2Recording(FileRecording):
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """T_world_lidar at the vehicle's poses, more than there are sweeps."""
-        path = self._truth_path()
+        path = self._truth_path
         if path is None:
             return None
         table = _read_columns(path, ("timestamp_ns", *_POSITION, *_QUATERNION))
         stamps, T_world_ego = table["timestamp_ns"].astype(np.float64) * _NANOSECOND, _poses(path, table)
-        T_world_lidar = T_world_ego if self._T_ego_lidar is None else T_world_ego @ self._T_ego_lidar
         order = np.argsort(stamps, kind="stable")
-        kept = order[increasing_rows(stamps[order])]
-        return Trajectory(stamps[kept], T_world_lidar[kept])
+        T_world_lidar = T_world_ego if self._T_ego_lidar is None else T_world_ego @ self._T_ego_lidar
+        return increasing(stamps[order], T_world_lidar[order])
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         table = _read_columns(self._files[index], _POINT)
@@ -84,18 +83,11 @@ class Argoverse2Recording(FileRecording):
         stamp = float(self.stamps[index])
         return Scan.from_raw(points, stamp, rings=table["laser_number"], intensities=table["intensity"])
 
-    def _truth_path(self) -> Path | None:
-        path = self._source / "city_SE3_egovehicle.feather"
-        return path if path.is_file() else None
-
     def _fields(self, index: int) -> tuple[PointField, ...]:
         table = _read_columns(self._files[index], _POINT)
         return tuple(PointField(name, str(values.dtype)) for name, values in table.items())
 
-    def _notes(self) -> Iterator[str]:
-        yield "The scans are motion compensated by the publishers; their per-point times are not needed."
-
-    @property
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
         """A missing calibration."""
         if self._T_ego_lidar is not None:
@@ -123,10 +115,5 @@ def _read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]
 
 
 def _poses(path: Path, table: dict[str, NDArray[Any]]) -> FloatArray:
-    try:
-        positions, quaternions = (
-            np.column_stack([table[name] for name in names]) for names in (_POSITION, _QUATERNION)
-        )
-        return poses_wxyz(positions, quaternions)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; download it again") from error
+    positions, quaternions = (np.column_stack([table[name] for name in names]) for names in (_POSITION, _QUATERNION))
+    return poses_wxyz(path, positions, quaternions)

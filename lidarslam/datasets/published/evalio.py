@@ -19,8 +19,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.published.catalogue import CATALOGUE
-from lidarslam.datasets.recording import ImuSummary, PointField, Recording
+from lidarslam.datasets.recording import ImuSummary, Recording
 from lidarslam.datasets.stored_recording import StoredRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows
@@ -105,11 +106,7 @@ def absent(source: Path) -> str | None:
 
 
 def require_known(source: Path) -> None:
-    """Check that evalio has the sequence.
-
-    Raises:
-        InputError: evalio is not installed, or has no such sequence.
-    """
+    """Check that evalio has the sequence."""
     known = sequences()
     if not known:
         raise InputError(f"{source}: {MISSING_EXTRA}")
@@ -128,11 +125,7 @@ def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a sequence in the folder DATASET/SEQUENCE that evalio downloads it to.
-
-    Raises:
-        InputError: evalio is not installed, does not know the sequence, or a file of it is missing.
-    """
+    """Open a sequence in the folder DATASET/SEQUENCE that evalio downloads it to."""
     require_known(source)
     from evalio import datasets
 
@@ -145,10 +138,18 @@ class EvalioRecording(StoredRecording):
     """One sequence."""
 
     reader = "evalio"
+    _point_time = PointTimeModel("t", "ns", "relative")
 
     def __init__(self, folder: Path, config: ReaderConfig, sequence: Any) -> None:
         super().__init__(folder, config)
         self._sequence = sequence  # evalio.datasets.Dataset
+        if folder.parent.name in _POSITIONS_ALONE:
+            self.warnings = ("The truth has positions alone; errors of rotation against it say nothing.",)
+        lidar = sequence.lidar_params()
+        self._notes = (
+            f"{sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep.",
+            f"The duration is that of the scans at {lidar.rate:g} Hz, the sensor's rate.",
+        )
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:
@@ -163,11 +164,7 @@ class EvalioRecording(StoredRecording):
             raise InputError(f"{self._source}: evalio cannot read {what} ({reason}); download it again") from error
 
     def require_files(self) -> None:
-        """Check that every file is there.
-
-        Raises:
-            InputError: one is missing.
-        """
+        """Check that every file is there."""
         with self._reading("its list of files"):
             missing = [file for file in self._sequence.files() if not (self._source / file).exists()]
         if missing:
@@ -232,13 +229,6 @@ class EvalioRecording(StoredRecording):
                 number = sum(1 for _ in iterator.imu_iter())
         return ImuSummary(f"{parameters.brand} {parameters.model}", number, float(parameters.rate), True)
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Truth without orientations."""
-        if self._source.parent.name in _POSITIONS_ALONE:
-            return ("The truth has positions alone; errors of rotation against it say nothing.",)
-        return ()
-
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Scan]:
         given = 0
         try:
@@ -269,16 +259,9 @@ class EvalioRecording(StoredRecording):
     def _last_stamp(self, first: Scan) -> float:
         return float(first.stamp + (len(self) - 1) / self._sequence.lidar_params().rate)
 
+    @cached_property
     def _truth_path(self) -> Path | None:
         return None if self.ground_truth is None else self._source
-
-    def _point_time_model(self) -> PointTimeModel | None:
-        return PointTimeModel("t", "ns", "relative")
-
-    def _notes(self) -> Iterator[str]:
-        lidar = self._sequence.lidar_params()
-        yield f"{self._sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep."
-        yield f"The duration is that of the scans at {lidar.rate:g} Hz, the sensor's rate."
 
 
 def _scan(measurement: Any) -> Scan:

@@ -18,11 +18,7 @@ _SWEEP_TOLERANCE = 0.25
 
 
 def read_calibration(path: Path) -> dict[str, FloatArray]:
-    """The arrays of a calibration file by name; lines without numbers, such as the date, are left out.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """The arrays of a calibration file by name; lines without numbers, such as the date, are left out."""
     arrays = {}
     for line in bounded_lines(path):
         name, _, values = line.partition(":")
@@ -49,11 +45,7 @@ def _rigid(path: Path, R: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def read_tr(path: Path) -> FloatArray:
-    """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr` or `Tr_velo_to_cam`.
-
-    Raises:
-        InputError: the file cannot be read or has no such line.
-    """
+    """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr` or `Tr_velo_to_cam`."""
     arrays = read_calibration(path)
     name = "Tr_velo_to_cam" if "Tr" not in arrays and "Tr_velo_to_cam" in arrays else "Tr"
     rows = _entry(path, arrays, name, 12).reshape(3, 4)
@@ -61,11 +53,7 @@ def read_tr(path: Path) -> FloatArray:
 
 
 def read_raw_calibration(path: Path) -> FloatArray:
-    """The transform (4, 4) of a raw calibration file: T_B_A of calib_A_to_B.txt, T_rect_cam of calib_cam_to_cam.txt.
-
-    Raises:
-        InputError: the file cannot be read or lacks a line.
-    """
+    """The transform (4, 4) of a raw calibration file: T_B_A of calib_A_to_B.txt, T_rect_cam of calib_cam_to_cam.txt."""
     arrays = read_calibration(path)
     if path.name == "calib_cam_to_cam.txt":
         return _rigid(path, _entry(path, arrays, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
@@ -91,9 +79,6 @@ def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], config: ReaderCon
         folder: where the three files are, if they are.
         numbers: (N,) the scans' numbers, which are the rows of the files; a missing scan has a blank row.
         config: its rate makes the stamps when timestamps.txt is missing or useless.
-
-    Raises:
-        InputError: a file is damaged.
     """
     try:
         found = _rows(folder / "timestamps.txt", numbers)

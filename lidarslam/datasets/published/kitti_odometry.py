@@ -20,55 +20,45 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.published.kitti_files import read_tr
+from lidarslam.datasets.published.stamped_files import first_file
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, choose_sequence
+from lidarslam.datasets.stored_recording import FileRecording, find_sequence
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a sequence of the benchmark: its root, with `config.sequence`, or one `sequences/NN` folder.
-
-    Raises:
-        InputError: no such sequence, no scan, or a damaged stamp or calibration file.
-    """
-    return KittiOdometryRecording(_find_sequence(source, config.sequence), config)
-
-
-def _find_sequence(source: Path, wanted: str | None) -> Path:
-    if (source / "velodyne").is_dir():
-        name = source.resolve().name
-        if wanted is not None and wanted.zfill(2) != name.zfill(2):
-            raise InputError(f"{source}: is the sequence {name}, not {wanted}; leave --sequence out or give the root")
-        return source
-    names = sorted(path.parent.name for path in (source / "sequences").glob("*/velodyne") if path.is_dir())
-    if not names:
-        raise InputError(f"{source}: expected sequences/NN/velodyne or velodyne below it, found neither")
-    return source / "sequences" / choose_sequence(source, names, wanted)
+    """Open a sequence of the benchmark: its root, with `config.sequence`, or one `sequences/NN` folder."""
+    return KittiOdometryRecording(find_sequence(source, source / "sequences", "velodyne", config.sequence), config)
 
 
 class KittiOdometryRecording(FileRecording):
     """One sequence."""
 
     reader = "kitti-odometry"
+    _notes = ("The scans are motion compensated by the publishers; they have no per-point time and need none.",)
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(folder / "velodyne")
         super().__init__(folder, config, files)
         self._times = self._read_times()
+        self._rate_is_assumed = not len(self._times)
         last = int(self._numbers[-1])
-        self._lines = 0 if self._times is None else len(self._times)  # of times.txt
-        if self._times is not None and last >= self._lines < 2:
+        if (folder / "times.txt").is_file() and last >= len(self._times) < 2:
             raise InputError(
                 f"{folder / 'times.txt'}: expected {last + 1} stamps, one for every scan up to {files[-1].name}, got"
-                f" {self._lines}; complete it, or remove it to use the rate"
+                f" {len(self._times)}; complete it, or remove it to use the rate"
             )
         self.stamps = self._stamps_of(self._numbers)
+        whole = folder.resolve()
+        self._pose_file = first_file(f"{whole.name}.txt", whole.parent.parent / "poses") or first_file(
+            "poses.txt", whole
+        )
+        self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
 
-    def _read_times(self) -> FloatArray | None:
+    def _read_times(self) -> FloatArray:
+        """The stamps (N,) of times.txt; none without it."""
         path = self._source / "times.txt"
-        if not path.is_file():
-            return None
-        times = read_stamps(path)
+        times = read_stamps(path) if path.is_file() else np.empty(0)
         increasing = increasing_rows(times)
         if not increasing.all():
             raise InputError(
@@ -79,11 +69,12 @@ class KittiOdometryRecording(FileRecording):
 
     def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
         """The stamps (N,) of scans by their numbers; those beyond the last line continue at the median rate."""
-        if self._times is None:
+        if self._rate_is_assumed:
             return numbers / self._config.rate_hz
-        beyond = np.maximum(numbers - (self._lines - 1), 0)
+        last_line = len(self._times) - 1
+        beyond = np.maximum(numbers - last_line, 0)
         period_s = float(np.median(np.diff(self._times))) if beyond.any() else 0.0
-        return np.asarray(self._times[np.minimum(numbers, self._lines - 1)] + period_s * beyond, dtype=np.float64)
+        return np.asarray(self._times[np.minimum(numbers, last_line)] + period_s * beyond, dtype=np.float64)
 
     @property
     def name(self) -> str:
@@ -99,57 +90,41 @@ class KittiOdometryRecording(FileRecording):
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """T_world_lidar of every pose with a stamp, also where the scan is absent."""
-        path, T_cam_lidar = self._pose_file, self.T_cam_lidar
-        if path is None or T_cam_lidar is None:
+        T_cam_lidar = self.T_cam_lidar
+        if self._pose_file is None or T_cam_lidar is None:
             return None
-        T_cam0_cam = read_kitti_poses(path)
-        if self._times is not None:
-            T_cam0_cam = T_cam0_cam[: max(self._lines, int(self._numbers[-1]) + 1)]
+        T_cam0_cam = read_kitti_poses(self._pose_file)
+        if not self._rate_is_assumed:
+            T_cam0_cam = T_cam0_cam[: max(len(self._times), int(self._numbers[-1]) + 1)]
         # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
         T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
         return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
-
-    @property
-    def _pose_file(self) -> Path | None:
-        folder = self._source.resolve()
-        candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
-        return next((path for path in candidates if path.is_file()), None)
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         rows = read_bin(self._files[index])
         return Scan.from_raw(rows[:, :3], self.stamps[index], intensities=rows[:, 3])
 
-    def _truth_path(self) -> Path | None:
-        return self._pose_file if (self._source / "calib.txt").is_file() else None
-
-    @property
-    def _rate_is_assumed(self) -> bool:
-        return self._times is None
-
-    def _notes(self) -> Iterator[str]:
-        yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
-
-    @property
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
         """Missing and superfluous stamps, scans and poses."""
         return tuple(self._warnings())
 
     def _warnings(self) -> Iterator[str]:
-        last, poses = int(self._numbers[-1]), 0
-        if self._times is None:
+        last, lines, poses = int(self._numbers[-1]), len(self._times), 0
+        if self._rate_is_assumed:
             yield assumed_rate("There is no times.txt", self._config)
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
-        if self._pose_file is not None and self._truth_path() is None:
+        if self._pose_file is not None and self._truth_path is None:
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
         elif self._pose_file is not None:
             with suppress(InputError):  # damaged, an error of `ground_truth`
                 poses = len(read_kitti_poses(self._pose_file))
         up_to = f"for the scans up to number {last}"
-        if 0 < self._lines <= last:
-            yield f"times.txt has only {self._lines} lines {up_to}; the missing stamps continue at its rate."
+        if 0 < lines <= last:
+            yield f"times.txt has only {lines} lines {up_to}; the missing stamps continue at its rate."
         if 0 < poses <= last:
             yield f"{self._pose_file} has only {poses} poses {up_to}."
-        counts = ((self._lines, f"times.txt has {self._lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
+        counts = ((lines, f"times.txt has {lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
         if more := [said for number, said in counts if number > last + 1]:
             yield f"{' and '.join(more)} {up_to}; those beyond are not used."

@@ -2,7 +2,6 @@
 
 The scans are as measured, not motion compensated. The calibration files are in the date's folder above the drive."""
 
-from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -21,11 +20,11 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.kitti_files import read_raw_calibration, read_sweep_timing
+from lidarslam.datasets.published.stamped_files import increasing
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
-from lidarslam.datasets.times.point_time import PointTimeModel
-from lidarslam.datasets.times.stamps import increasing_rows, read_stamps
+from lidarslam.datasets.times.stamps import read_stamps
 
 _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
@@ -36,32 +35,14 @@ _ACCELERATIONS, _ANGULAR_VELOCITIES = slice(11, 14), slice(17, 20)
 
 
 class OxtsPoses(NamedTuple):
-    """The unit's poses."""
+    """The poses of the GPS/IMU unit."""
 
-    numbers: NDArray[np.intp]  # (N,) the row of the stamp file each pose belongs to
+    stamps: FloatArray  # (N,) seconds on the clock of the scans, NaN where there is none
     T_enu_imu: FloatArray  # (N, 4, 4) in an east-north-up frame; imu is x forward, y left, z up
     accuracy_m: FloatArray  # (N,) standard deviation of the position as the unit itself states it
     angular_velocities: FloatArray  # (N, 3) rad/s
     accelerations: FloatArray  # (N, 3) specific force, m/s^2
     geodetic: FloatArray  # (N, 3) latitude and longitude in degrees, altitude in metres
-
-
-def read_oxts(folder: Path) -> OxtsPoses:
-    """Read `oxts/data` of a drive.
-
-    Raises:
-        InputError: there is no file, or one does not hold 30 numbers that begin with a latitude.
-    """
-    files, numbers = numbered_scans(folder, ".txt")
-    tables = [parse_numbers(path, _COLUMNS) for path in files]
-    for path, table in zip(files, tables, strict=True):
-        if len(table) != 1 or not np.isfinite(table[0, :6]).all() or not abs(table[0, 0]) < _POLE_DEG:
-            expected = f"one line of {_COLUMNS} numbers that begins with a latitude"
-            raise InputError(f"{path}: expected {expected}, got {len(table)} lines; copy the file again")
-    rows = np.concatenate(tables)
-    accuracy_m = rows[:, _POSITION_ACCURACY_COLUMN]
-    velocities, accelerations = rows[:, _ANGULAR_VELOCITIES], rows[:, _ACCELERATIONS]
-    return OxtsPoses(numbers, oxts_poses(rows), accuracy_m, velocities, accelerations, rows[:, :3])
 
 
 def oxts_poses(rows: FloatArray) -> FloatArray:
@@ -80,11 +61,7 @@ def oxts_poses(rows: FloatArray) -> FloatArray:
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a `..._sync` drive folder.
-
-    Raises:
-        InputError: the folder is no such drive, or a stamp file is damaged.
-    """
+    """Open a `..._sync` drive folder."""
     data = source / "velodyne_points" / "data"
     if not data.is_dir():
         raise InputError(f"{source}: expected a drive folder with velodyne_points/data in it, found none")
@@ -107,6 +84,11 @@ class KittiRawRecording(FileRecording):
         super().__init__(drive, config, files)
         self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config)
         self.stamps = self._timing.stamps
+        self._rate_is_assumed = not self._timing.from_clock
+        self._point_time = None if config.time_reference == "none" else AZIMUTH_TIME
+        first, last = self._numbers[0], self._numbers[-1]
+        gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
+        self.warnings = (*self._timing.notes, *gaps)
 
     @cached_property
     def T_cam_lidar(self) -> FloatArray | None:
@@ -119,92 +101,85 @@ class KittiRawRecording(FileRecording):
         return read_raw_calibration(path) if path.is_file() else None
 
     @cached_property
-    def _oxts(self) -> OxtsPoses | None:
+    def oxts(self) -> OxtsPoses | None:
+        """The poses of `oxts/data`; None without the unit."""
         folder = self._source / "oxts" / "data"
-        return read_oxts(folder) if folder.is_dir() else None
-
-    @cached_property
-    def ground_truth(self) -> Trajectory | None:
-        """T_world_lidar of the GPS/IMU unit; the world is the LiDAR's frame at the first of these poses."""
-        oxts, T_lidar_imu = self._oxts, self._calibration("calib_imu_to_velo.txt")
-        if oxts is None or T_lidar_imu is None:
+        if not folder.is_dir():
             return None
-        T_enu_lidar = oxts.T_enu_imu @ inverse(T_lidar_imu)
-        stamps = self._oxts_stamps(oxts)
-        kept = increasing_rows(stamps)
-        if not kept.any():
-            return None
-        return Trajectory(stamps[kept], inverse(T_enu_lidar[kept][0]) @ T_enu_lidar[kept])
+        files, numbers = numbered_scans(folder, ".txt")
+        tables = [parse_numbers(path, _COLUMNS) for path in files]
+        for path, table in zip(files, tables, strict=True):
+            if len(table) != 1 or not np.isfinite(table[0, :6]).all() or not abs(table[0, 0]) < _POLE_DEG:
+                expected = f"one line of {_COLUMNS} numbers that begins with a latitude"
+                raise InputError(f"{path}: expected {expected}, got {len(table)} lines; copy the file again")
+        rows = np.concatenate(tables)
+        return OxtsPoses(
+            self._oxts_stamps(numbers),
+            oxts_poses(rows),
+            rows[:, _POSITION_ACCURACY_COLUMN],
+            rows[:, _ANGULAR_VELOCITIES],
+            rows[:, _ACCELERATIONS],
+            rows[:, :3],
+        )
 
-    @cached_property
-    def imu(self) -> ImuSamples | None:
-        """Angular velocities and accelerations of the GPS/IMU unit, one for each camera image."""
-        oxts = self._oxts
-        if oxts is None:
-            return None
-        T_lidar_imu = self._calibration("calib_imu_to_velo.txt")
-        return usable_samples(self._oxts_stamps(oxts), oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
-
-    @property
-    def oxts(self) -> tuple[OxtsPoses, FloatArray] | None:
-        """The GPS/IMU unit's rows and their stamps (N,), NaN where there is none; None without the unit."""
-        return None if self._oxts is None else (self._oxts, self._oxts_stamps(self._oxts))
-
-    def _oxts_stamps(self, oxts: OxtsPoses) -> FloatArray:
-        """Stamps (N,) of the unit's poses on the clock of the scans, NaN where there is none.
+    def _oxts_stamps(self, numbers: NDArray[np.intp]) -> FloatArray:
+        """Stamps (N,) of the unit's poses, by their numbers, on the clock of the scans, NaN where there is none.
 
         A row lies 11 to 23 ms after its scan's stamp, with jitter. Measured on the drives 0005 and 0009 against LiDAR
         odometry: with rows at the scans' stamps, the forward motion deviates by 25 and 54 mm and the yaw by 0.049 and
         0.010 degrees (standard deviations); with the rows' own stamps, by 15 and 12 mm, 0.018 and 0.008 degrees.
         """
         if not self._timing.from_clock:
-            return oxts.numbers / self._config.rate_hz
+            return numbers / self._config.rate_hz
         path = self._source / "oxts" / "timestamps.txt"
         if path.is_file():
-            rows, table = oxts.numbers, read_stamps(path)
+            rows, table = numbers, read_stamps(path)
         else:  # the stamps of the scans with the rows' numbers are used instead
-            rows = np.searchsorted(self._numbers, oxts.numbers)
-            rows = np.where(np.append(self._numbers, -1)[rows] == oxts.numbers, rows, len(self))
+            rows = np.searchsorted(self._numbers, numbers)
+            rows = np.where(np.append(self._numbers, -1)[rows] == numbers, rows, len(self))
             table = self.stamps
         return np.append(table, np.nan)[np.minimum(rows, len(table))]
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of the GPS/IMU unit; the world is the LiDAR's frame at the first of these poses."""
+        oxts, T_lidar_imu = self.oxts, self._calibration("calib_imu_to_velo.txt")
+        if oxts is None or T_lidar_imu is None:
+            return None
+        truth = increasing(oxts.stamps, oxts.T_enu_imu @ inverse(T_lidar_imu))
+        return None if truth is None else truth.transformed(inverse(truth.T_world_lidar[0]))
+
+    @cached_property
+    def _truth_path(self) -> Path | None:
+        return None if self.ground_truth is None else self._source / "oxts"
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """Angular velocities and accelerations of the GPS/IMU unit, one for each camera image."""
+        oxts, T_lidar_imu = self.oxts, self._calibration("calib_imu_to_velo.txt")
+        if oxts is None:
+            return None
+        return usable_samples(oxts.stamps, oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         rows = read_bin(self._files[index])
         points = rows[:, :3]
         offsets = None
-        if self._config.time_reference != "none":
+        if self._point_time is not None:
             before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
             offsets = offsets_from_azimuth(points, float(before_s), float(after_s))
         return Scan.from_raw(points, self.stamps[index], offsets, intensities=rows[:, 3])
 
-    def _truth_path(self) -> Path | None:
-        return None if self.ground_truth is None else self._source / "oxts"
-
-    def _point_time_model(self) -> PointTimeModel | None:
-        return None if self._config.time_reference == "none" else AZIMUTH_TIME
-
-    @property
-    def _rate_is_assumed(self) -> bool:
-        return not self._timing.from_clock
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Stamps that were interpolated, and missing scans."""
-        first, last = self._numbers[0], self._numbers[-1]
-        gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
-        return (*self._timing.notes, *gaps)
-
-    def _notes(self) -> Iterator[str]:
-        if self._oxts is None:
-            yield "There is no oxts folder, so there is no ground truth."
-            return
-        truth = self.ground_truth
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        oxts, truth = self.oxts, self.ground_truth
+        if oxts is None:
+            return ("There is no oxts folder, so there is no ground truth.",)
         if truth is None:
-            yield (
-                "There is no calib_imu_to_velo.txt above the drive, so its oxts poses cannot be used as ground truth."
+            return (
+                "There is no calib_imu_to_velo.txt above the drive, so its oxts poses cannot be used as ground truth.",
             )
-            return
-        if len(truth) < len(self._oxts.numbers):
-            yield f"{len(self._oxts.numbers) - len(truth)} oxts rows without a stamp that increases were left out."
-        median_m = float(np.median(self._oxts.accuracy_m))
-        yield f"The ground truth is GPS/IMU; it states its own position accuracy as {median_m:.2f} m (median)."
+        median_m, left_out = float(np.median(oxts.accuracy_m)), len(oxts.stamps) - len(truth)
+        accuracy = f"The ground truth is GPS/IMU; it states its own position accuracy as {median_m:.2f} m (median)."
+        gaps = (f"{left_out} oxts rows without a stamp that increases were left out.",) if left_out else ()
+        return *gaps, accuracy

@@ -5,7 +5,6 @@ frame here is that of the HDL-32E's centre with the axes of the body turned by 1
 z up. The world of the ground truth is turned likewise.
 """
 
-from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -21,11 +20,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bytes
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.stamped_files import increasing, read_table, stamped_scans
-from lidarslam.datasets.recording import PointField
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.published.stamped_files import StampedRecording, first_file, increasing, read_table
 
-SCANS = "velodyne_sync"
 _POINT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
 _STEP_M, _ORIGIN_M = 0.005, -100.0
 # Places of the sensors in the frame of the body, from the data set's paper; the IMU has the body's axes.
@@ -36,24 +32,26 @@ _T_LIDAR_IMU = inverse(_T_BODY_LIDAR) @ make_transform(np.eye(3), _IMU_IN_BODY)
 _US = 1e-6
 
 
-class NcltRecording(FileRecording):
+class NcltRecording(StampedRecording):
     """One session: the folder, such as 2012-01-08, with velodyne_sync in it."""
 
     reader = "nclt"
+    scan_folder = "velodyne_sync"
     imu_name = "ms25.csv"
+    _stored = tuple((name, str(_POINT[name])) for name in _POINT.names or ())
+    _notes = ("Points have no times in this layout. The body's axes are turned so that z points up.",)
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
-        files, stamps = stamped_scans(folder / SCANS)
-        super().__init__(folder, config, files)
-        self.stamps = stamps
+        super().__init__(folder, config)
+        above = folder.resolve().parent
+        self._truth_path = first_file(f"groundtruth_{self.name}.csv", folder, above, above / "ground_truth")
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """T_world_lidar; the world is the truth's with its z axis turned up."""
-        path = self._truth_path()
-        if path is None:
+        if self._truth_path is None:
             return None
-        rows = read_table(path, 7)
+        rows = read_table(self._truth_path, 7)
         R_world_body = Rotation.from_euler("ZYX", rows[:, [6, 5, 4]]).as_matrix()
         T_down_body = make_transform(R_world_body, rows[:, 1:4])
         return increasing(_US * rows[:, 0], _UPRIGHT @ T_down_body @ _T_BODY_LIDAR)
@@ -76,18 +74,6 @@ class NcltRecording(FileRecording):
         in_body = _STEP_M * np.column_stack([records[axis] for axis in "xyz"]).astype(np.float64) + _ORIGIN_M
         points: FloatArray = transform_points(inverse(_T_BODY_LIDAR), in_body)
         return Scan.from_raw(points, self.stamps[index], None, records["laser"], records["intensity"])
-
-    def _truth_path(self) -> Path | None:
-        name = f"groundtruth_{self.name}.csv"
-        above = self._source.resolve().parent
-        places = (self._source, above, above / "ground_truth")
-        return next((place / name for place in places if (place / name).is_file()), None)
-
-    def _fields(self, index: int) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(name, str(_POINT[name])) for name in _POINT.names or ())
-
-    def _notes(self) -> Iterator[str]:
-        yield "Points have no times in this layout. The body's axes are turned so that z points up."
 
 
 open_recording = NcltRecording

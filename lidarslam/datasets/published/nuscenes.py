@@ -6,8 +6,9 @@ sensor's: x to the right, y forward, z up."""
 import mmap
 import re
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -22,10 +23,9 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bin
-from lidarslam.datasets.published.stamped_files import poses_wxyz
-from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.published.stamped_files import increasing, poses_wxyz
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import FileRecording, choose_sequence
-from lidarslam.datasets.times.stamps import increasing_rows
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 _LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
@@ -34,7 +34,6 @@ _TAIL = 100  # bytes
 _LONGEST_RECORD = 1 << 13  # bytes; those of the data set have some hundred
 
 T = TypeVar("T")
-_FIELDS = ("x", "y", "z", "intensity", "ring")
 
 
 class _Scene(TypedDict):
@@ -65,57 +64,67 @@ _SCENES, _SAMPLES, _POSES = (TypeAdapter(list[_Scene]), TypeAdapter(list[_Sample
 _SWEEP, _POSE = TypeAdapter(_Sweep), TypeAdapter(_Pose)
 
 
-class Sweeps(NamedTuple):
-    """The sweeps of a scene in the order of time, samples (key frames) among them."""
+class NuScenesRecording(FileRecording):
+    """One scene, given by its name and token: its sweeps in the order of time, samples (key frames) among them."""
 
-    files: list[str]  # N paths below the root
-    stamps: FloatArray  # (N,) seconds
-    T_world_lidar: FloatArray  # (N, 4, 4)
+    reader = "nuscenes"
+    _stored = tuple((name, "float32") for name in ("x", "y", "z", "intensity", "ring"))
 
-
-def scenes(version: Path) -> dict[str, str]:
-    """The tokens of the scenes of a version by their names.
-
-    Raises:
-        InputError: the table is missing or damaged.
-    """
-    return {record["name"]: record["token"] for record in _table(version / "scene.json", _SCENES)}
-
-
-def read_sweeps(version: Path, scene: str) -> Sweeps:
-    """The sweeps of a scene, given by its token.
-
-    Raises:
-        InputError: a table is missing or damaged, or the scene has no sweep.
-    """
-    samples = {one["token"] for one in _table(version / "sample.json", _SAMPLES) if one["scene_token"] == scene}
-    data = _select(version / "sample_data.json", _LIDAR_FILE, lambda _: True, _SWEEP)
-    sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
-    if not sweeps:
-        raise InputError(f"{version / 'sample_data.json'}: has no sweep of LIDAR_TOP for the scene; download it again")
-    if outside := next((one["filename"] for one in sweeps if not stays_below(one["filename"])), None):
-        raise InputError(
-            f"{version / 'sample_data.json'}: names a sweep outside the data set, {outside}; download it again"
+    def __init__(self, root: Path, config: ReaderConfig, scene: str, version: Path, token: str) -> None:
+        tables = version / "sample_data.json"
+        samples = {one["token"] for one in _table(version / "sample.json", _SAMPLES) if one["scene_token"] == token}
+        data = _select(tables, _LIDAR_FILE, lambda _: True, _SWEEP)
+        sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
+        if not sweeps:
+            raise InputError(f"{tables}: has no sweep of LIDAR_TOP for the scene; download it again")
+        if outside := next((one["filename"] for one in sweeps if not stays_below(one["filename"])), None):
+            raise InputError(f"{tables}: names a sweep outside the data set, {outside}; download it again")
+        super().__init__(root, config, [root / one["filename"] for one in sweeps])
+        self.stamps = np.array([one["timestamp"] for one in sweeps]) * _MICROSECOND
+        self._sweeps, self._version, self._scene = sweeps, version, scene
+        self._truth_path = version / "ego_pose.json"
+        self._notes = (
+            f"{scene} of {version.name}, samples and sweeps of LIDAR_TOP.",
+            "The scans are motion compensated by the publishers; they have no per-point time and need none.",
         )
-    wanted = {one["ego_pose_token"].encode() for one in sweeps}
-    ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, _POSE)
-    T_world_ego = _poses(version, list(ego_poses), [one["ego_pose_token"] for one in sweeps])
-    sensors = _table(version / "calibrated_sensor.json", _POSES)
-    T_ego_lidar = _poses(version, sensors, [one["calibrated_sensor_token"] for one in sweeps])
-    stamps = np.array([one["timestamp"] for one in sweeps]) * _MICROSECOND
-    return Sweeps([one["filename"] for one in sweeps], stamps, T_world_ego @ T_ego_lidar)
+
+    @property
+    def name(self) -> str:
+        """Such as nuscenes_scene-0061."""
+        return f"nuscenes_{self._scene}"
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at every sweep, by the ego poses and the calibration."""
+        wanted = {one["ego_pose_token"].encode() for one in self._sweeps}
+        ego_poses = _select(self._version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, _POSE)
+        T_world_ego = self._poses(list(ego_poses), [one["ego_pose_token"] for one in self._sweeps])
+        sensors = _table(self._version / "calibrated_sensor.json", _POSES)
+        T_ego_lidar = self._poses(sensors, [one["calibrated_sensor_token"] for one in self._sweeps])
+        return increasing(self.stamps, T_world_ego @ T_ego_lidar)
+
+    def _poses(self, records: list[_Pose], tokens: list[str]) -> FloatArray:
+        """Transforms (N, 4, 4) of N tokens."""
+        by_token = {one["token"]: one for one in records}
+        if missing := next((token for token in tokens if token not in by_token), None):
+            raise InputError(f"{self._version}: has no pose {missing!r}; download the tables again")
+        found = [by_token[token] for token in tokens]
+        return poses_wxyz(self._version, [one["translation"] for one in found], [one["rotation"] for one in found])
+
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
+        rows = read_bin(self._files[index], len(self._stored))
+        return Scan.from_raw(rows[:, :3], self.stamps[index], rings=rows[:, 4], intensities=rows[:, 3])
 
 
-def _poses(version: Path, records: list[_Pose], tokens: list[str]) -> FloatArray:
-    """Transforms (N, 4, 4) of N tokens."""
-    by_token = {one["token"]: one for one in records}
-    if missing := next((token for token in tokens if token not in by_token), None):
-        raise InputError(f"{version}: has no pose {missing!r}; download the tables again")
-    found = [by_token[token] for token in tokens]
-    try:
-        return poses_wxyz([one["translation"] for one in found], [one["rotation"] for one in found])
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{version}: a pose is damaged ({error}); download the tables again") from error
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open a scene of the root with `v1.0-*`, samples and sweeps; `config.sequence` is such as 61 for scene-0061."""
+    versions = sorted(path.parent for path in source.glob("v1.0-*/scene.json"))
+    if not versions:
+        raise InputError(f"{source}: expected v1.0-*/scene.json below it, found none; give the root of nuScenes")
+    tables = ((version, _table(version / "scene.json", _SCENES)) for version in versions)
+    found = {one["name"]: (version, one["token"]) for version, scenes in tables for one in scenes}
+    name = choose_sequence(source, sorted(found), config.sequence, "scene")
+    return NuScenesRecording(source, config, name, *found[name])
 
 
 def _table(path: Path, shape: TypeAdapter[list[T]]) -> list[T]:
@@ -142,54 +151,3 @@ def _select(
                     yield parse_json(text[start:end], shape)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
-
-
-def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a scene of the root with `v1.0-*`, samples and sweeps; `config.sequence` is its name, or 61 for scene-0061.
-
-    Raises:
-        InputError: no such scene, or a table is missing or damaged.
-    """
-    versions = sorted(path.parent for path in source.glob("v1.0-*/scene.json"))
-    if not versions:
-        raise InputError(f"{source}: expected v1.0-*/scene.json below it, found none; give the root of nuScenes")
-    found = {name: (version, token) for version in versions for name, token in scenes(version).items()}
-    name = choose_sequence(source, sorted(found), config.sequence, "scene")
-    return NuScenesRecording(source, config, name, *found[name])
-
-
-class NuScenesRecording(FileRecording):
-    """One scene."""
-
-    reader = "nuscenes"
-
-    def __init__(self, root: Path, config: ReaderConfig, scene: str, version: Path, token: str) -> None:
-        sweeps = read_sweeps(version, token)
-        super().__init__(root, config, [root / name for name in sweeps.files])
-        self._scene, self._version = scene, version
-        self.stamps, self._T_world_lidar = sweeps.stamps, sweeps.T_world_lidar
-
-    @property
-    def name(self) -> str:
-        """Such as nuscenes_scene-0061."""
-        return f"nuscenes_{self._scene}"
-
-    @property
-    def ground_truth(self) -> Trajectory:
-        """T_world_lidar at every sweep, by the ego poses and the calibration."""
-        kept = increasing_rows(self.stamps)
-        return Trajectory(self.stamps[kept], self._T_world_lidar[kept])
-
-    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index], len(_FIELDS))
-        return Scan.from_raw(rows[:, :3], self.stamps[index], rings=rows[:, 4], intensities=rows[:, 3])
-
-    def _truth_path(self) -> Path:
-        return self._version / "ego_pose.json"
-
-    def _fields(self, index: int) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(name, "float32") for name in _FIELDS)
-
-    def _notes(self) -> Iterator[str]:
-        yield f"{self._scene} of {self._version.name}, samples and sweeps of LIDAR_TOP."
-        yield "The scans are motion compensated by the publishers; they have no per-point time and need none."

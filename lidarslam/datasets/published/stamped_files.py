@@ -7,33 +7,38 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
 from lidarslam.core.trajectory import Trajectory, parse_numbers
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
 
 
-def stamped_scans(folder: Path) -> tuple[list[Path], FloatArray]:
-    """The .bin files of a folder by their stamps, and the stamps (N,) in seconds.
+class StampedRecording(FileRecording):
+    """A folder in which `scan_folder` holds .bin scans named by clock readings in micro- or nanoseconds."""
 
-    Raises:
-        InputError: there is none, or a name is no clock reading in micro- or nanoseconds.
-    """
-    files = np.array([path for path in folder.glob("*.bin") if not path.name.startswith(".")], dtype=object)
-    if not len(files):
-        raise InputError(f"{folder}: holds no .bin scan; give the folder of one sequence, above it")
-    stamps = stamps_from_names([path.stem for path in files])
-    if stamps is None or len(np.unique(stamps)) < len(stamps):
-        raise InputError(f"{folder}: expected scans named by their stamps, such as 1561000444390857630.bin")
-    order = np.argsort(stamps)
-    return list(files[order]), stamps[order]
+    scan_folder: str
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        scans = folder / self.scan_folder
+        files = np.array([path for path in scans.glob("*.bin") if not path.name.startswith(".")], dtype=object)
+        if not len(files):
+            raise InputError(f"{scans}: holds no .bin scan; give the folder of one sequence, above it")
+        stamps = stamps_from_names([path.stem for path in files])
+        if stamps is None or len(np.unique(stamps)) < len(stamps):
+            raise InputError(f"{scans}: expected scans named by their stamps, such as 1561000444390857630.bin")
+        order = np.argsort(stamps)
+        super().__init__(folder, config, list(files[order]))
+        self.stamps = stamps[order]
+
+
+def first_file(name: str, *folders: Path) -> Path | None:
+    """The file in the first folder that has one of this name."""
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def read_table(path: Path, columns: int) -> FloatArray:
-    """The rows (N, columns) of a table whose numbers are all finite; the first column is a stamp.
-
-    Raises:
-        InputError: the file cannot be read, or a row does not hold that many numbers.
-    """
+    """The rows (N, columns) of a table whose numbers are all finite; the first column is a stamp."""
     table = parse_numbers(path, columns)
     return np.asarray(table[np.isfinite(table).all(axis=1)])
 
@@ -44,13 +49,18 @@ def increasing(stamps: FloatArray, T_world_lidar: FloatArray) -> Trajectory | No
     return Trajectory(stamps[kept], T_world_lidar[kept]) if kept.any() else None
 
 
-def poses_wxyz(positions: ArrayLike, quaternions: ArrayLike) -> FloatArray:
-    """Transforms (..., 4, 4) of positions (..., 3) and quaternions (..., 4) with the scalar first.
+def poses_of_rows(numbers: FloatArray) -> FloatArray:
+    """Transforms (..., 4, 4) of the twelve numbers (..., 12) of their first three rows, as files round them."""
+    rows = numbers.reshape(*numbers.shape[:-1], 3, 4)
+    return orthonormalize(make_transform(rows[..., :3], rows[..., 3]))
 
-    Raises:
-        ValueError: a number is not finite, or a quaternion is zero.
-    """
-    t, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
-    if not (np.isfinite(t).all() and np.isfinite(q).all()):
-        raise ValueError("expected finite positions and quaternions")
-    return make_transform(Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix(), t)
+
+def poses_wxyz(path: Path, positions: ArrayLike, quaternions: ArrayLike) -> FloatArray:
+    """Transforms (..., 4, 4) of positions (..., 3) and quaternions (..., 4) of a file, with the scalar first."""
+    try:
+        t, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+        if not (np.isfinite(t).all() and np.isfinite(q).all()):
+            raise ValueError("expected finite positions and quaternions")
+        return make_transform(Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix(), t)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: {error}; download it again") from error

@@ -18,10 +18,10 @@ from rosbags.rosbag2 import reader as rosbag2_reader
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd  # type: ignore[attr-defined] # Python's, or as in Python
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.folders.point_table import RawCloud
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.bag_recovery import MCAP_MAGIC, recover, require_tables
-from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
 # Recorders write chunks of 1 to 16 MB, and a cloud of two million points has some 100 MB.
 MOST_BYTES = 1 << 28
@@ -103,11 +103,7 @@ class BagFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the index, or the whole file where the index cannot be read.
-
-        Raises:
-            InputError: nothing of the bag can be read, or it is of no readable kind.
-        """
+        """Read the index, or the whole file where the index cannot be read."""
         if path.is_file() and not path.stat().st_size:
             raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
         self.path = path
@@ -220,12 +216,8 @@ class BagFile:
                     return last
                 look_back_ns *= 8
 
-    def decode(self, message: BagMessage, time_field: str | None = None) -> DecodedCloud:
-        """The points of a message.
-
-        Raises:
-            InputError: the message is damaged or lacks a field.
-        """
+    def decode(self, message: BagMessage, time_field: str | None = None) -> RawCloud:
+        """The points of a message."""
         with self._damage("a point cloud cannot be decoded"):
             try:
                 return decode(message, self.ros2, time_field)

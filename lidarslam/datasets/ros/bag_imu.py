@@ -87,11 +87,7 @@ class BagImu:
     """The IMU recorded with the point clouds of a bag."""
 
     def __init__(self, bag: BagFile, clouds: CloudTopic, wanted: str | None) -> None:
-        """Choose the topic.
-
-        Raises:
-            InputError: the wanted topic is no IMU's.
-        """
+        """Choose the topic."""
         self._bag = bag
         self._clouds = clouds
         self._topic = _choose(bag, clouds, wanted)

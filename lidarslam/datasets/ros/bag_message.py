@@ -12,8 +12,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
 
-from lidarslam.datasets.ros.driver_messages import CUSTOM_MESSAGE_TYPES, decode_custom_message
-from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, decode_point_cloud2
+from lidarslam.datasets.folders.point_table import RawCloud
+from lidarslam.datasets.ros.driver_messages import CUSTOM_MESSAGE_TYPES, decode_custom_message, decode_scan_message
+from lidarslam.datasets.ros.point_cloud2 import decode_point_cloud2
 
 POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
@@ -69,7 +70,7 @@ def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
     return int(seconds) * 10**9 + int(nanoseconds), frame_id
 
 
-def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCloud:
+def decode(message: BagMessage, ros2: bool, time_field: str | None) -> RawCloud:
     """Decode a message of one of the `CLOUD_TYPES`, or a sweep of packets, by fixed definitions.
 
     Those in the bag are not used: the definition of PointCloud2 has not changed, bags may lack definitions, and a
@@ -78,8 +79,6 @@ def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCl
     if message.message_type in CUSTOM_MESSAGE_TYPES:
         return decode_custom_message(message.raw, ros2)
     if message.message_type == VELODYNE_SCAN_TYPE:
-        from lidarslam.datasets.ros.driver_messages import decode_scan_message
-
         return decode_scan_message(message.raw, ros2)
     cloud = cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE, ros2))
     return decode_point_cloud2(cloud, time_field)

@@ -32,21 +32,12 @@ class OusterBag(OusterRecording):
         super().__init__(source, config)
         self._bag = bag
         self._topic = topic
-        self.topic = topic.name
-        self.topics = bag.topics
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A lost index."""
-        return () if self._bag.damage is None else (self._bag.damage,)
+        self.topic, self.topics = topic.name, bag.topics
+        self.warnings = () if bag.damage is None else (bag.damage,)
 
     @cached_property
     def sensor(self) -> Any:
-        """See `OusterRecording`.
-
-        Raises:
-            InputError: there is no metadata.
-        """
+        """See `OusterRecording`."""
         if (text := next(self._contents("metadata", _STRING_TYPE), None)) is not None:
             return read_sensor(text.decode(errors="replace"))
         if (beside := find_metadata(self._source)) is not None:
@@ -62,13 +53,6 @@ class OusterBag(OusterRecording):
 
     def _packets_of_imu(self) -> Iterator[Any]:
         return imu_packets(self.sensor, self._contents("imu_packets", self._topic.message_type))
-
-    @cached_property
-    def _extent(self) -> tuple[int, float]:
-        count, last = 0, 0.0
-        for scan in self.scans(faults=Faults()):
-            count, last = count + 1, scan.stamp
-        return count, last
 
     def _contents(self, name: str, message_type: str) -> Iterator[bytes]:
         """The content of the messages of a topic other than that of the packets: a single string or array of bytes."""

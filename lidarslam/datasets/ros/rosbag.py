@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -10,10 +9,12 @@ from pathlib import Path
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.cloud_recording import CloudRecording
+from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.point_table import RawCloud
 from lidarslam.datasets.packets.packet_recording import require
-from lidarslam.datasets.recording import ImuSummary, PointField, Recording, SeveralTopicsError, Topic
+from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
 from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
@@ -26,10 +27,7 @@ from lidarslam.datasets.ros.bag_message import (
     find_stamp_source,
 )
 from lidarslam.datasets.ros.ouster_bag import OusterBag
-from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.stored_recording import StoredRecording, truth_beside
-from lidarslam.datasets.times.azimuth import PointTiming, Sweep, point_timing
-from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, TimedCloud, learn_point_time
+from lidarslam.datasets.stored_recording import truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
@@ -47,12 +45,7 @@ _NEVER_SET = "scans were left out: their stamps were never set"
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a rosbag1 `.bag`, a rosbag2 folder, or a single `.db3` or `.mcap`.
-
-    Raises:
-        InputError: the bag cannot be read, or it does not hold the one point cloud topic that is asked for.
-        ConfigError: the topic holds packets, and the library that decodes them is not installed.
-    """
+    """Open a rosbag1 `.bag`, a rosbag2 folder, or a single `.db3` or `.mcap`."""
     bag = BagFile(source)
     topic = choose_topic(source, bag.topics, config.topic)
     if topic.message_type in OUSTER_PACKET_TYPES:
@@ -62,7 +55,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     return BagRecording(source, config, bag, topic)
 
 
-class BagRecording(StoredRecording):
+class BagRecording(CloudRecording):
     """The messages of one point cloud topic.
 
     Stamps are those of the message headers, or, where no header has one, the times of recording. A message of another
@@ -76,6 +69,7 @@ class BagRecording(StoredRecording):
         self._bag = bag
         self._topic = topic
         self.topic, self.topics = topic.name, bag.topics
+        self._truth_path = truth_beside(source, self.name)
 
     @property
     def frames(self) -> tuple[BagFile, str]:
@@ -92,27 +86,26 @@ class BagRecording(StoredRecording):
 
     @cached_property
     def _imu(self) -> BagImu:
-        return BagImu(self._bag, CloudTopic(self._topic, self._frame_id, self._stamps), self._config.imu_topic)
+        clouds = CloudTopic(self._topic, self._frame_id, self._stamps)
+        return BagImu(self._bag, clouds, self._config.imu_topic)
 
     def _imu_summary(self) -> ImuSummary | None:
         return self._imu.summary()
 
-    def _truth_path(self) -> Path | None:
-        return truth_beside(self._source, self.name)
-
-    @property
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
         """Other topics, a lost index, headers without stamps, and faults of the points' times."""
         others = _others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (others, self._bag.damage, unset, _one_part(self._source), *self._point_time.warnings)
+        found = (others, self._bag.damage, unset, _one_part(self._source), *self._timing.warnings)
         return tuple(warning for warning in found if warning is not None)
 
-    def _notes(self) -> Iterator[str]:
-        return iter(self._point_time.notes)
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        return self._timing.notes
 
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
-        return in_stamp_order(self._wanted(wanted, faults, strict), self._stamps.stamp, faults)
+        return in_stamp_order(self._wanted(wanted, faults, strict), self._stamp, faults)
 
     def _wanted(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
         other_sensor = (
@@ -128,7 +121,7 @@ class BagRecording(StoredRecording):
                 faults.unreadable(InputError(message.damage))
             elif message.frame_id != self._frame_id:
                 faults.leave_out(other_sensor, repr(message.frame_id))
-            elif (stamp := self._stamps.stamp(message)) <= self._stamps.before_first:
+            elif (stamp := self._stamp(message)) <= self._stamps.before_first:
                 faults.leave_out(_NEVER_SET, f"{stamp:.9f}")
             else:
                 yield message
@@ -150,14 +143,13 @@ class BagRecording(StoredRecording):
         if count < len(self):
             faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", len(self) - count)
 
-    def _sound(self) -> Iterator[BagMessage]:
-        """The messages that have a header, to infer from; the others are counted when it is their turn."""
+    def _sound_items(self) -> Iterator[BagMessage]:
         return (message for message in self._bag.messages(self._topic) if message.damage is None)
 
     @cached_property
     def _frame_id(self) -> str:
         """The sensor that most of the first messages come from, unless another is asked for."""
-        frames = Counter(m.frame_id for m in islice(self._sound(), _FRAMES_LOOKED_AT))
+        frames = Counter(m.frame_id for m in islice(self._sound_items(), _FRAMES_LOOKED_AT))
         wanted = self._config.frame_id
         if wanted is None:
             return max(frames, key=lambda frame: frames[frame], default="")
@@ -168,21 +160,15 @@ class BagRecording(StoredRecording):
             )
         return wanted
 
-    def _read(self, item: BagMessage, faults: Faults) -> Scan:
-        cloud, stamp = self._decode(item), self._stamps.stamp(item)
-        model, azimuth = self._point_time.learned.model, self._point_time.azimuth
-        offsets = azimuth.offsets(cloud.sweep) if model is None else cloud.offsets(model, stamp)
-        return cloud.scan(stamp, offsets, self._point_time.model is not None, faults)
-
-    def _decode(self, message: BagMessage) -> DecodedCloud:
-        return self._bag.decode(message, self._config.time_field)
-
-    def _fields(self, item: BagMessage) -> tuple[PointField, ...]:
-        return self._decode(item).fields
+    def _decode(self, item: BagMessage) -> RawCloud:
+        return self._bag.decode(item, self._config.time_field)
 
     @cached_property
     def _stamps(self) -> StampSource:
-        return find_stamp_source(self._sound())
+        return find_stamp_source(self._sound_items())
+
+    def _stamp(self, item: BagMessage) -> float:
+        return self._stamps.stamp(item)
 
     def _last_stamp(self, first: Scan) -> float:
         return self._last_recorded_stamp or first.stamp
@@ -190,52 +176,36 @@ class BagRecording(StoredRecording):
     @cached_property
     def _last_recorded_stamp(self) -> float | None:
         last = self._bag.last_message(self._topic)
-        return None if last is None else self._stamps.stamp(last)
+        return None if last is None else self._stamp(last)
 
     @cached_property
-    def _point_time(self) -> PointTiming:
-        first, period_s = next(self._sound(), None), None
-        if first is not None and self._last_recorded_stamp is not None and len(self) > 1:
-            period_s = (self._last_recorded_stamp - self._stamps.stamp(first)) / (len(self) - 1)
-        return point_timing(self._learned_time(period_s), self._pairs(), period_s, self._config.time_reference)
+    def _period_s(self) -> float | None:
+        first = next(self._sound_items(), None)
+        if first is None or self._last_recorded_stamp is None or len(self) < 2:
+            return None
+        return (self._last_recorded_stamp - self._stamp(first)) / (len(self) - 1)
 
-    def _point_time_model(self) -> PointTimeModel | None:
-        return self._point_time.model
-
-    def _learned_time(self, period_s: float | None) -> LearnedTime:
-        unit, reference = self._config.time_unit, self._config.time_reference
-        if reference == "none":
-            return LearnedTime()
+    @property
+    def _defined_time(self) -> tuple[TimeUnit, TimeReference, TimeUnit | None]:
         if self._topic.message_type == VELODYNE_SCAN_TYPE:
-            unit, reference = "ns", "absolute"  # as they are decoded
-        elif self._topic.message_type in driver_messages.CUSTOM_MESSAGE_TYPES:
-            return learn_point_time(self._timed_clouds(), unit, "absolute", period_s, driver_messages.TIME_UNIT)
-        return learn_point_time(self._timed_clouds(), unit, reference, period_s)
+            return "ns", "absolute", None  # as they are decoded
+        if self._topic.message_type in driver_messages.CUSTOM_MESSAGE_TYPES:
+            return self._config.time_unit, "absolute", driver_messages.TIME_UNIT
+        return super()._defined_time
 
-    def _timed_clouds(self) -> Iterator[TimedCloud]:
-        for message in self._sound():
-            with suppress(InputError):  # damaged, which is counted when it is its turn
-                yield self._decode(message).timed(self._stamps.stamp(message))
-
-    def _pairs(self) -> Iterator[list[Sweep]]:
+    def _runs(self) -> Iterator[list[BagMessage]]:
         apart = max(2, min(self._topic.messages, _LOOKED_AT) // _PAIRS)
-        pair: list[Sweep] = []
-        for number, message in enumerate(islice(self._sound(), _LOOKED_AT)):
+        pair: list[BagMessage] = []
+        for number, message in enumerate(islice(self._sound_items(), _LOOKED_AT)):
             if number % apart < 2:
-                with suppress(InputError):
-                    pair.append(self._decode(message).sweep)
+                pair.append(message)
             if number % apart == 1:
                 yield pair
                 pair = []
 
 
 def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
-    """The wanted point cloud topic, or the only one with many messages; without clouds, the only one of packets.
-
-    Raises:
-        SeveralTopicsError: there is more than one to choose from.
-        InputError: there is no such topic, or none to choose from; the message lists them.
-    """
+    """The wanted point cloud topic, or the only one with many messages; without clouds, the only one of packets."""
     clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES and topic.messages]
     packets = [topic for topic in topics if _has_packets(topic) and topic.messages]
     if wanted is not None:

@@ -1,6 +1,6 @@
 """Time of the points of a spinning sensor from their azimuth, where a sweep has no times but its order of firing."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import TimeReference
-from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, is_return
+from lidarslam.datasets.faults import NO_POINT_TIME, Faults
+from lidarslam.datasets.folders.point_table import RawCloud
+from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel
 
 AZIMUTH_TIME = PointTimeModel("azimuth", "s", "relative")
+
+Decision = tuple[float | None, str | None, str | None]
+"""The duration of a sweep if the azimuth gives the times, a fact for the user, and the missing setting."""
 
 # Number of blocks of consecutive points whose mean azimuth is followed round the circle.
 _BLOCKS, _FEWEST_IN_BLOCK = 180, 8
@@ -31,8 +37,6 @@ _DIFFERS_M, _LARGEST_M = 0.05, 1.0
 _FEWEST_COMPARED, _CLEAR = 100, 0.75
 # No sensor turns more slowly; scans farther apart leave sweeps out between them.
 _LONGEST_SWEEP_S = 0.25
-# Pairs of consecutive scans that are compared, spread over the recording.
-_PAIRS = 40
 _USED = "The points are in the order of one turn, and their times follow from the azimuth."
 _NOT_USED = (
     "The points have no times, and the seams of the sweeps are closed as in motion compensated ones, or sweeps are"
@@ -52,32 +56,11 @@ _NO_TIMES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class SweepOrder:
+class SweepOrder(NamedTuple):
     """Points of a sweep in the order of firing."""
 
     points: FloatArray  # (N, 3) the returns
     turned_deg: FloatArray  # (N,) the angle that the sensor has turned since the sweep's first point
-
-    def end(self) -> FloatArray:
-        """The points (M, 3) before the seam."""
-        return np.asarray(self.points[self.turned_deg > self.turned_deg.max() - _END_DEG])
-
-    def start(self) -> FloatArray:
-        """The points (M, 3) behind the seam."""
-        return np.asarray(self.points[self.turned_deg < _START_DEG])
-
-
-def turned_angles(points: FloatArray, rings: NDArray[np.generic] | None = None) -> FloatArray | None:
-    """Angle in degrees by which the sensor had turned since the first point, for returns (N, 3) in their stored order.
-
-    The points are stored in the order of firing, or, where there are rings, ring by ring with each in this order.
-
-    Returns:
-        (N,) from 0; None where the points are in another order, or not of one turn.
-    """
-    turned = _one_after_the_other(points, rings)
-    return _ring_by_ring(points, rings) if turned is None and rings is not None else turned
 
 
 def _one_after_the_other(points: FloatArray, rings: NDArray[np.generic] | None) -> FloatArray | None:
@@ -137,27 +120,33 @@ def _nearest_turn(angle: float, reference: float) -> float:
     return float(angle + 360.0 * np.round((reference - angle) / 360.0))
 
 
-def offsets_from_order(points: FloatArray, rings: NDArray[np.generic] | None, period_s: float) -> FloatArray | None:
-    """Seconds (N,) from the sweep's first point, for the raw points (N, 3) of a sweep that lasts a period.
+def offsets_from_order(cloud: RawCloud, sweep_s: float) -> FloatArray | None:
+    """Seconds (N,) from the first point of a sweep that lasts so long; NaN without a return.
 
-    Points without a return get NaN; None where the points are not in the order of firing.
+    None where the points are not in the order of firing.
     """
-    order = sweep_order(points, rings)
+    order = sweep_order(cloud)
     if order is None:
         return None
-    offsets = np.full(len(points), np.nan)
-    offsets[is_return(points)] = order.turned_deg * (period_s / order.turned_deg.max())
+    offsets = np.full(len(cloud.points), np.nan)
+    offsets[cloud.returns] = order.turned_deg * (sweep_s / order.turned_deg.max())
     return offsets
 
 
-def sweep_order(points: FloatArray, rings: NDArray[np.generic] | None) -> SweepOrder | None:
-    """The returns of a raw sweep (N, 3) with their angles; None where they are not in the order of firing."""
-    found = is_return(points)
-    turned = turned_angles(points[found], None if rings is None else rings[found])
-    return None if turned is None else SweepOrder(points[found], turned)
+def sweep_order(cloud: RawCloud) -> SweepOrder | None:
+    """The returns of a sweep with the angles by which the sensor had turned since the first of them.
+
+    The points are stored in the order of firing, or, where there are rings, ring by ring with each in this order; None
+    where they are in another order, or not of one turn.
+    """
+    points, rings = cloud.points[cloud.returns], None if cloud.rings is None else cloud.rings[cloud.returns]
+    turned = _one_after_the_other(points, rings)
+    if turned is None and rings is not None:
+        turned = _ring_by_ring(points, rings)
+    return None if turned is None else SweepOrder(points, turned)
 
 
-def are_as_measured(pairs: Iterable[Sequence[SweepOrder]]) -> bool | None:
+def are_as_measured(pairs: Iterable[tuple[SweepOrder, SweepOrder]]) -> bool | None:
     """Whether sweeps are as measured, by pairs of consecutive ones, each in its own frame.
 
     At the seam of a sweep as measured, its last points continue in the first points of the next sweep, while its own
@@ -185,11 +174,12 @@ def _across_seam(sweep: SweepOrder, following: SweepOrder) -> tuple[FloatArray, 
     """Differences of range (K,) of a sweep's last points to the next one's first points, and to its own."""
     from scipy.spatial import KDTree  # takes a while to load
 
-    end = sweep.end()
+    end = sweep.points[sweep.turned_deg > sweep.turned_deg.max() - _END_DEG]
     end = end[np.linalg.norm(end, axis=1) > _NEAREST_M]
     ranges = np.linalg.norm(end, axis=1, keepdims=True)
     differences, is_same = [], np.ones(len(end), dtype=bool)
-    for start in (following.start(), sweep.start()):
+    for points, turned_deg in (following, sweep):
+        start = points[turned_deg < _START_DEG]
         start_ranges = np.linalg.norm(start, axis=1, keepdims=True)
         apart, nearest = KDTree(start / start_ranges).query(end / ranges)
         is_same &= apart < _SAME_DIRECTION
@@ -209,95 +199,72 @@ def offsets_from_azimuth(points: NDArray[np.floating], before_s: float, after_s:
     return np.where(half_turns < 0.0, before_s * half_turns, after_s * half_turns)
 
 
-class Sweep(NamedTuple):
-    """A scan as stored."""
-
-    points: FloatArray  # (N, 3), places without a return included
-    rings: NDArray[np.generic] | None  # (N,)
-
-
-@dataclass(frozen=True)
-class AzimuthTiming:
-    """Whether points get their times from the azimuth, and remarks on it."""
-
-    period_s: float | None = None  # the duration of a sweep; None: the points get no times
-    note: str | None = None  # a fact for the user
-    warning: str | None = None  # the missing setting, and its value
-
-    def offsets(self, sweep: Sweep) -> FloatArray | None:
-        """Seconds (N,) from the sweep's first point; None without times."""
-        return None if self.period_s is None else offsets_from_order(sweep.points, sweep.rings, self.period_s)
-
-
 @dataclass(frozen=True)
 class PointTiming:
     """Where the times of a recording's points come from; inferred once, so that all scans are read in the same way."""
 
-    learned: LearnedTime
-    azimuth: AzimuthTiming
+    model: PointTimeModel | None = None  # None where points have no times
+    sweep_s: float | None = None  # the duration of a sweep, where the times follow from the azimuth
+    notes: tuple[str, ...] = ()  # facts for the user
+    warnings: tuple[str, ...] = ()  # faults of the time field and their effect; times that the azimuth could give
 
-    @property
-    def model(self) -> PointTimeModel | None:
-        """The source of the offsets; None where points have no times."""
-        return self.learned.model if self.azimuth.period_s is None else AZIMUTH_TIME
+    def offsets(self, cloud: RawCloud, stamp: float) -> FloatArray | None:
+        """Seconds (N,) from the stamp at which the points were measured; None where this cloud does not tell."""
+        if self.sweep_s is not None:
+            return offsets_from_order(cloud, self.sweep_s)
+        if self.model is None or cloud.times is None or cloud.time_field != self.model.field:
+            return None
+        return self.model.offsets(cloud.times, stamp)
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Facts for the user."""
-        return () if self.azimuth.note is None else (self.azimuth.note,)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Faults of the time field and their effect on the times; times that the azimuth could give."""
-        fault = self.learned.warning
-        if fault is not None and self.learned.model is None:
-            without = "." if self.azimuth.warning is not None else _NO_TIMES
-            fault += without if self.azimuth.period_s is None else "; the times follow from the azimuth instead."
-        return tuple(warning for warning in (fault, self.azimuth.warning) if warning is not None)
-
-
-def pair_starts(scans: int) -> list[int]:
-    """Indices, spread over a recording of `scans` scans, of the first scan of each pair that is compared."""
-    return sorted({int(index) for index in np.linspace(0, max(0, scans - 2), _PAIRS)})
+    def scan(self, cloud: RawCloud, stamp: float, faults: Faults, example: str) -> Scan:
+        """The valid points; a scan without usable point times, where others have them, is counted."""
+        scan = cloud.scan(stamp, self.offsets(cloud, stamp))
+        if self.model is not None and scan.time_offsets is None and len(scan):
+            faults.note(NO_POINT_TIME, example)
+        return scan
 
 
 def point_timing(
-    learned: LearnedTime, runs: Iterable[Iterable[Sweep]], period_s: float | None, reference: TimeReference
+    learned: LearnedTime, runs: Iterable[Iterable[RawCloud]], period_s: float | None, reference: TimeReference
 ) -> PointTiming:
-    """By a time field, or where that gives no times by the azimuth; arguments as of `infer_azimuth_timing`."""
-    has_field = learned.model is not None
-    return PointTiming(learned, AzimuthTiming() if has_field else infer_azimuth_timing(runs, period_s, reference))
-
-
-def infer_azimuth_timing(
-    runs: Iterable[Iterable[Sweep]], period_s: float | None, reference: TimeReference
-) -> AzimuthTiming:
-    """Decide by runs of consecutive scans, where the recording has no times of its own.
+    """By a time field, or where that gives no times by the azimuth.
 
     Args:
+        learned: of the time field.
         runs: two or more consecutive scans each; read only as far as needed.
         period_s: seconds between scans; None for a single one.
-        reference: "azimuth" does not question that sweeps are as measured; other than "auto", there is nothing to do.
+        reference: "azimuth" does not question that sweeps are as measured; other than "auto", the azimuth is not used.
     """
-    if reference not in ("auto", "azimuth") or period_s is None:
-        return AzimuthTiming()
-    orders = ([sweep_order(*sweep) for sweep in run] for run in runs)
-    if reference == "azimuth":
-        return _as_asked(orders, period_s)
+    fault = learned.warning
+    if learned.model is not None:
+        return PointTiming(learned.model, warnings=() if fault is None else (fault,))
+    sweep_s, note, offer = None, None, None
+    if reference in ("auto", "azimuth") and period_s is not None:
+        orders = ([sweep_order(cloud) for cloud in run] for run in runs)
+        sweep_s, note, offer = (_as_asked if reference == "azimuth" else _as_measured)(orders, period_s)
+    if fault is not None and sweep_s is not None:
+        fault += "; the times follow from the azimuth instead."
+    elif fault is not None:
+        fault += _NO_TIMES if offer is None else "."
+    warnings = tuple(warning for warning in (fault, offer) if warning is not None)
+    return PointTiming(None if sweep_s is None else AZIMUTH_TIME, sweep_s, () if note is None else (note,), warnings)
+
+
+def _as_measured(runs: Iterable[list[SweepOrder | None]], period_s: float) -> Decision:
     if period_s >= _LONGEST_SWEEP_S:
-        return AzimuthTiming()
-    if not (pairs := list(_ordered_pairs(orders))):
-        return AzimuthTiming(note=_UNORDERED)
+        return None, None, None
+    if not (pairs := list(_ordered_pairs(runs))):
+        return None, _UNORDERED, None
     decision = are_as_measured(pairs)
     if decision is None:
-        return AzimuthTiming(warning=_OFFERED)
-    return AzimuthTiming(period_s, note=_USED) if decision else AzimuthTiming(note=_NOT_USED)
+        return None, None, _OFFERED
+    return (period_s, _USED, None) if decision else (None, _NOT_USED, None)
 
 
-def _as_asked(runs: Iterable[list[SweepOrder | None]], period_s: float) -> AzimuthTiming:
+def _as_asked(runs: Iterable[list[SweepOrder | None]], period_s: float) -> Decision:
     if all(order is None for run in runs for order in run):
-        return AzimuthTiming(warning=_NO_ORDER)
-    return AzimuthTiming(period_s, note=_USED) if period_s < _LONGEST_SWEEP_S else AzimuthTiming(warning=_TOO_SLOW)
+        return None, None, _NO_ORDER
+    return (period_s, _USED, None) if period_s < _LONGEST_SWEEP_S else (None, None, _TOO_SLOW)
 
 
 def _ordered_pairs(runs: Iterable[list[SweepOrder | None]]) -> Iterator[tuple[SweepOrder, SweepOrder]]:

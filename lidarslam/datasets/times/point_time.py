@@ -10,22 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.config import TimeReference, TimeUnit
-
-# In the order of preference, should a cloud have several; compared without regard to case.
-TIME_FIELD_NAMES: tuple[str, ...] = (
-    "t",
-    "time",
-    "timestamp",
-    "timestamps",
-    "stamps",
-    "offset_time",
-    "time_offset",
-    "time_stamp",
-)
-RING_FIELD_NAMES: tuple[str, ...] = ("ring", "channel", "line", "laser_id", "laser", "ring_id", "beam_id", "beam")
+from lidarslam.datasets.folders.point_table import RawCloud
 
 UNITS_PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 # Units of times that were divided or multiplied once too often; not among the settings.
@@ -51,34 +38,6 @@ _IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
 _COARSEST_OF_SWEEP = 0.1
 # Instead of the extremes, so that a few stray values do not matter.
 _QUANTILES = (0.005, 0.5, 0.995)
-
-
-def _first_listed(names: Sequence[str], wanted: tuple[str, ...]) -> str | None:
-    present = {name.lower(): name for name in reversed(names)}
-    return next((present[name] for name in wanted if name in present), None)
-
-
-def find_time_field(names: Sequence[str], wanted: str | None = None) -> str | None:
-    """The field with the per-point time: the wanted one, else the first of `TIME_FIELD_NAMES`; None without any.
-
-    Raises:
-        InputError: the wanted field is not among the names.
-    """
-    if wanted is None:
-        return _first_listed(names, TIME_FIELD_NAMES)
-    if wanted not in names:
-        raise InputError(f"the points have no time field {wanted!r}; their fields are: {', '.join(names)}")
-    return wanted
-
-
-def find_ring_field(names: Sequence[str]) -> str | None:
-    """The field with the number of the laser, the first of `RING_FIELD_NAMES`; None without any."""
-    return _first_listed(names, RING_FIELD_NAMES)
-
-
-def is_return(points: FloatArray) -> NDArray[np.bool_]:
-    """Mask (N,) of the points (N, 3) that are returns of the laser; drivers leave any time in the others."""
-    return np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -147,14 +106,6 @@ class PointTimeModel:
         return np.asarray(seconds + float((Fraction(rounded) - zero) / per_second))
 
 
-class TimedCloud(NamedTuple):
-    """The raw times (N,) of a cloud's returns, with the field's name, and the scan's stamp in seconds if known."""
-
-    field: str | None
-    values: NDArray[np.generic] | None
-    stamp: float | None
-
-
 class LearnedTime(NamedTuple):
     """The inferred meaning of a time field."""
 
@@ -164,7 +115,7 @@ class LearnedTime(NamedTuple):
 
 
 def learn_point_time(
-    clouds: Iterable[TimedCloud],
+    clouds: Iterable[tuple[RawCloud, float | None]],
     unit: TimeUnit = "auto",
     reference: TimeReference = "auto",
     period_s: float | None = None,
@@ -173,17 +124,21 @@ def learn_point_time(
     """By the first cloud whose times are unambiguous, else by the last with any; see `infer_point_time`.
 
     Stamps close to zero are ambiguous: times from 0 to 0.1 s are then relative as well as absolute.
+
+    Args:
+        clouds: with the scans' stamps in seconds, if known; read only as far as needed.
     """
     learned, failures = LearnedTime(), 0
-    for cloud in islice(clouds, _CLOUDS_LOOKED_AT):
-        if cloud.values is not None and len(cloud.values) < 2:
+    for cloud, stamp in islice(clouds, _CLOUDS_LOOKED_AT):
+        values = None if cloud.times is None else cloud.times[cloud.returns]
+        if values is not None and len(values) < 2:
             continue  # an empty scan shows nothing of the field
         found = LearnedTime()
-        if cloud.field is not None and cloud.values is not None:
-            found = infer_point_time(cloud.field, cloud.values, cloud.stamp, unit, reference, period_s, defined_unit)
+        if cloud.time_field is not None and values is not None:
+            found = infer_point_time(cloud.time_field, values, stamp, unit, reference, period_s, defined_unit)
         learned = found if found.model is not None or learned == LearnedTime() else learned
         failures += found.model is None
-        is_clear = cloud.stamp is None or abs(cloud.stamp) > 2 * CLOCK_LIMIT_S
+        is_clear = stamp is None or abs(stamp) > 2 * CLOCK_LIMIT_S
         if (found.model is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
             break
     if (model := learned.model) is None:

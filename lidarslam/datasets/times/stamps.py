@@ -40,9 +40,6 @@ def read_stamps(path: Path) -> FloatArray:
 
     A line is a date and time (taken as UTC), seconds, or an integer count of milli-, micro- or nanoseconds since
     1970. Digits below about 0.2 microseconds are lost in clock readings, as float64 holds no more.
-
-    Raises:
-        InputError: the file cannot be read or a line is no stamp.
     """
     lines = [line for line in map(str.strip, bounded_lines(path)) if not line.startswith("#")]
     stamps = np.full(len(lines), np.nan)
@@ -165,9 +162,6 @@ def in_stamp_order(
 
     A stamp that jumps ahead is held back until the next few decide between a stray one, which would cost all that
     follow, and a pause. An error of the items' source is raised after the items before it.
-
-    Raises:
-        InputError: the clock was set back for good, unless it may be; then all that follow are left out.
     """
     errors: list[Exception] = []
     source = _stamped(items, stamp_of, errors)
