@@ -26,7 +26,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting, ReaderConfig, RollPitchYaw
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
-from lidarslam.datasets.mounted_recording import MountedRecording
+from lidarslam.datasets.mounting import MountedRecording
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory

@@ -9,8 +9,8 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.folders.point_table import coordinates
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
+from lidarslam.datasets.point_table import coordinates
 
 # Surveys end well within this; squares of much more overflow.
 _FARTHEST_M = 1e9

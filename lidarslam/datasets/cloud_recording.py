@@ -9,7 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import PointField, RawCloud
+from lidarslam.datasets.point_table import PointField, RawCloud
 from lidarslam.datasets.stored_recording import StoredRecording
 from lidarslam.datasets.times.azimuth import PointTiming, point_timing
 from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, learn_point_time

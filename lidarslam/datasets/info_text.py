@@ -19,6 +19,14 @@ from lidarslam.datasets.registry import choose_reader, open_recording
 
 # Between these a stamp is a date; else it counts from some start.
 _EPOCH_FROM_S, _EPOCH_UNTIL_S = 5e8, 5e9
+_KEYS = (
+    "source", "reader", "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan",
+    "point_time", "ground_truth", "imu",
+)  # fmt: skip
+_NOTHING_KNOWN: dict[str, Any] = {
+    **dict.fromkeys(_KEYS),
+    **{key: [] for key in ("fields", "notes", "topics", "topic_choices")},
+}
 _CHOOSE = "Choose one of them with --topic, such as --topic {}"
 
 
@@ -37,9 +45,9 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
 
 def describe_as_json(source: Path, config: ReaderConfig) -> str:
     """The same as JSON with the keys of docs/command_line.md, all of them always; null for unknown values."""
-    content = _content(source, choose_reader(source, config.name))
+    content = {**_NOTHING_KNOWN, "source": str(source), "reader": choose_reader(source, config.name)}
     try:
-        content |= _known(open_recording(source, config).describe())
+        content |= _content(open_recording(source, config).describe())
     except SeveralTopicsError as error:
         content["topics"] = _topics(error.topics)
         content["topic_choices"] = [topic.name for topic in error.clouds]
@@ -48,22 +56,12 @@ def describe_as_json(source: Path, config: ReaderConfig) -> str:
     return json.dumps(content, indent=2, allow_nan=False).replace("\x7f", "\\u007f")
 
 
-def _content(source: Path, reader: str) -> dict[str, Any]:
-    """All keys, with the values known before the recording is opened."""
-    names = ("topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan", "point_time")
-    unknown = dict.fromkeys((*names, "ground_truth", "imu"))
-    return {
-        "source": str(source),
-        "reader": reader,
-        **unknown,
-        "fields": [],
-        "notes": [],
-        "topics": [],
-        "topic_choices": [],
-    }
-
-
-def _known(info: RecordingInfo) -> dict[str, Any]:
+def _content(info: RecordingInfo) -> dict[str, Any]:
+    first, imu, model = info.first, info.imu, info.point_time
+    times = None
+    if model is not None and first.time_offsets is not None and len(first):
+        span = {"first_s": float(first.time_offsets.min()), "last_s": float(first.time_offsets.max())}
+        times = {**asdict(model), **span}
     return {
         "topic": info.topic,
         "scans": info.scans,
@@ -72,34 +70,21 @@ def _known(info: RecordingInfo) -> dict[str, Any]:
         "duration_s": info.duration_s,
         "rate_hz": info.rate_hz,
         "first_scan": {
-            "points": len(info.first),
-            "dropped_points": info.first.dropped,
-            "has_intensities": info.first.intensities is not None,
-            "has_colours": info.first.colours is not None,
-            "has_rings": info.first.rings is not None,
+            "points": len(first),
+            "dropped_points": first.dropped,
+            **{f"has_{name}": getattr(first, name) is not None for name in ("intensities", "colours", "rings")},
         },
-        "point_time": _known_point_time(info),
+        "point_time": times,
         "ground_truth": None if info.ground_truth is None else str(info.ground_truth),
         "fields": [{"name": field.name, "type": field.type_name} for field in info.fields],
-        "imu": None if info.imu is None else _known_imu(info.imu),
+        "imu": None if imu is None else {key: value for key, value in asdict(imu).items() if key != "notes"},
         "notes": list(_notes(info)),
         "topics": _topics(info.topics),
     }
 
 
-def _known_imu(imu: ImuSummary) -> dict[str, Any]:
-    return {key: value for key, value in asdict(imu).items() if key != "notes"}
-
-
 def _topics(topics: Sequence[Topic]) -> list[dict[str, Any]]:
     return [{"name": topic.name, "type": topic.message_type, "messages": topic.messages} for topic in topics]
-
-
-def _known_point_time(info: RecordingInfo) -> dict[str, Any] | None:
-    model, offsets = info.point_time, info.first.time_offsets
-    if model is None or offsets is None or not len(offsets):
-        return None
-    return {**asdict(model), "first_s": float(offsets.min()), "last_s": float(offsets.max())}
 
 
 def format_info(source: Path, info: RecordingInfo) -> str:

@@ -11,7 +11,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounted_recording import recorded_axes
+from lidarslam.datasets.mounting import recorded_axes
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.stamps import in_stamp_order
 
@@ -71,18 +71,20 @@ def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Sca
     """The chosen scans of a recording, in the order of time, of bounded size; faults are counted."""
     scans = recording.scans(chosen.start, chosen.stop, chosen.step, faults)
     if np.array_equal(recorded_axes(recording)[1], np.eye(4)):
-        scans = _with_turns_checked(scans, faults)
+        scans = (_turn_looked_at(scan, faults) for scan in scans)
     ordered = in_stamp_order((look_at(scan, faults) for scan in scans), lambda scan: scan.stamp, faults)
-    return _with_paces_checked(_without_repeats(ordered, faults), faults)
+    return _new_measurements(ordered, faults)
 
 
-def _without_repeats(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
-    """The scans that are new measurements: the noise of two measurements is never the same."""
+def _new_measurements(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
+    """The scans without repeated ones: the noise of two measurements is never the same."""
     last: Scan | None = None
     for scan in scans:
         if last is not None and len(scan) > _FEW_POINTS and _is_repeated(scan.points, last.points):
             faults.leave_out(_REPEATED, f"at {scan.stamp:.9f}")
             continue
+        if last is not None and scan.stamp - last.stamp < _LEAST_INTERVAL_S:
+            faults.note(_TOO_FAST, f"{1e6 * (scan.stamp - last.stamp):.3g} microseconds at {scan.stamp:.9f}")
         last = scan
         yield scan
 
@@ -91,20 +93,10 @@ def _is_repeated(points: FloatArray, before: FloatArray) -> bool:
     return np.array_equal(points, before) and bool(np.ptp(points, axis=0).any())
 
 
-def _with_paces_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
-    latest = -np.inf
-    for scan in scans:
-        if scan.stamp - latest < _LEAST_INTERVAL_S:
-            faults.note(_TOO_FAST, f"{1e6 * (scan.stamp - latest):.3g} microseconds at {scan.stamp:.9f}")
-        latest = scan.stamp
-        yield scan
-
-
-def _with_turns_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
-    for scan in scans:
-        if _TURN_DEG[0] < (turned_deg := _turned_deg(scan)) < _TURN_DEG[1]:
-            faults.note(_COUNTER_CLOCKWISE, f"by {turned_deg:.0f} degrees at {scan.stamp:.9f}")
-        yield scan
+def _turn_looked_at(scan: Scan, faults: Faults) -> Scan:
+    if _TURN_DEG[0] < (turned_deg := _turned_deg(scan)) < _TURN_DEG[1]:
+        faults.note(_COUNTER_CLOCKWISE, f"by {turned_deg:.0f} degrees at {scan.stamp:.9f}")
+    return scan
 
 
 def _turned_deg(scan: Scan) -> float:

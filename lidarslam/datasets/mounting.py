@@ -1,18 +1,24 @@
-"""The mounting of a LiDAR: its name or angles as a rotation, and a cautious guess by the ground in the first scans."""
+"""The mounting of a LiDAR: a recording in upright axes, by a name or angles, or a guess by the ground in its scans."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.recording import Recording, RecordingInfo
 
 # Roll, pitch, yaw in degrees of the recorded axes: the direction of the recorded z axis, as seen along x.
 _ANGLES_DEG: dict[MountingName, RollPitchYaw] = {
@@ -44,6 +50,8 @@ _MOST_OPPOSITE = 0.01
 # the ceiling and not the floor, or the other way round; strays are left out.
 _FAR_TO_ONE_SIDE, _NEAR_TO_OTHER, _STRAY_SHARE = np.sin(np.deg2rad(35.0)), np.sin(np.deg2rad(9.0)), 0.005
 _SCANS = 5
+# Step between the scans that a guess uses.
+_STEP = 4
 _ENOUGH_SCANS, _SOME_SCANS = 4, 2
 # Points farther than this many median ranges are left out; cells are this share of the median range.
 _FAR, _CELL_SHARE, _LEAST_CELL_M = 4.0, 1.0 / 30.0, 0.05
@@ -136,6 +144,123 @@ def _raise(points: NDArray[np.floating], sine: float, cosine: float, corrected: 
         corrected[n, 0], corrected[n, 1], corrected[n, 2] = x * scale, y * scale, rho * sine + z * cosine
 
 
+@dataclass(frozen=True)
+class Guess:
+    """The mounting as the first scans show it."""
+
+    mounting: Mounting = "upright"  # that is applied
+    warning: str | None = None  # the guess, or that it cannot be decided; with the setting
+
+
+UPRIGHT = Guess()
+
+
+class MountedRecording:
+    """A recording whose LiDAR frame is turned to x forward, z up: scans, ground truth and extrinsics.
+
+    Args:
+        recorded: in its own axes.
+        mounting: of these; auto: guessed from the first scans, when it is needed.
+        raised_deg: added to the elevations of all points, above the recorded x-y plane.
+        time_scale: factor on the points' times from their scan's stamp.
+    """
+
+    def __init__(
+        self, recorded: Recording, mounting: Mounting, raised_deg: float = 0.0, time_scale: float = 1.0
+    ) -> None:
+        self.recorded = recorded
+        self.raised_deg = raised_deg
+        self._time_scale = time_scale
+        self._mounting = mounting
+
+    @cached_property
+    def _guess(self) -> Guess:
+        if self._mounting != "auto":
+            return Guess(self._mounting)
+        try:
+            return guess_mounting(scan.points for scan in self.recorded.scans(step=_STEP, faults=Faults()))
+        except InputError:  # raised again when the scans are read
+            return UPRIGHT
+
+    @cached_property
+    def T_upright_recorded(self) -> FloatArray:
+        """(4, 4) the rotation from the recorded axes."""
+        return transform_of(self._guess.mounting)
+
+    @property
+    def name(self) -> str:
+        """A short name."""
+        return self.recorded.name
+
+    def __len__(self) -> int:
+        return len(self.recorded)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar, of the upright axes; the world is the truth's."""
+        truth = self.recorded.ground_truth
+        if truth is None:
+            return None
+        return Trajectory(truth.stamps, truth.T_world_lidar @ inverse(self.T_upright_recorded))
+
+    @property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """Extrinsic calibration of a KITTI recording."""
+        T_cam_recorded = self.recorded.T_cam_lidar
+        return None if T_cam_recorded is None else np.asarray(T_cam_recorded @ inverse(self.T_upright_recorded))
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU, with its extrinsic calibration to the upright axes."""
+        samples = self.recorded.imu
+        if samples is None or samples.T_lidar_imu is None:
+            return samples
+        return replace(samples, T_lidar_imu=self.T_upright_recorded @ samples.T_lidar_imu)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Of the recording, and of a guess."""
+        warning = self._guess.warning
+        return (*self.recorded.warnings, *(() if warning is None else (warning,)))
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`, in upright axes."""
+        _ = self.T_upright_recorded  # guessed before the first scan: two passes over one file may not alternate
+        return map(self._upright, self.recorded.scans(start, stop, step, faults))
+
+    def _upright(self, scan: Scan) -> Scan:
+        return corrected(scan, self.T_upright_recorded, self.raised_deg, self._time_scale)
+
+    def describe(self) -> RecordingInfo:
+        """The contents of the recording, and its mounting unless it is upright."""
+        info, guess, notes = self.recorded.describe(), self._guess, []
+        if guess.warning is not None:
+            notes.append(f"{guess.warning[0].upper()}{guess.warning[1:]}.")
+        elif not np.array_equal(self.T_upright_recorded, np.eye(4)):
+            notes.append(f"The scans are turned upright, as reader.mounting={written(guess.mounting)}.")
+        if self.raised_deg:
+            notes.append(
+                f"Every point is raised by {self.raised_deg:g} degrees of elevation, before every method alike."
+            )
+        return replace(info, first=self._upright(info.first), notes=(*info.notes, *notes))
+
+
+def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
+    """The recording in its own axes, and T_upright_recorded (4, 4)."""
+    if isinstance(recording, MountedRecording):
+        return recording.recorded, recording.T_upright_recorded
+    return recording, np.eye(4)
+
+
+def elevation_of(recording: Recording) -> tuple[float, float]:
+    """The degrees by which a recording's points are raised, and the cosine between its recorded z axis and up."""
+    if not isinstance(recording, MountedRecording):
+        return 0.0, 1.0
+    return recording.raised_deg, float(recording.T_upright_recorded[2, 2])
+
+
 @dataclass(frozen=True, eq=False)
 class Plane:
     """A plane that the sensor sees from one side."""
@@ -221,17 +346,6 @@ def _sphere(count: int) -> FloatArray:
     across = np.sqrt(1.0 - z**2)
     spread = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
     return np.concatenate([np.eye(3), -np.eye(3), spread])
-
-
-@dataclass(frozen=True)
-class Guess:
-    """The mounting as the first scans show it."""
-
-    mounting: Mounting = "upright"  # that is applied
-    warning: str | None = None  # the guess, or that it cannot be decided; with the setting
-
-
-UPRIGHT = Guess()
 
 
 def guess_mounting(scans: Iterable[FloatArray]) -> Guess:

@@ -10,7 +10,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import PointField
+from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 

@@ -10,8 +10,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
-from lidarslam.datasets.mounted_recording import MountedRecording
-from lidarslam.datasets.mounting import KITTI_DEG
+from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published.evalio import is_of_evalio, located
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.unrecognised import absent, result_of_program, unrecognised

@@ -14,8 +14,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.imu_samples import summarise
+from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.recording import KITTI_FIELDS, ImuSummary, RecordingInfo, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 

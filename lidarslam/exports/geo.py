@@ -16,7 +16,7 @@ from lidarslam.core.files import make_directory, written
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory, format_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.mounted_recording import recorded_axes
+from lidarslam.datasets.mounting import recorded_axes
 from lidarslam.datasets.published.kitti_raw import KittiRawRecording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile

@@ -13,7 +13,7 @@ from lidarslam.core.files import make_directory, replacing
 from lidarslam.core.geometry import FloatArray, make_transform, transform_points
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import read_transform
-from lidarslam.datasets.mounted_recording import recorded_axes
+from lidarslam.datasets.mounting import recorded_axes
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.exports.source import read_map, read_run_scans, read_source

@@ -6,8 +6,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import RawCloud
 from lidarslam.datasets.mounting import corrected, transform_of
+from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.times.azimuth import PointTiming

@@ -10,7 +10,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
-from lidarslam.datasets.mounted_recording import elevation_of
+from lidarslam.datasets.mounting import elevation_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.elevation import ElevationEstimator

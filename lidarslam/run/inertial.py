@@ -14,8 +14,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
-from lidarslam.datasets.mounted_recording import recorded_axes
-from lidarslam.datasets.mounting import transform_of
+from lidarslam.datasets.mounting import recorded_axes, transform_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapper import Mapper

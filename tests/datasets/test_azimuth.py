@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.folders.point_table import RawCloud
+from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.times.azimuth import are_as_measured, offsets_from_order, sweep_order
 

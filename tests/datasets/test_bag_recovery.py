@@ -19,8 +19,7 @@ from rosbags.rosbag2.storage_mcap import zstd
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.ros.bag_file import BagFile, unpacked
-from lidarslam.datasets.ros.bag_recovery import recover
+from lidarslam.datasets.ros.bag_file import BagFile, recover, unpacked
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000

@@ -10,8 +10,8 @@ import pytest
 from lidarslam.core.scan import Scan
 from lidarslam.datasets import info_text
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.info_text import describe_as_json
+from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.recording import ImuSummary, RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 

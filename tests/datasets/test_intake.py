@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at, take_in
-from lidarslam.datasets.mounted_recording import MountedRecording
+from lidarslam.datasets.mounting import MountedRecording
 
 
 def seen(points, **fields):

@@ -9,7 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.mounted_recording import MountedRecording
+from lidarslam.datasets.mounting import MountedRecording
 from lidarslam.datasets.published.kitti_odometry import KittiOdometryRecording
 from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 

@@ -14,8 +14,14 @@ from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import Mounting, ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.mounted_recording import MountedRecording
-from lidarslam.datasets.mounting import UPRIGHT, guess_mounting, mounting_with_up, transform_of, written
+from lidarslam.datasets.mounting import (
+    UPRIGHT,
+    MountedRecording,
+    guess_mounting,
+    mounting_with_up,
+    transform_of,
+    written,
+)
 from lidarslam.datasets.recording import RecordingInfo
 from lidarslam.datasets.registry import open_recording
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.folders.point_table import TIME_FIELDS, RawCloud, raw_cloud
+from lidarslam.datasets.point_table import TIME_FIELDS, RawCloud, raw_cloud
 from lidarslam.datasets.times.point_time import (
     UNITS_PER_SECOND,
     LearnedTime,

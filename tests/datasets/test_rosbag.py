@@ -14,8 +14,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import PointField
 from lidarslam.datasets.info_text import describe_source
+from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile

@@ -9,8 +9,8 @@ from lidarslam.cli import main
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import make_transform, transform_points
 from lidarslam.core.trajectory import Trajectory, format_kitti, read_tum, write_tum
-from lidarslam.datasets.folders.point_table import coordinates
 from lidarslam.datasets.folders.scan_files import read_ply
+from lidarslam.datasets.point_table import coordinates
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.record import RecordRequest, read_trajectory, record
 from lidarslam.simulation.world import Boxes, HeightField, Route, World

@@ -16,9 +16,9 @@ from lidarslam.core.text import count
 from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import RawCloud, raw_cloud
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key, table_reader
 from lidarslam.datasets.imu_samples import IMU_FILE, find_imu_file, read_imu_csv
+from lidarslam.datasets.point_table import RawCloud, raw_cloud
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import FileRecording, find_truth_file
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S

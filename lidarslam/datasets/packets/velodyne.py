@@ -12,9 +12,9 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import PointField, fields_of, raw_cloud
 from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
 from lidarslam.datasets.packets.packet_recording import PacketRecording
+from lidarslam.datasets.point_table import PointField, fields_of, raw_cloud
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.point_time import PointTimeModel
 

@@ -17,7 +17,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import PointField
+from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.stamped_files import first_file, increasing, poses_wxyz
 from lidarslam.datasets.stored_recording import FileRecording
 

@@ -1,27 +1,37 @@
-"""Messages of rosbag1 and rosbag2 files, by rosbags; a file whose index cannot be read is read without it."""
+"""Messages of rosbag1 and rosbag2 files, by rosbags; a file whose index cannot be read is read without it.
 
+Layouts: ROS bag format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), rosbag2's SQLite tables. They are read
+here where there is no index, as after a crash of the recorder, because rosbags needs one, and `StreamReader` of mcap
+1.6 loses a chunk that is cut off and accepts cut records.
+"""
+
+import sqlite3
+import struct
 from bz2 import BZ2Decompressor
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from io import RawIOBase
-from itertools import count
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
+from io import BytesIO, RawIOBase
+from itertools import chain, count, pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
+from urllib.parse import quote
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.rosbag1 import Reader as Rosbag1Reader
-from rosbags.rosbag1.reader import Compression, decompressors
+from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressors, normalize, read_uint32
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2 import reader as rosbag2_reader
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd  # type: ignore[attr-defined] # Python's, or as in Python
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, read_exact, read_string, zstd  # type: ignore[attr-defined] # Python's, or as in Python
+from rosbags.typesys.msg import normalize_msgtype
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.folders.point_table import RawCloud
+from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
-from lidarslam.datasets.ros.bag_recovery import MCAP_MAGIC, recover, require_tables
+
+Report = Callable[[str], None]
 
 # Recorders write chunks of 1 to 16 MB, and a cloud of two million points has some 100 MB.
 MOST_BYTES = 1 << 28
@@ -34,17 +44,23 @@ _REPAIR = {
     ".mcap": "mcap recover {} -o recovered.mcap",
     ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
 }
+# Records are read whole; a longer one is a damaged length.
+_LONGEST_RECORD = 1 << 30
+# Opcodes of MCAP.
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+MCAP_MAGIC, _ROSBAG1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
+# A damaged database may hold anything for a name.
+_TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+# By the table itself, because the pages of its index are at the end.
+_ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
 
 
 def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
-    """The content of compressed frames, one after the other.
+    """The content of compressed frames, one after the other; ValueError where they are cut short or hold too much.
 
     Args:
         data: the frames.
         make: a decompressor of one frame, as of the standard library.
-
-    Raises:
-        ValueError: they are cut short, or there is too much.
     """
     frames, size = [], 0
     while data:
@@ -138,11 +154,10 @@ class BagFile:
             with suppress(InputError):
                 return self._read_index()
         reports: list[str] = []
-        try:
-            messages = recover(self.path, self._suffix(self.path), reports.append)
-            counts = Counter((message.topic, message.message_type) for message in messages)
-        except Exception as reason:  # not even the beginning can be read
-            raise error from reason
+        counts: Counter[tuple[str, str]] = Counter()
+        with suppress(Exception):  # not even the beginning can be read
+            messages = recover(self.path, self._suffix(), reports.append)
+            counts.update((message.topic, message.message_type) for message in messages)
         if not counts:
             raise error
         self._has_index = False
@@ -182,7 +197,7 @@ class BagFile:
 
     def _in_sequence(self, topic: Topic) -> Iterator[BagMessage]:
         with suppress(Exception):  # not even its beginning can be read any more
-            for message in recover(self.path, self._suffix(self.path), lambda _: None):
+            for message in recover(self.path, self._suffix(), lambda _: None):
                 if (message.topic, message.message_type) == (topic.name, topic.message_type):
                     yield self._message(message.record_ns, message.raw, topic)
 
@@ -200,21 +215,16 @@ class BagFile:
     def last_message(self, topic: Topic) -> BagMessage | None:
         """The message of a topic recorded last, found from the end of the bag; None if there is none."""
         if self._has_index:
-            with suppress(InputError):  # damaged there
-                return self._last_by_index(topic)
+            with suppress(Exception), self._opened() as reader:  # damaged there
+                look_back_ns = _LAST_MESSAGES_NS
+                while True:
+                    start_ns = reader.end_time - look_back_ns
+                    parts = (self._by_index(storage, topic, start_ns) for storage in _storages(reader))
+                    last = _last(chain.from_iterable(parts))
+                    if last is not None or look_back_ns > reader.duration:
+                        return last
+                    look_back_ns *= 8
         return _last(self.messages(topic))
-
-    def _last_by_index(self, topic: Topic) -> BagMessage | None:
-        with self._opened() as reader:
-            with self._damage("its index cannot be read"):
-                end_ns, length_ns = reader.end_time, reader.duration
-            look_back_ns = _LAST_MESSAGES_NS
-            while True:
-                parts = [self._by_index(storage, topic, end_ns - look_back_ns) for storage in _storages(reader)]
-                last = _last(message for part in parts for message in part)
-                if last is not None or look_back_ns > length_ns:
-                    return last
-                look_back_ns *= 8
 
     def decode(self, message: BagMessage, time_field: str | None = None) -> RawCloud:
         """The points of a message."""
@@ -246,8 +256,8 @@ class BagFile:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise InputError(f"{self.path}: {place} ({reason}); {self._remedy()}") from error
 
-    def _suffix(self, path: Path) -> str:
-        return path.suffix if self.ros2 else ".bag"
+    def _suffix(self) -> str:
+        return self.path.suffix if self.ros2 else ".bag"
 
     def _remedy(self) -> str:
         if self.path.is_dir():
@@ -257,25 +267,20 @@ class BagFile:
             files = sorted(str(file) for suffix in _STORAGE_SUFFIXES for file in self.path.glob(f"*{suffix}"))
             such_as = f", such as {files[0]}" if files else ""
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files{such_as}"
-        command = _REPAIR.get(self._suffix(self.path))
+        command = _REPAIR.get(self._suffix())
         if command is None:
             return "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml"
         return f"try `{command.format(self.path)}`, or copy the bag again"
 
 
 def _require_rosbag1(path: Path) -> None:
-    """Refuse an MCAP file of another name.
-
-    Raises:
-        InputError: it is one.
-        OSError: the file cannot be read.
-    """
+    """Refuse an MCAP file of another name."""
     with path.open("rb") as file:
         if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
             raise InputError(f"{path}: is an MCAP file, by its first bytes; name it {path.with_suffix('.mcap').name}")
 
 
-def _last(messages: Iterator[BagMessage]) -> BagMessage | None:
+def _last(messages: Iterable[BagMessage]) -> BagMessage | None:
     last = None
     for message in messages:
         last = message if message.damage is None else last
@@ -287,3 +292,156 @@ def _storages(reader: Rosbag1Reader | Rosbag2Reader) -> list[Any]:
     if isinstance(reader, Rosbag1Reader):
         return [reader]
     return getattr(reader.storage, "storages", None) or [reader.storage]
+
+
+class RecoveredMessage(NamedTuple):
+    """One message; the type is named as in ROS 2, the time is that of recording in nanoseconds."""
+
+    topic: str
+    message_type: str
+    record_ns: int
+    raw: bytes
+
+
+def recover(path: Path, suffix: str, report: Report) -> Iterator[RecoveredMessage]:
+    """The messages of a `.bag`, `.mcap` or `.db3` file up to its first damaged place, which is reported in a line.
+
+    Raises:
+        ValueError, OSError, sqlite3.Error: it is no such file at all.
+    """
+    if suffix == ".db3":
+        yield from _database(path, report)
+        return
+    records: _Rosbag1 | _Mcap = _Rosbag1() if suffix == ".bag" else _Mcap()
+    with path.open("rb") as file:
+        if file.read(len(records.magic)) != records.magic:
+            raise ValueError(f"it does not begin as a {suffix} file")
+        size = path.stat().st_size
+        while (at := file.tell()) < size:
+            try:
+                yield from records.read(file)
+            except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
+                report(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})")
+                return
+
+
+class _Rosbag1:
+    """Records of a header, fields `name=value`, and data; chunks hold connections and messages."""
+
+    magic = _ROSBAG1_MAGIC
+
+    def __init__(self) -> None:
+        self._connections: dict[int, tuple[str, str]] = {}  # topic and type, by the number in each message
+
+    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+        """The messages of the record that begins here."""
+        header, size = Header.read(file), read_uint32(file)
+        kind, data = header.get_uint8("op"), file.read(min(size, _LONGEST_RECORD))
+        if kind == RecordType.CHUNK:
+            compression = header.get_string("compression")
+            yield from _within(data if compression == "none" else decompressors[compression](data), self.read)
+        _require_whole(data, size)
+        if kind == RecordType.CONNECTION:
+            fields = Header.read(BytesIO(struct.pack("<I", size) + data))
+            named = normalize(header.get_string("topic")), normalize_msgtype(fields.get_string("type"))
+            self._connections[header.get_uint32("conn")] = named
+        elif kind == RecordType.MSGDATA:
+            named = self._connections[header.get_uint32("conn")]
+            yield RecoveredMessage(*named, header.get_time("time"), data)
+
+
+class _Mcap:
+    """Records of an opcode, a length and their content; chunks hold schemas, channels and messages."""
+
+    magic = MCAP_MAGIC
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
+
+    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+        """The messages of the record that begins here."""
+        opcode, size = struct.unpack("<BQ", read_exact(file, 9))
+        if opcode in (_FOOTER, _DATA_END):  # the summary behind it repeats schemas and channels
+            file.seek(0, 2)
+            return
+        data = file.read(min(size, _LONGEST_RECORD))
+        body = BytesIO(data)
+        if opcode == _CHUNK:
+            _, _, unpacked_size, checksum = struct.unpack("<QQQI", read_exact(body, 28))
+            compression, _, content = read_string(body), body.read(8), body.read()
+            # A part of a chunk without compression can be read as it stands.
+            is_part = not compression and len(data) < size
+            content = content if is_part else decompress(content, compression, unpacked_size, checksum)
+            yield from _within(content, self.read)
+        _require_whole(data, size)
+        if opcode == _SCHEMA:
+            (schema,) = struct.unpack("<H", read_exact(body, 2))
+            self._schemas[schema] = read_string(body)
+        elif opcode == _CHANNEL:
+            channel, schema = struct.unpack("<HH", read_exact(body, 4))
+            self._channels[channel] = (read_string(body), self._schemas[schema])
+        elif opcode == _MESSAGE:
+            channel, _, record_ns, _ = struct.unpack("<HIQQ", read_exact(body, 22))
+            yield RecoveredMessage(*self._channels[channel], record_ns, body.read())
+
+
+def _within(content: bytes, read: Callable[[BinaryIO], Iterator[RecoveredMessage]]) -> Iterator[RecoveredMessage]:
+    """The messages of the records of a chunk."""
+    stream = BytesIO(content)
+    while stream.tell() < len(content):
+        yield from read(stream)
+
+
+def _require_whole(data: bytes, size: int) -> None:
+    if len(data) < size:
+        raise ValueError(f"expected a record of {size:,} bytes, got {len(data):,}")
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def require_tables(path: Path) -> None:
+    """ValueError where messages or topics of a database (or one in a folder) are a view: its query may have no end."""
+    for file in path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []:
+        with closing(_connected(file)) as database, suppress(sqlite3.Error):  # damaged, which is found when it is read
+            for name, kind in database.execute("SELECT name, type FROM sqlite_master"):
+                if name.lower() in ("messages", "topics") and kind != "table":
+                    raise ValueError(f"its {name} are a {kind}, not a table")
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
+
+
+def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
+    require_tables(path)
+    with path.open("rb") as file:
+        header = file.read(32)
+    with closing(_connected(path)) as database:
+        # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
+        database.execute("PRAGMA writable_schema=ON")
+        topics = {number: (name, kind) for number, name, kind in database.execute(_TOPICS)}
+        # Pages that are missing at the end (sqlite.org/fileformat2.html, 1.3) SQLite may take for zeros.
+        page, pages = struct.unpack_from(">H10xI", header, 16)
+        is_cut = path.stat().st_size < pages * (page if page > 1 else 65536)
+        for row, following in pairwise(chain(_rows(database, report), [None])):
+            if row is None or (following is None and is_cut):
+                return
+            topic, record_ns, raw = row
+            if topic in topics and isinstance(record_ns, int) and isinstance(raw, bytes):
+                yield RecoveredMessage(*topics[topic], record_ns, raw)
+            else:
+                report(f"a row of it is no message (its data are of type {type(raw).__name__})")
+
+
+def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:
+    """The rows of the table of messages, up to damage."""
+    rows = 0
+    try:
+        for row in database.execute(_ROWS):
+            yield row
+            rows += 1
+    except sqlite3.Error as error:
+        report(f"it breaks off after {rows:,} rows ({_reason(error)})")

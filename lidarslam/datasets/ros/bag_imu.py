@@ -1,11 +1,11 @@
 """The IMU of a bag: its topic, its messages sensor_msgs/Imu, and its extrinsic from /tf_static."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice, takewhile
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -75,22 +75,13 @@ def _matrix(transform: Any) -> FloatArray:
     return T
 
 
-class CloudTopic(NamedTuple):
-    """The clock and the frame of a bag's point clouds."""
-
-    topic: Topic
-    frame_id: str
-    stamps: StampSource
-
-
 class BagImu:
-    """The IMU recorded with the point clouds of a bag."""
+    """The IMU recorded with the point clouds of a bag: the wanted topic, else that nearest to the clouds'."""
 
-    def __init__(self, bag: BagFile, clouds: CloudTopic, wanted: str | None) -> None:
-        """Choose the topic."""
+    def __init__(self, bag: BagFile, clouds: str, lidar_frame: str, stamps: StampSource, wanted: str | None) -> None:
         self._bag = bag
-        self._clouds = clouds
-        self._topic = _choose(bag, clouds, wanted)
+        self._lidar_frame, self._stamps = lidar_frame, stamps  # of the clouds
+        self._topic = _choose(bag, clouds, lidar_frame, wanted)
 
     def samples(self) -> ImuSamples | None:
         """All samples, by one pass over their topic; None of a bag without any."""
@@ -112,12 +103,12 @@ class BagImu:
             numbers = None if message.damage is not None else imu_numbers(message.raw, self._bag.ros2)
             if numbers is None:
                 damaged += 1
-                continue
-            sound.append(message)
-            rows.append(numbers)
+            else:
+                sound.append(message)
+                rows.append(numbers)
         if not sound:
             return None
-        source = find_stamp_source(sound) if self._clouds.stamps.from_header else self._clouds.stamps
+        source = find_stamp_source(sound) if self._stamps.from_header else self._stamps
         stamps = np.array([source.stamp(message) for message in sound])
         stamps[stamps <= source.before_first] = np.nan
         T_lidar_imu, notes = self._extrinsic(sound[0].frame_id)
@@ -127,20 +118,21 @@ class BagImu:
         return usable_samples(stamps, table[:, ANGULAR_VELOCITY], table[:, ACCELERATION], T_lidar_imu, notes)
 
     def _extrinsic(self, frame_id: str) -> tuple[FloatArray | None, tuple[str, ...]]:
-        lidar = self._clouds.frame_id
+        lidar = self._lidar_frame
         if frame_id.lstrip("/") == lidar.lstrip("/"):
             note = f"LiDAR and IMU share the frame {lidar!r}, so the IMU is taken to have the LiDAR's axes and place."
             return np.eye(4), (note,)
         return static_transform(self._bag, lidar, frame_id), ()
 
 
-def _choose(bag: BagFile, clouds: CloudTopic, wanted: str | None) -> Topic | None:
+def _choose(bag: BagFile, clouds: str, lidar_frame: str, wanted: str | None) -> Topic | None:
     """The wanted topic, or of several the nearest by the names of topic and frame, of these the fastest."""
     imus = [topic for topic in bag.topics if topic.message_type == IMU_TYPE and topic.messages]
     if wanted is not None:
         named = (topic for topic in imus if topic.name.lstrip("/") == wanted.lstrip("/"))
         if (found := next(named, None)) is None:
-            raise InputError(f"{bag.path}: reader.imu_topic is {wanted!r}; its IMU topics: {_listing(imus)}")
+            listed = ", ".join(topic.name for topic in imus) or "none"
+            raise InputError(f"{bag.path}: reader.imu_topic is {wanted!r}; its IMU topics: {listed}")
         return found
     if len(imus) < 2:
         return imus[0] if imus else None
@@ -148,23 +140,16 @@ def _choose(bag: BagFile, clouds: CloudTopic, wanted: str | None) -> Topic | Non
     def nearness(topic: Topic) -> tuple[int, int]:
         message = next((one for one in bag.messages(topic) if one.damage is None), None)
         frame_id = "" if message is None else message.frame_id
-        shared = _common(_parts(topic.name), _parts(clouds.topic.name)[:-1])
-        return shared + _common(_parts(frame_id, "[/_]"), _parts(clouds.frame_id, "[/_]")), topic.messages
+        names = _shared(topic.name, clouds.rpartition("/")[0])
+        return names + _shared(frame_id, lidar_frame, "[/_]"), topic.messages
 
     return max(imus, key=nearness)
 
 
-def _listing(topics: Sequence[Topic]) -> str:
-    return ", ".join(topic.name for topic in topics) or "none"
-
-
-def _parts(name: str, separator: str = "/") -> list[str]:
-    return re.split(separator, name.lstrip("/"))
-
-
-def _common(first: Sequence[str], second: Sequence[str]) -> int:
+def _shared(first: str, second: str, separator: str = "/") -> int:
     """Number of leading parts that two names share."""
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(first, second, strict=False)))
+    parts = (re.split(separator, name.lstrip("/")) for name in (first, second))
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
 
 
 def imu_numbers(raw: bytes, ros2: bool) -> FloatArray | None:

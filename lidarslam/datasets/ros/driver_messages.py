@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import TimeUnit
-from lidarslam.datasets.folders.point_table import RawCloud, raw_cloud
 from lidarslam.datasets.packets.velodyne import decode_sweep
+from lidarslam.datasets.point_table import RawCloud, raw_cloud
 
 CUSTOM_MESSAGE_TYPES = (
     "livox_ros_driver/msg/CustomMsg",

@@ -12,12 +12,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.point_table import RawCloud
 from lidarslam.datasets.packets.packet_recording import require
+from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
 from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
+from lidarslam.datasets.ros.bag_imu import BagImu
 from lidarslam.datasets.ros.bag_message import (
     CLOUD_TYPES,
     OUSTER_PACKET_TYPES,
@@ -86,8 +86,7 @@ class BagRecording(CloudRecording):
 
     @cached_property
     def _imu(self) -> BagImu:
-        clouds = CloudTopic(self._topic, self._frame_id, self._stamps)
-        return BagImu(self._bag, clouds, self._config.imu_topic)
+        return BagImu(self._bag, self._topic.name, self._frame_id, self._stamps, self._config.imu_topic)
 
     def _imu_summary(self) -> ImuSummary | None:
         return self._imu.summary()
@@ -224,13 +223,15 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
     if not any(topic.messages for topic in topics):
         raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
     others = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
-    hint = (
-        " {} holds raw packets of a sensor whose packets are not decoded: play it through the sensor's driver and"
-        " record the point clouds."
-    )
+    hint = ""
+    if others:
+        hint = (
+            f" {others[0].name} holds raw packets of a sensor whose packets are not decoded: play it through the"
+            " sensor's driver and record the point clouds."
+        )
     raise InputError(
-        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages."
-        f"{hint.format(others[0].name) if others else ''} Its topics: {_listing(topics)}"
+        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages.{hint} Its topics:"
+        f" {_listing(topics)}"
     )
 
 

@@ -12,7 +12,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import TimeReference
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
-from lidarslam.datasets.folders.point_table import RawCloud
+from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel
 
 AZIMUTH_TIME = PointTimeModel("azimuth", "s", "relative")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.config import TimeReference, TimeUnit
-from lidarslam.datasets.folders.point_table import RawCloud
+from lidarslam.datasets.point_table import RawCloud
 
 UNITS_PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 # Units of times that were divided or multiplied once too often; not among the settings.
