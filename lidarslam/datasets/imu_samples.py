@@ -1,6 +1,6 @@
 """The samples of an IMU as recorded, made usable: in order, finite, in SI units."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,10 @@ def usable_samples(
     rows = finite_rows[np.unique(stamps[finite_rows], return_index=True)[1]]
     if not len(rows):
         return None
-    notes = (*notes, *_left_out(len(stamps) - len(finite_rows), len(finite_rows) - len(rows)))
+    kinds = {"with a number that is not finite": len(stamps), "with the stamp of another": len(finite_rows)}
+    for (kind, before), after in zip(kinds.items(), (len(finite_rows), len(rows)), strict=True):
+        if before > after:
+            notes = (*notes, f"{count(before - after, 'IMU sample')} {kind} left out.")
     force = accelerations[rows]
     size = float(np.median(np.linalg.norm(force, axis=1)))
     if _IN_G[0] < size < _IN_G[1]:
@@ -84,23 +87,11 @@ def _missing(stamps: FloatArray) -> float:
     return 1.0 - (len(stamps) - 1) * float(np.median(np.diff(stamps))) / float(stamps[-1] - stamps[0])
 
 
-def _left_out(not_finite: int, repeated: int) -> Iterator[str]:
-    kinds = [(not_finite, "with a number that is not finite"), (repeated, "with the stamp of another")]
-    for number, kind in kinds:
-        if number:
-            yield f"{count(number, 'IMU sample')} {kind} left out."
-
-
 def summarise(name: str, samples: ImuSamples | None) -> ImuSummary | None:
     """The description of the samples of a topic, file or folder; None of none."""
     if samples is None:
         return None
     return ImuSummary(name, len(samples), samples.rate_hz, samples.T_lidar_imu is not None, samples.notes)
-
-
-def find_imu_file(folders: Sequence[Path]) -> Path | None:
-    """The table in the first folder that has one."""
-    return next((folder / IMU_FILE for folder in folders if (folder / IMU_FILE).is_file()), None)
 
 
 def read_imu_csv(path: Path) -> ImuSamples | None:

@@ -195,7 +195,7 @@ class MountedRecording:
     def __len__(self) -> int:
         return len(self.recorded)
 
-    @property
+    @cached_property
     def ground_truth(self) -> Trajectory | None:
         """T_world_lidar, of the upright axes; the world is the truth's."""
         truth = self.recorded.ground_truth

@@ -233,11 +233,16 @@ def _last_number(name: str) -> int | None:
     return int(numbers[-1]) if numbers else None
 
 
+def first_file(folders: Sequence[Path], *names: str) -> Path | None:
+    """The first of these files in the first folder that has one of them."""
+    paths = (folder / name for folder in folders for name in names)
+    return next((path for path in paths if path.is_file()), None)
+
+
 def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | None:
     """The true trajectory in the first folder that has one; `<stem>.tum` in any of them precedes general names."""
-    own = [folder / f"{stem}.tum" for folder in folders] if stem else []
-    general = [folder / name for folder in folders for name in _TRUTH_NAMES]
-    return next((path for path in own + general if path.is_file()), None)
+    own = None if stem is None else first_file(folders, f"{stem}.tum")
+    return own or first_file(folders, *_TRUTH_NAMES)
 
 
 def truth_beside(source: Path, name: str) -> Path | None:

@@ -3,7 +3,6 @@
 import re
 import stat
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import cast
@@ -186,24 +185,62 @@ def _as_table(numbers: NDArray[np.generic], names: tuple[str, ...]) -> NDArray[n
 
 def read_ply(path: Path) -> NDArray[np.void]:
     """The vertices (N,) of a PLY file, ascii or binary; other elements, such as faces, are left out."""
-    data = read_bytes(path)
+    return _read_described(path, "PLY", _ply_table)
+
+
+def read_pcd(path: Path) -> NDArray[np.void]:
+    """The points (N,) of a PCD file, ascii, binary or binary_compressed; organised clouds are flattened."""
+    return _read_described(path, "PCD", _pcd_table)
+
+
+def _read_described(path: Path, kind: str, read: Callable[[bytes], NDArray[np.void]]) -> NDArray[np.void]:
     try:
-        lines, length = _split_header(data, "end_header")
-        if lines[0] != ["ply"]:
-            raise ValueError("expected a header that begins with `ply`")
-        encoding, rows, dtype, skipped, further = _ply_header(lines)
-        if dtype.itemsize > _WIDEST_POINT:
-            raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
-        if max(skipped[0], further) > len(data):
-            raise ValueError(
-                f"expected {max(skipped[0], further):,} other elements in {len(data):,} bytes: it is truncated"
-            )
-        body = data[length:].split(b"\n", skipped[0])[-1] if encoding == "ascii" else data[length + skipped[1] :]
-        if not rows and further:
-            return np.empty(0, dtype)
-        return (read_ascii_table if encoding == "ascii" else read_binary_table)(body, dtype, rows)
+        return read(read_bytes(path))
     except ValueError as error:
-        raise InputError(f"{path}: not a readable PLY file: {error}; copy it again or remove it") from None
+        raise InputError(f"{path}: not a readable {kind} file: {error}; copy it again or remove it") from None
+
+
+def _ply_table(data: bytes) -> NDArray[np.void]:
+    lines, length = _split_header(data, "end_header")
+    if lines[0] != ["ply"]:
+        raise ValueError("expected a header that begins with `ply`")
+    encoding = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "")
+    if encoding not in _BYTE_ORDER:
+        raise ValueError(f"expected the format {', '.join(_BYTE_ORDER)}, got {encoding!r}")
+    elements = _ply_elements(lines)
+    names, counts = [name for name, *_ in elements], [count for _, count, _ in elements]
+    if "vertex" not in names:
+        raise ValueError("expected an element `vertex`, found none")
+    at = names.index("vertex")
+    *others, dtype = (_ply_row_type(kinds, _BYTE_ORDER[encoding]) for _, _, kinds in elements[: at + 1])
+    before, rows, further = sum(counts[:at]), counts[at], sum(counts[at + 1 :])
+    if dtype.itemsize > _WIDEST_POINT:
+        raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
+    if (other := max(before, further)) > len(data):
+        raise ValueError(f"expected {other:,} other elements in {len(data):,} bytes: it is truncated")
+    if not rows and further:
+        return np.empty(0, dtype)
+    if encoding == "ascii":
+        return read_ascii_table(data[length:].split(b"\n", before)[-1], dtype, rows)
+    skipped = sum(count * kind.itemsize for count, kind in zip(counts, others, strict=False))
+    return read_binary_table(data[length + skipped :], dtype, rows)
+
+
+def _ply_elements(lines: list[list[str]]) -> list[tuple[str, int, list[list[str]]]]:
+    """Name, number and properties of each element."""
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for words in lines:
+        if words[:1] == ["element"] and len(words) == 3:
+            elements.append((words[1], _whole_number("elements", words[2]), []))
+        elif words[:1] == ["property"] and elements:
+            elements[-1][2].append(words[1:])
+    return elements
+
+
+def _whole_number(noun: str, word: str) -> int:
+    if not word.isdecimal():
+        raise ValueError(f"expected a number of {noun}, got {word[:40]!r}: it is invalid")
+    return int(word)
 
 
 def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
@@ -219,30 +256,6 @@ def _split_header(data: bytes, last: str) -> tuple[list[list[str]], int]:
     return lines[1:], at
 
 
-def _ply_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], tuple[int, int], int]:
-    """Encoding, number of vertices, their type, (lines, bytes) of the elements before, and number of those behind."""
-    encoding = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "")
-    if encoding not in _BYTE_ORDER:
-        raise ValueError(f"expected the format {', '.join(_BYTE_ORDER)}, got {encoding!r}")
-    elements: list[tuple[str, int, list[list[str]]]] = []
-    for words in lines:
-        if words[:1] == ["element"] and len(words) == 3:
-            if not words[2].isdecimal():
-                raise ValueError(f"expected a number of elements, got {words[2][:40]!r}: it is invalid")
-            elements.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"] and elements:
-            elements[-1][2].append(words[1:])
-    skipped_lines = skipped_bytes = 0
-    for place, (name, rows, properties) in enumerate(elements):
-        dtype = _ply_row_type(properties, _BYTE_ORDER[encoding])
-        if name == "vertex":
-            further = sum(rows for _, rows, _ in elements[place + 1 :])
-            return encoding, rows, dtype, (skipped_lines, skipped_bytes), further
-        skipped_lines += rows
-        skipped_bytes += rows * dtype.itemsize
-    raise ValueError("expected an element `vertex`, found none")
-
-
 def _ply_row_type(properties: list[list[str]], order: str) -> np.dtype[np.void]:
     columns = []
     for words in properties:
@@ -252,30 +265,7 @@ def _ply_row_type(properties: list[list[str]], order: str) -> np.dtype[np.void]:
     return np.dtype(columns)
 
 
-@dataclass(frozen=True)
-class _Header:
-    dtype: np.dtype[np.void]
-    points: int
-    encoding: str
-    length: int
-
-
-def read_pcd(path: Path) -> NDArray[np.void]:
-    """The points (N,) of a PCD file, ascii, binary or binary_compressed; organised clouds are flattened."""
-    data = read_bytes(path)
-    try:
-        header = _pcd_header(data)
-        body = data[header.length :]
-        if header.encoding == "ascii":
-            return read_ascii_table(body, header.dtype, header.points)
-        if header.encoding == "binary":
-            return read_binary_table(body, header.dtype, header.points)
-        return _read_compressed(body, header)
-    except ValueError as error:
-        raise InputError(f"{path}: not a readable PCD file: {error}; copy it again or remove it") from None
-
-
-def _pcd_header(data: bytes) -> _Header:
+def _pcd_table(data: bytes) -> NDArray[np.void]:
     lines, length = _split_header(data, "DATA")
     entries = {words[0].upper(): words[1:] for words in lines if words and not words[0].startswith("#")}
     names = entries.get("FIELDS") or entries.get("COLUMNS") or []
@@ -283,15 +273,18 @@ def _pcd_header(data: bytes) -> _Header:
     counts = entries.get("COUNT", ["1"] * len(names))
     if not names or not len(names) == len(sizes) == len(kinds) == len(counts):
         raise ValueError("expected FIELDS, SIZE, TYPE and COUNT of one length each")
-    points = entries.get("POINTS", [])
-    if len(points) != 1:
+    if len(entries.get("POINTS", [])) != 1:
         raise ValueError("expected a line POINTS with their number")
-    encoding = " ".join(entries["DATA"])
-    if encoding not in ("ascii", "binary", "binary_compressed"):
-        raise ValueError(f"expected DATA ascii, binary or binary_compressed, got {encoding!r}")
-    if not points[0].isdecimal():
-        raise ValueError(f"expected a number of POINTS, got {points[0][:40]!r}: it is invalid")
-    return _Header(_pcd_row_type(names, sizes, kinds, counts), int(points[0]), encoding, length)
+    encoding, rows = " ".join(entries["DATA"]), _whole_number("POINTS", entries["POINTS"][0])
+    dtype, body = _pcd_row_type(names, sizes, kinds, counts), data[length:]
+    match encoding:
+        case "ascii":
+            return read_ascii_table(body, dtype, rows)
+        case "binary":
+            return read_binary_table(body, dtype, rows)
+        case "binary_compressed":
+            return _read_compressed(body, dtype, rows)
+    raise ValueError(f"expected DATA ascii, binary or binary_compressed, got {encoding!r}")
 
 
 def _pcd_row_type(names: list[str], sizes: list[str], kinds: list[str], counts: list[str]) -> np.dtype[np.void]:
@@ -310,12 +303,12 @@ def _pcd_row_type(names: list[str], sizes: list[str], kinds: list[str], counts: 
         raise ValueError(f"expected sizes of 1, 2, 4 or 8 bytes ({error})") from None
 
 
-def _read_compressed(body: bytes, header: _Header) -> NDArray[np.void]:
+def _read_compressed(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
     """The body is two sizes and an LZF stream that holds the fields one after another, not the points."""
     if len(body) < 8:
         raise ValueError("expected two sizes before the compressed points: it is truncated")
     compressed, size = (int(word) for word in np.frombuffer(body, "<u4", count=2))
-    expected = header.points * header.dtype.itemsize
+    expected = rows * dtype.itemsize
     if size != expected or len(body) < 8 + compressed:
         raise ValueError(
             f"expected {expected} bytes in {compressed} compressed ones, got {size} in {len(body) - 8}: it is truncated"
@@ -325,9 +318,9 @@ def _read_compressed(body: bytes, header: _Header) -> NDArray[np.void]:
     data = lzf.decompress(body[8 : 8 + compressed], size)
     if data is None or len(data) != size:
         raise ValueError("the compressed points are damaged")
-    table = np.empty(header.points, header.dtype)
+    table = np.empty(rows, dtype)
     at = 0
-    for name in header.dtype.names or ():
+    for name in dtype.names or ():
         column = table[name]
         table[name] = np.frombuffer(data, column.dtype, count=column.size, offset=at).reshape(column.shape)
         at += column.nbytes

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -17,61 +16,16 @@ from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key, table_reader
-from lidarslam.datasets.imu_samples import IMU_FILE, find_imu_file, read_imu_csv
+from lidarslam.datasets.imu_samples import IMU_FILE, read_imu_csv
 from lidarslam.datasets.point_table import RawCloud, raw_cloud
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, find_truth_file
+from lidarslam.datasets.stored_recording import FileRecording, find_truth_file, first_file
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S
 from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate, stamps_from_names
 
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 # Pairs of consecutive scans that are compared at their seams, spread over the recording.
 _PAIRS = 40
-
-
-@dataclass(frozen=True, eq=False)
-class FolderLayout:
-    """The scans of a folder."""
-
-    files: tuple[Path, ...]  # N files in the order of time, all with one suffix
-    stamps: FloatArray  # (N,) seconds, strictly increasing
-    from_clock: bool  # whether the stamps were found; else they are made from the rate
-    truth: Path | None  # a TUM file, or None
-    imu: Path | None  # a table of samples, or None
-    notes: tuple[str, ...]  # facts for the user
-    warnings: tuple[str, ...]  # faults and repairs
-
-
-def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
-    """The layout by names and the stamp file; no scan is opened."""
-    files, notes, warnings = _find_scans(folder)
-    places = (folder, folder.resolve().parent)
-    stamp_file = next((place / name for place in places for name in _STAMP_FILES if (place / name).is_file()), None)
-    stamps, from_clock = np.arange(len(files)) / rate_hz, True
-    named = stamps_from_names([path.stem for path in files])
-    if stamp_file is not None:
-        stamps, replaced, faults = _read_stamp_file(stamp_file, files)
-        warnings += faults
-        if replaced:
-            warnings.append(
-                f"{count(replaced, 'stamp')} of {stamp_file.name} interpolated: repeated, backwards or far ahead."
-            )
-    elif named is not None and len(set(named)) == len(named):
-        notes.append("The stamps are the file names.")
-        order = np.argsort(named)  # not that of the names: 5.36 comes before 5.4
-        files, stamps = [files[i] for i in order], named[order]
-    else:
-        from_clock = False
-        if named is not None:
-            warnings.append("The file names look like stamps, but some are equal.")
-    whole = (
-        folder.resolve().parent.parent if folder.resolve().parent.name == "velodyne_points" else folder.resolve().parent
-    )
-    if folder.resolve().name == "velodyne" or whole != folder.resolve().parent:
-        warnings.append(f"The folder is part of a KITTI recording; name {whole} for its times, poses and calibration.")
-    return FolderLayout(
-        tuple(files), stamps, from_clock, find_truth_file(places), find_imu_file(places), tuple(notes), tuple(warnings)
-    )
 
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
@@ -96,8 +50,8 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     )
 
 
-def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int, list[str]]:
-    """The stamps, the number of replaced ones, and a warning where lines and scans differ in number."""
+def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, list[str]]:
+    """The stamps, and warnings where lines and scans differ in number, or stamps were replaced."""
     lines = read_stamps(path)
     stamps, numbers = lines[np.isfinite(lines)], np.arange(len(files))
     warnings, left = [], max(0, len(files) - len(stamps))
@@ -121,7 +75,11 @@ def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int
             f"{path}: expected stamps that increase from line to line, no two of them do; mend it, or move it away to"
             " use the file names or the rate"
         ) from None
-    return mended, replaced - left, warnings
+    if replaced > left:
+        warnings.append(
+            f"{count(replaced - left, 'stamp')} of {path.name} interpolated: repeated, backwards or far ahead."
+        )
+    return mended, warnings
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -138,27 +96,49 @@ class ScanFolderRecording(CloudRecording, FileRecording):
     imu_name = IMU_FILE
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
-        self._layout = find_layout(folder, config.rate_hz)
-        super().__init__(folder, config, self._layout.files)
-        self.stamps = self._layout.stamps
-        self._has_stamps = self._layout.from_clock
-        self._truth_path, self._layout_notes = self._layout.truth, self._layout.notes
-        self._read_table = table_reader(self._layout.files)
+        """By names and the stamp file; no scan is opened."""
+        files, notes, warnings = _find_scans(folder)
+        places = (folder, folder.resolve().parent)
+        stamp_file = first_file(places, *_STAMP_FILES)
+        stamps, self._has_stamps = np.arange(len(files)) / config.rate_hz, True
+        named = stamps_from_names([path.stem for path in files])
+        if stamp_file is not None:
+            stamps, faults = _read_stamp_file(stamp_file, files)
+            warnings += faults
+        elif named is not None and len(set(named)) == len(named):
+            notes.append("The stamps are the file names.")
+            order = np.argsort(named)  # not that of the names: 5.36 comes before 5.4
+            files, stamps = [files[i] for i in order], named[order]
+        else:
+            self._has_stamps = False
+            if named is not None:
+                warnings.append("The file names look like stamps, but some are equal.")
+        above = places[1]
+        whole = above.parent if above.name == "velodyne_points" else above
+        if folder.resolve().name == "velodyne" or whole != above:
+            warnings.append(
+                f"The folder is part of a KITTI recording; name {whole} for its times, poses and calibration."
+            )
+        super().__init__(folder, config, files)
+        self.stamps = stamps
+        self._truth_path, self._imu_path = find_truth_file(places), first_file(places, IMU_FILE)
+        self._folder_notes, self._folder_warnings = tuple(notes), tuple(warnings)
+        self._read_table = table_reader(files)
 
     @cached_property
     def imu(self) -> ImuSamples | None:
         """The table imu.csv in the folder or the one above."""
-        return None if self._layout.imu is None else read_imu_csv(self._layout.imu)
+        return None if self._imu_path is None else read_imu_csv(self._imu_path)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """The repairs of the stamps, an assumed rate, and faults of the points' times."""
         assumed = (assumed_rate("The scans have no stamps", self._config),) if self._rate_is_assumed else ()
-        return (*self._layout.warnings, *assumed, *self._timing.warnings)
+        return (*self._folder_warnings, *assumed, *self._timing.warnings)
 
     @cached_property
     def _notes(self) -> tuple[str, ...]:
-        return (*self._layout_notes, *self._timing.notes)
+        return (*self._folder_notes, *self._timing.notes)
 
     def _decode(self, item: int) -> RawCloud:
         path = self._files[item]

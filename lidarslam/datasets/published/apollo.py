@@ -35,7 +35,7 @@ class ApolloRecording(ScanFolderRecording):
         self._truth_path = folder / "poses" / "gt_poses.txt"
         self._rows = self._read_poses()
         self.stamps = self._rows[:, 1]
-        self._has_stamps, self._layout_notes = True, ()
+        self._has_stamps, self._folder_notes = True, ()
         if not increasing_rows(self.stamps).all():
             raise InputError(f"{self._truth_path}: expected stamps that increase from line to line; mend it")
 

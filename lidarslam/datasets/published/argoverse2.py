@@ -18,8 +18,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.published.stamped_files import first_file, increasing, poses_wxyz
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.published.stamped_files import increasing, poses_wxyz
+from lidarslam.datasets.stored_recording import FileRecording, first_file
 
 _NANOSECOND = 1e-9
 _POINT = ("x", "y", "z", "intensity", "laser_number")
@@ -41,7 +41,7 @@ class Argoverse2Recording(FileRecording):
             raise InputError(f"{wrong}: expected a name that is the sweep's stamp in nanoseconds; move it away")
         super().__init__(folder, config, files)
         self.stamps = np.array([int(path.stem) for path in files]) * _NANOSECOND
-        self._truth_path = first_file("city_SE3_egovehicle.feather", folder)
+        self._truth_path = first_file((folder,), "city_SE3_egovehicle.feather")
 
     @property
     def name(self) -> str:

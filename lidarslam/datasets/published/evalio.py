@@ -105,8 +105,14 @@ def absent(source: Path) -> str | None:
     return f"{source}: is not downloaded: {how_to_get(source)}{install}"
 
 
-def require_known(source: Path) -> None:
-    """Check that evalio has the sequence."""
+def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
+    names = [f"{PREFIX}{data_set}/{name}" for name in known.get(data_set, ())]
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f": {', '.join(names[:_LISTED])}{more}" if names else ""
+
+
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open a sequence in the folder DATASET/SEQUENCE that evalio downloads it to."""
     known = sequences()
     if not known:
         raise InputError(f"{source}: {MISSING_EXTRA}")
@@ -116,22 +122,9 @@ def require_known(source: Path) -> None:
             f"{source}: evalio has no {full_name(source)}{_choice(data_set, known)}; a folder of another data set is"
             " read with --reader"
         )
-
-
-def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
-    names = [f"{PREFIX}{data_set}/{name}" for name in known.get(data_set, ())]
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f": {', '.join(names[:_LISTED])}{more}" if names else ""
-
-
-def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a sequence in the folder DATASET/SEQUENCE that evalio downloads it to."""
-    require_known(source)
     from evalio import datasets
 
-    recording = EvalioRecording(source.absolute(), config, datasets.get_sequence(full_name(source)))
-    recording.require_files()
-    return recording
+    return EvalioRecording(source.absolute(), config, datasets.get_sequence(full_name(source)))
 
 
 class EvalioRecording(StoredRecording):
@@ -150,6 +143,10 @@ class EvalioRecording(StoredRecording):
             f"{sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep.",
             f"The duration is that of the scans at {lidar.rate:g} Hz, the sensor's rate.",
         )
+        with self._reading("its list of files"):
+            missing = [file for file in sequence.files() if not (folder / file).exists()]
+        if missing:
+            raise InputError(f"{folder}: {missing[0]} is missing, the download is not complete; {how_to_get(folder)}")
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:
@@ -163,26 +160,18 @@ class EvalioRecording(StoredRecording):
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise InputError(f"{self._source}: evalio cannot read {what} ({reason}); download it again") from error
 
-    def require_files(self) -> None:
-        """Check that every file is there."""
-        with self._reading("its list of files"):
-            missing = [file for file in self._sequence.files() if not (self._source / file).exists()]
-        if missing:
-            command = how_to_get(self._source)
-            raise InputError(f"{self._source}: {missing[0]} is missing, the download is not complete; {command}")
-
     @property
     def name(self) -> str:
         """Such as hilti_2022_basement_2."""
         return str(self._sequence.full_name).replace("/", "_")
 
+    def __len__(self) -> int:
+        return self._length
+
     @cached_property
     def _length(self) -> int:
         with self._reading("the scans"):
             return len(self._sequence.data_iter())  # that of the sequence itself may be a number in its source
-
-    def __len__(self) -> int:
-        return self._length
 
     @cached_property
     def _T_imu_lidar(self) -> FloatArray:
@@ -231,23 +220,20 @@ class EvalioRecording(StoredRecording):
 
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Scan]:
         given = 0
-        try:
-            for scan in self._decoded(wanted):
-                given += 1
-                yield scan
-        except InputError as error:
-            if strict or not given:
-                raise
-            faults.leave_out(_UNREADABLE, str(error), len(wanted) - given)
-
-    def _decoded(self, wanted: range) -> Iterator[Scan]:
         with self._reading("the scans"):
             measurements = self._sequence.data_iter().lidar_iter()
         for index in range(wanted.stop):
-            with self._reading(f"scan {index}"):
-                measurement = next(measurements)
-                scan = _scan(measurement) if index in wanted else None
+            try:
+                with self._reading(f"scan {index}"):
+                    measurement = next(measurements)
+                    scan = _scan(measurement) if index in wanted else None
+            except InputError as error:
+                if strict or not given:
+                    raise
+                faults.leave_out(_UNREADABLE, str(error), len(wanted) - given)
+                return
             if scan is not None:
+                given += 1
                 yield scan
 
     def _read(self, item: Scan, faults: Faults) -> Scan:  # noqa: ARG002

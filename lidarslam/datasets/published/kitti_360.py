@@ -17,9 +17,9 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.published.kitti_files import read_calibration, read_sweep_timing
-from lidarslam.datasets.published.stamped_files import first_file, increasing, poses_of_rows, read_table
+from lidarslam.datasets.published.stamped_files import increasing, poses_of_rows, read_table
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, find_sequence
+from lidarslam.datasets.stored_recording import FileRecording, find_sequence, first_file
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
 from lidarslam.datasets.times.stamps import scan_rate
 
@@ -45,7 +45,7 @@ class Kitti360Recording(FileRecording):
         # There are no files of the sweeps' starts and ends, unlike in KITTI's raw data.
         self.warnings = tuple(note for note in timing.notes if "sweeps" not in note)
         self._sweep_s = 1.0 / (scan_rate(self.stamps) or config.rate_hz)
-        self._truth_path = first_file("poses.txt", drive.parent.parent / "data_poses" / drive.name)
+        self._truth_path = first_file((drive.parent.parent / "data_poses" / drive.name,), "poses.txt")
         self._point_time = None if config.time_reference == "none" else AZIMUTH_TIME
 
     @cached_property

@@ -20,9 +20,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.published.kitti_files import read_tr
-from lidarslam.datasets.published.stamped_files import first_file
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, find_sequence
+from lidarslam.datasets.stored_recording import FileRecording, find_sequence, first_file
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
 
 
@@ -50,9 +49,8 @@ class KittiOdometryRecording(FileRecording):
             )
         self.stamps = self._stamps_of(self._numbers)
         whole = folder.resolve()
-        self._pose_file = first_file(f"{whole.name}.txt", whole.parent.parent / "poses") or first_file(
-            "poses.txt", whole
-        )
+        poses = first_file((whole.parent.parent / "poses",), f"{whole.name}.txt")
+        self._pose_file = poses or first_file((whole,), "poses.txt")
         self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
 
     def _read_times(self) -> FloatArray:

@@ -20,11 +20,11 @@ from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import (
     StampedRecording,
-    first_file,
     increasing,
     poses_of_rows,
     read_table,
 )
+from lidarslam.datasets.stored_recording import first_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 _LASERS, _COLUMNS, _SWEEP_S = 64, 1024, 0.1
@@ -48,7 +48,8 @@ class MulRanRecording(StampedRecording):
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         super().__init__(folder, config)
-        self._truth_path = first_file("global_pose.csv", folder, folder / "sensor_data")
+        self._folders = folder, folder / "sensor_data"
+        self._truth_path = first_file(self._folders, "global_pose.csv")
         self._has_times = config.time_reference != "none"
         self._point_time = PointTimeModel("column", "s", "relative") if self._has_times else None
 
@@ -64,7 +65,7 @@ class MulRanRecording(StampedRecording):
     @cached_property
     def imu(self) -> ImuSamples | None:
         """The samples of xsens_imu.csv; where the unit is on the car is not published."""
-        path = first_file(self.imu_name, self._source, self._source / "sensor_data")
+        path = first_file(self._folders, self.imu_name)
         if path is None:
             return None
         with path.open(encoding="utf-8", errors="replace") as file:

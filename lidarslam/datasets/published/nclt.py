@@ -20,7 +20,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bytes
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.stamped_files import StampedRecording, first_file, increasing, read_table
+from lidarslam.datasets.published.stamped_files import StampedRecording, increasing, read_table
+from lidarslam.datasets.stored_recording import first_file
 
 _POINT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
 _STEP_M, _ORIGIN_M = 0.005, -100.0
@@ -44,7 +45,7 @@ class NcltRecording(StampedRecording):
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         super().__init__(folder, config)
         above = folder.resolve().parent
-        self._truth_path = first_file(f"groundtruth_{self.name}.csv", folder, above, above / "ground_truth")
+        self._truth_path = first_file((folder, above, above / "ground_truth"), f"groundtruth_{self.name}.csv")
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:

@@ -87,6 +87,7 @@ class NuScenesRecording(FileRecording):
             f"{scene} of {version.name}, samples and sweeps of LIDAR_TOP.",
             "The scans are motion compensated by the publishers; they have no per-point time and need none.",
         )
+        _ = self.ground_truth  # so that a damaged table is an error at once
 
     @property
     def name(self) -> str:

@@ -32,11 +32,6 @@ class StampedRecording(FileRecording):
         self.stamps = stamps[order]
 
 
-def first_file(name: str, *folders: Path) -> Path | None:
-    """The file in the first folder that has one of this name."""
-    return next((folder / name for folder in folders if (folder / name).is_file()), None)
-
-
 def read_table(path: Path, columns: int) -> FloatArray:
     """The rows (N, columns) of a table whose numbers are all finite; the first column is a stamp."""
     table = parse_numbers(path, columns)

@@ -72,7 +72,7 @@ def test_the_sequence_has_to_be_chosen(area: Path) -> None:
         open_recording(area)
     with pytest.raises(InputError, match="has no sequence 'x'; there are: MathildaAVE-1"):
         open_recording(area, ReaderConfig(sequence="x"))
-    with pytest.raises(InputError, match="is one sequence, not x"):
+    with pytest.raises(InputError, match="is the sequence MathildaAVE-1, not x"):
         open_recording(area / "MathildaAVE-1", ReaderConfig(sequence="x"))
 
 
