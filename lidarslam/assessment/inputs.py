@@ -13,8 +13,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.registry import is_recording, open_recording
-from lidarslam.datasets.unrecognised import absent
+from lidarslam.datasets.registry import absent, is_recording, open_recording
 from lidarslam.simulation.record import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.storage import directory as files
 from lidarslam.storage.finished_run import read_trajectory

@@ -57,7 +57,6 @@ class Faults:
 
 
 def _counted(number: int, kind: str) -> str:
-    """The number and the kind, which is written for several scans."""
     if number == 1:
         for several, one in _SINGULAR:
             kind = kind.replace(several, one)

@@ -81,7 +81,6 @@ def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
 
 
 def _missing(stamps: FloatArray) -> float:
-    """Share of the samples that are missing of a steady rate."""
     if len(stamps) < 3:
         return 0.0
     return 1.0 - (len(stamps) - 1) * float(np.median(np.diff(stamps))) / float(stamps[-1] - stamps[0])

@@ -136,7 +136,6 @@ def correct_elevation(points: NDArray[np.floating], angle_deg: float) -> FloatAr
 
 @compiled
 def _raise(points: NDArray[np.floating], sine: float, cosine: float, corrected: FloatArray) -> None:
-    """Write points (N, 3), raised by an angle."""
     for n in range(len(points)):
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
         rho = np.sqrt(x * x + y * y)

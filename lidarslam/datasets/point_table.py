@@ -117,7 +117,6 @@ def coordinates(table: NDArray[np.void]) -> FloatArray:
 
 
 def _column(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """A flat copy in the machine's own byte order."""
     return values.astype(values.dtype.newbyteorder("=")).reshape(-1)
 
 

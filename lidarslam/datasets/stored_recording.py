@@ -79,7 +79,6 @@ class StoredRecording:
 
     @cached_property
     def _rate_is_assumed(self) -> bool:
-        """Whether the stamps follow from the rate of the settings."""
         return False
 
     def __len__(self) -> int:

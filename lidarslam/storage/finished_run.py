@@ -20,8 +20,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
 from lidarslam.datasets.point_table import coordinates, read_colours, read_intensities, scalar_fields
-from lidarslam.datasets.registry import choose_reader
-from lidarslam.datasets.unrecognised import absent
+from lidarslam.datasets.registry import absent, choose_reader
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.unfinished import require_whole

@@ -227,7 +227,6 @@ def _ply_table(data: bytes) -> NDArray[np.void]:
 
 
 def _ply_elements(lines: list[list[str]]) -> list[tuple[str, int, list[list[str]]]]:
-    """Name, number and properties of each element."""
     elements: list[tuple[str, int, list[list[str]]]] = []
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3:

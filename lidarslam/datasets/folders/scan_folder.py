@@ -29,7 +29,6 @@ _PAIRS = 40
 
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
-    """The scan files in natural order, the most common suffix and numbered names first; notes and warnings."""
     named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
     candidates = [path for path in named if path.is_file()]
     if not candidates:
@@ -96,7 +95,6 @@ class ScanFolderRecording(CloudRecording, FileRecording):
     imu_name = IMU_FILE
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
-        """By names and the stamp file; no scan is opened."""
         files, notes, warnings = _find_scans(folder)
         places = (folder, folder.resolve().parent)
         stamp_file = first_file(places, *_STAMP_FILES)

@@ -34,7 +34,6 @@ def find_metadata(source: Path) -> Path | None:
 
 
 def _in_common(name: str, other: str) -> int:
-    """The number of leading characters in common."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(name, other, strict=False)))
 
 
@@ -63,7 +62,6 @@ class OusterRecording(PacketRecording):
         return XYZLut(self.sensor, use_extrinsics=False)
 
     def _read(self, frame: Any, faults: Faults) -> Scan:  # noqa: ARG002
-        """The scan of one of the library's LidarFrames."""
         valid = (frame.status & _VALID).astype(bool)
         ranges = frame.field("RANGE")
         points = self._directions(np.where(valid, ranges, 0))

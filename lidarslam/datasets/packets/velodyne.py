@@ -41,7 +41,6 @@ class VelodyneCapture(PacketRecording):
         return raw_cloud(table).scan(stamp, table["time"].astype(np.float64) if self._has_times else None)
 
     def _clouds(self) -> Iterator[_StampedCloud]:
-        """Stamp and points of each sweep."""
         import velodyne_decoder
 
         config = velodyne_decoder.Config(max_range=_FARTHEST_M, timestamp_first_packet=True)
@@ -80,7 +79,6 @@ def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> _StampedCloud:
 
 
 def _reason(path: Path, error: Exception) -> str:
-    """Why a capture cannot be read, and what to do."""
     said = " ".join(str(error).split()) or type(error).__name__
     if "tcpdump" in said or type(error).__name__ == "NeedData":
         return f"is no capture that can be read; a .pcapng is converted by `editcap -F pcap {path} {path.stem}.pcap`"
@@ -88,7 +86,6 @@ def _reason(path: Path, error: Exception) -> str:
 
 
 def _other_sensor(path: Path) -> str:
-    """The content of a capture without packets of a Velodyne, and what to do."""
     import velodyne_decoder
 
     payloads: list[bytes] = []

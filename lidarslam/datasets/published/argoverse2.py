@@ -50,7 +50,6 @@ class Argoverse2Recording(FileRecording):
 
     @cached_property
     def _T_ego_lidar(self) -> FloatArray | None:
-        """The mounting of the upper LiDAR; None without a calibration."""
         path = self._source / "calibration" / "egovehicle_SE3_sensor.feather"
         if not path.is_file():
             return None

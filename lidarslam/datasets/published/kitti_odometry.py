@@ -54,7 +54,6 @@ class KittiOdometryRecording(FileRecording):
         self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
 
     def _read_times(self) -> FloatArray:
-        """The stamps (N,) of times.txt; none without it."""
         path = self._source / "times.txt"
         times = read_stamps(path) if path.is_file() else np.empty(0)
         increasing = increasing_rows(times)

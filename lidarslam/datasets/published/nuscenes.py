@@ -105,7 +105,6 @@ class NuScenesRecording(FileRecording):
         return increasing(self.stamps, T_world_ego @ T_ego_lidar)
 
     def _poses(self, records: list[_Pose], tokens: list[str]) -> FloatArray:
-        """Transforms (N, 4, 4) of N tokens."""
         by_token = {one["token"]: one for one in records}
         if missing := next((token for token in tokens if token not in by_token), None):
             raise InputError(f"{self._version}: has no pose {missing!r}; download the tables again")

@@ -119,7 +119,6 @@ class BagFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the index, or the whole file where the index cannot be read."""
         if path.is_file() and not path.stat().st_size:
             raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
         self.path = path
@@ -184,7 +183,6 @@ class BagFile:
             on_damage(str(error))
 
     def _by_index(self, storage: Any, topic: Topic, start_ns: int | None = None) -> Iterator[BagMessage]:
-        """The messages of one file since a time."""
         named = (topic.name, topic.message_type)
         connections = [each for each in storage.connections if (each.topic, each.msgtype) == named]
         messages = storage.messages(connections, start=start_ns) if connections else iter(())
@@ -274,7 +272,6 @@ class BagFile:
 
 
 def _require_rosbag1(path: Path) -> None:
-    """Refuse an MCAP file of another name."""
     with path.open("rb") as file:
         if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
             raise InputError(f"{path}: is an MCAP file, by its first bytes; name it {path.with_suffix('.mcap').name}")
@@ -387,7 +384,6 @@ class _Mcap:
 
 
 def _within(content: bytes, read: Callable[[BinaryIO], Iterator[RecoveredMessage]]) -> Iterator[RecoveredMessage]:
-    """The messages of the records of a chunk."""
     stream = BytesIO(content)
     while stream.tell() < len(content):
         yield from read(stream)
@@ -437,7 +433,6 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
 
 
 def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:
-    """The rows of the table of messages, up to damage."""
     rows = 0
     try:
         for row in database.execute(_ROWS):

@@ -65,7 +65,6 @@ def chain(edges: Edges, target: str, source: str) -> FloatArray | None:
 
 
 def _matrix(transform: Any) -> FloatArray:
-    """(4, 4) of a geometry_msgs/Transform."""
     from scipy.spatial.transform import Rotation  # takes a while to load
 
     q, t = transform.rotation, transform.translation
@@ -147,7 +146,6 @@ def _choose(bag: BagFile, clouds: str, lidar_frame: str, wanted: str | None) -> 
 
 
 def _shared(first: str, second: str, separator: str = "/") -> int:
-    """Number of leading parts that two names share."""
     parts = (re.split(separator, name.lstrip("/")) for name in (first, second))
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
 

@@ -129,7 +129,6 @@ def _view(message: PointCloud2, wanted: Sequence[PointFieldMessage]) -> NDArray[
 
 
 def _flaw(field: PointFieldMessage, point_step: int) -> str | None:
-    """Why a field cannot be read."""
     if field.datatype not in _TYPES:
         return f"has the unknown datatype {field.datatype}; known are 1 to 8"
     if field.offset + np.dtype(_TYPES[field.datatype]).itemsize > point_step:

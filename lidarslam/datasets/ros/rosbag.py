@@ -243,7 +243,6 @@ def _others_left_out(topics: Sequence[Topic], chosen: Topic) -> str | None:
 
 
 def _has_packets(topic: Topic) -> bool:
-    """Whether a topic holds a sensor's packets that can be decoded."""
     is_lidar = "lidar" in topic.name.rpartition("/")[2]  # packets of the IMU have the same type
     return topic.message_type == VELODYNE_SCAN_TYPE or (topic.message_type in OUSTER_PACKET_TYPES and is_lidar)
 

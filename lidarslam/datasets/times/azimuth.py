@@ -116,7 +116,6 @@ def _is_turn(path: FloatArray) -> bool:
 
 
 def _nearest_turn(angle: float, reference: float) -> float:
-    """The angle plus whole turns that is nearest to the reference."""
     return float(angle + 360.0 * np.round((reference - angle) / 360.0))
 
 

@@ -77,7 +77,6 @@ class PointTimeModel:
         return middle is None or self._is_near(middle, self._zero(stamp))
 
     def _zero(self, stamp: float) -> Fraction:
-        """The field's reading at the stamp."""
         return Fraction(stamp) * Fraction(self.units_per_second) if self.reference == "absolute" else Fraction(0)
 
     def _is_near(self, reading: Fraction, other: Fraction) -> bool:
@@ -252,7 +251,6 @@ def _is_plausible(period_s: float) -> bool:
 
 
 def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str]) -> str | None:
-    """The unit in which the values read the same as the stamp."""
     if stamp is None or abs(stamp) <= 2 * CLOCK_LIMIT_S:  # ambiguous: relative times read about the same
         return None
     for unit in units:
@@ -264,7 +262,6 @@ def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str
 
 
 def _unit_by_span(spread: ValueSpread, period_s: float | None) -> str | None:
-    """The unit in which the values span a sweep."""
     spans = {unit: spread.span / per_second for unit, per_second in UNITS_PER_SECOND.items()}
     if period_s is not None and _is_plausible(period_s):
         for unit, span in spans.items():

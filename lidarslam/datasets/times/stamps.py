@@ -85,7 +85,6 @@ def stamps_from_names(stems: Sequence[str]) -> FloatArray | None:
 
 
 def _stamp_from_name(stem: str) -> float:
-    """NaN where it is none."""
     if _SECONDS_NAME.fullmatch(stem):
         return seconds if (seconds := float(stem)) < _LATEST_S else np.nan
     if _INTEGER_NAME.fullmatch(stem):
