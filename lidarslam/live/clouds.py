@@ -8,7 +8,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting import corrected, transform_of
 from lidarslam.datasets.point_table import RawCloud
-from lidarslam.datasets.ros import driver_messages
+from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.times.azimuth import PointTiming
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
@@ -119,8 +119,8 @@ class CloudDecoder:
         if self._is_settled:
             return
         unit, reference, defined_unit = self._config.time_unit, self._config.time_reference, None
-        if self._type in driver_messages.CUSTOM_MESSAGE_TYPES:
-            reference, defined_unit = "absolute", driver_messages.TIME_UNIT
+        if self._type in bag_message.CUSTOM_MESSAGE_TYPES:
+            reference, defined_unit = "absolute", bag_message.TIME_UNIT
         self._clouds.append((cloud, stamp))
         before = len(self._clouds) - 1
         period_s = (stamp - self._clouds[0][1]) / before if before else None

@@ -8,7 +8,7 @@ from rosbags.typesys.store import Typestore
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
 from lidarslam.core.tracking import Status
-from lidarslam.datasets.ros import driver_messages
+from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.pipeline.estimates import ScanEstimate
@@ -18,10 +18,10 @@ from lidarslam.pipeline.estimates import ScanEstimate
 def message_types() -> Typestore:
     """The definitions of all message types in use."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for message_type in driver_messages.CUSTOM_MESSAGE_TYPES:
+    for message_type in bag_message.CUSTOM_MESSAGE_TYPES:
         point_type = message_type.replace("CustomMsg", "CustomPoint")
-        store.register(get_types_from_msg(driver_messages.CUSTOM_POINT_DEFINITION, point_type))
-        store.register(get_types_from_msg(driver_messages.CUSTOM_MESSAGE_DEFINITION, message_type))
+        store.register(get_types_from_msg(bag_message.CUSTOM_POINT_DEFINITION, point_type))
+        store.register(get_types_from_msg(bag_message.CUSTOM_MESSAGE_DEFINITION, message_type))
     return store
 
 

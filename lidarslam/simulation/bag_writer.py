@@ -15,8 +15,12 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
-from lidarslam.datasets.ros.driver_messages import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
+from lidarslam.datasets.ros.bag_message import (
+    CUSTOM_MESSAGE_DEFINITION,
+    CUSTOM_POINT_DEFINITION,
+    TRANSFORMS_DEFINITION,
+    TRANSFORMS_TYPE,
+)
 from lidarslam.datasets.ros.made_messages import (
     POINT_CLOUD2_TYPE,
     header,

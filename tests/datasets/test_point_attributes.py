@@ -6,8 +6,7 @@ import pytest
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.datasets.point_table import raw_cloud, read_colours, read_intensities
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.ros.bag_message import decode_point_cloud2
-from lidarslam.datasets.ros.driver_messages import decode_custom_message
+from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
 STAMP_NS = 1_700_000_000_250_000_000
 XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4")]

@@ -5,8 +5,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.ros.bag_message import decode_point_cloud2
-from lidarslam.datasets.ros.driver_messages import decode_custom_message
+from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
 STAMP_NS = 1_700_000_000_250_000_000
 STAMP = STAMP_NS / 10**9

@@ -16,8 +16,14 @@ from lidarslam.core.text import count
 from lidarslam.datasets.imu_samples import summarise, usable_samples
 from lidarslam.datasets.recording import ImuSummary, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, BagMessage, StampSource, deserialize, find_stamp_source
-from lidarslam.datasets.ros.driver_messages import behind_header
+from lidarslam.datasets.ros.bag_message import (
+    TRANSFORMS_TYPE,
+    BagMessage,
+    StampSource,
+    behind_header,
+    deserialize,
+    find_stamp_source,
+)
 
 _TOPIC = "tf_static"
 

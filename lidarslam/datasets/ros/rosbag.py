@@ -9,25 +9,25 @@ from pathlib import Path
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.packet_recording import require
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
-from lidarslam.datasets.ros import driver_messages
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import BagImu
 from lidarslam.datasets.ros.bag_message import (
     CLOUD_TYPES,
+    CUSTOM_MESSAGE_TYPES,
     OUSTER_PACKET_TYPES,
+    TIME_UNIT,
     VELODYNE_SCAN_TYPE,
     BagMessage,
     StampSource,
     find_stamp_source,
 )
 from lidarslam.datasets.ros.ouster_bag import OusterBag
-from lidarslam.datasets.stored_recording import truth_beside
+from lidarslam.datasets.stored_recording import CloudRecording, truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
@@ -188,8 +188,8 @@ class BagRecording(CloudRecording):
     def _defined_time(self) -> tuple[TimeUnit, TimeReference, TimeUnit | None]:
         if self._topic.message_type == VELODYNE_SCAN_TYPE:
             return "ns", "absolute", None  # as they are decoded
-        if self._topic.message_type in driver_messages.CUSTOM_MESSAGE_TYPES:
-            return self._config.time_unit, "absolute", driver_messages.TIME_UNIT
+        if self._topic.message_type in CUSTOM_MESSAGE_TYPES:
+            return self._config.time_unit, "absolute", TIME_UNIT
         return super()._defined_time
 
     def _runs(self) -> Iterator[list[BagMessage]]:
