@@ -51,7 +51,7 @@ def _turned(points, angles):
     return np.column_stack([cosine * x - sine * y, sine * x + cosine * y, z])
 
 
-def record(folder: Path, every=1, stamps=True, rings=True, count=30, **options) -> Path:
+def record(folder: Path, every=1, stamps=True, rings=True, count=12, **options) -> Path:
     """A folder of scans without times."""
     folder.mkdir()
     for number in range(count):

@@ -239,21 +239,21 @@ def overwrite(file, begin, content):
     file.write_bytes(data)
 
 
-BIG = {"count": 8, "width": 1500}  # two of these scans fill a chunk
+BIG = {"count": 6, "width": 1500}  # two of these scans fill a chunk
 KINDS = [("bag", None), ("bag", Rosbag1Writer.CompressionFormat.LZ4), ("mcap", None)]
 
 
-@pytest.mark.parametrize("damaged", [0, 1, 3])
+@pytest.mark.parametrize("damaged", [0, 2])
 @pytest.mark.parametrize(("kind", "compression"), KINDS)
 def test_an_indexed_bag_is_read_up_to_a_damaged_chunk(write_drive, kind, compression, damaged):
     file, _, points = write_drive(kind, **BIG, **({} if compression is None else {"compression": (compression,)}))
     chunks = chunks_of(file)
-    assert len(chunks) == 4
+    assert len(chunks) == 3
     begin, length = chunks[damaged]
     if kind == "mcap":  # the checksum of the chunk, which rosbags leaves out
         overwrite(file, begin - 49 + 9 + 24, b"\1\2\3\4")
     overwrite(file, begin, bytes(length))
-    lost = list(range(2 * damaged, 8))
+    lost = list(range(2 * damaged, 6))
     if not damaged:  # nothing to learn from is left
         with pytest.raises(InputError, match="reading stopped after 0 messages"):
             list(open_recording(file).scans(faults=Faults()))
@@ -261,30 +261,30 @@ def test_an_indexed_bag_is_read_up_to_a_damaged_chunk(write_drive, kind, compres
     told = (
         f"1 damaged place in the bag was met, where reading its file stopped; the first: {file}: reading stopped after"
         f" {2 * damaged} messages of /points",
-        f"{len(lost)} scans are missing that the index lists; the first: its index lists 8 scans, it holds",
+        f"{len(lost)} scans are missing that the index lists; the first: its index lists 6 scans, it holds",
     )
     assert_all_but(open_recording(file), points, lost, *told)
     assert open_recording(file).describe().duration_s > 0.0
 
 
 def join(folder, file, later):
-    """Put another storage file of as many scans, 8, behind that of a folder."""
+    """Put another storage file of as many scans, 6, behind that of a folder."""
     shutil.copy(later, folder / f"later{file.suffix}")
     metadata = folder / "metadata.yaml"
     text = metadata.read_text()
     text = text.replace(f"- {file.name}\n", f"- {file.name}\n  - later{file.suffix}\n", 1)
-    metadata.write_text(text.replace("message_count: 8\n", "message_count: 16\n"))
+    metadata.write_text(text.replace("message_count: 6\n", "message_count: 12\n"))
 
 
 def test_damage_in_one_file_of_a_folder_costs_no_other(write_drive):
     file, folder, _ = write_drive("mcap", **BIG)
-    later, _, _ = write_drive("mcap", **BIG, name="later", first=8)
+    later, _, _ = write_drive("mcap", **BIG, name="later", first=6)
     begin, length = chunks_of(file)[1]
     overwrite(file, begin, bytes(length))
     join(folder, file, later)
     faults = Faults()
     scans = list(open_recording(folder).scans(faults=faults))
-    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(8, 16))]
+    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(6, 12))]
     assert faults.warnings()[0].startswith("1 damaged place in the bag was met")
 
 

@@ -1,6 +1,7 @@
 """Recordings whose axes are not x forward, z up: as set, and as the ground shows."""
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -66,10 +67,12 @@ def cast(
     return (ranges + noise)[seen, None] * directions[seen]
 
 
+@cache
 def street(count: int = 5) -> list[FloatArray]:
     return [cast(rays(), 0.8 * number, BOXES) for number in range(count)]
 
 
+@cache
 def corridor(count: int = 5) -> list[FloatArray]:
     """Two metres wide and 2.6 high."""
     walls = [((-40.0, 1.0, -2.0), (40.0, 1.2, 2.0)), ((-40.0, -1.2, -2.0), (40.0, -1.0, 2.0))]

@@ -61,7 +61,7 @@ def test_habits_of_drivers(values, unit, reference, offsets, tolerance):
     np.testing.assert_allclose(model.offsets(values, STAMP), offsets, rtol=0.0, atol=tolerance)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     unit=st.sampled_from(sorted(UNITS_PER_SECOND)),
     reference=st.sampled_from(["relative", "absolute"]),
@@ -80,7 +80,7 @@ def test_any_sweep_in_any_unit_is_recovered(unit, reference, sweep_s, where, sta
     np.testing.assert_allclose(model.offsets(values, stamp), offsets, rtol=0.0, atol=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(stamp_ns=st.integers(10**9, 4 * 10**18), dtype=st.sampled_from(["uint64", "float64"]))
 def test_offsets_lose_nothing_of_a_clock_reading(stamp_ns, dtype):
     stamp = stamp_ns / 10**9  # rounded to float64, as Scan.stamp is

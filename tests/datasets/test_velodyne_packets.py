@@ -1,6 +1,7 @@
 """Packets of a VLP-16, written here as its manual lays them out, of a simulated room."""
 
 import struct
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,7 @@ def packet(first_s):
     return data, first_s + since, laser, points
 
 
+@cache
 def packets(duration_s):
     """Of a recording that begins at azimuth zero."""
     return [packet(first_s) for first_s in np.arange(0.0, duration_s, 24 * SEQUENCE_S)]
@@ -86,8 +88,9 @@ def assert_as_measured(scan, sent):
     near = np.empty_like(scan.points)
     for ring in range(16):
         mine, theirs = scan.rings == ring, rings[lasers] == ring
-        nearest = np.abs(since[mine][:, np.newaxis] - times[theirs]).argmin(axis=1)
-        np.testing.assert_allclose(times[theirs][nearest], since[mine], atol=3e-6)
+        known = times[theirs]  # increase
+        nearest = np.searchsorted(0.5 * (known[1:] + known[:-1]), since[mine])
+        np.testing.assert_allclose(known[nearest], since[mine], atol=3e-6)
         near[mine] = points[theirs][nearest]
     begins = np.column_stack([np.zeros((len(scan), 2)), HEIGHTS_M[order[scan.rings]]])
     ranges, expected = (np.linalg.norm(points - begins, axis=1) for points in (scan.points, near))

@@ -309,6 +309,7 @@ class MyRig(Dataset):
 """
 
 
+@pytest.mark.slow
 def test_a_data_set_of_the_user(evalio_data: Path, tmp_path: Path) -> None:
     """A class of evalio's in a module that EVALIO_CUSTOM lists; points without times, no truth, no usable IMU."""
     folder = evalio_data / "my_rig" / "loop"

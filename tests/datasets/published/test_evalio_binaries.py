@@ -28,7 +28,7 @@ def test_helipr(tmp_path: Path, rng: np.random.Generator) -> None:
     folder = tmp_path / "helipr" / "kaist_05"
     (folder / "Ouster").mkdir(parents=True)
     clouds = []
-    for index in range(2):
+    for index in range(1):
         cloud = np.zeros(128 * 1024, OUSTER)
         for name in ("x", "y", "z", "intensity"):
             cloud[name] = rng.uniform(1.0, 90.0, len(cloud))
