@@ -87,13 +87,13 @@ def test_livox_custom_message(bag_kit, rng, package, clock_ns):
 
 
 @pytest.mark.parametrize("clock_ns", [0, -STAMP_NS])
-def test_livox_times_in_microseconds(bag_kit, rng, clock_ns):
+def test_livox_times_in_microseconds(ros2_kit, rng, clock_ns):
     points, offset_us = rng.uniform(1, 9, (200, 3)).astype("f4"), np.linspace(0, 99_000, 200).astype("i8")
     messages = [
-        (ns, bag_kit.livox(points, offset_us, np.zeros(200), ns, ns + clock_ns, "livox_ros_driver2"))
+        (ns, ros2_kit.livox(points, offset_us, np.zeros(200), ns, ns + clock_ns, "livox_ros_driver2"))
         for ns in stamps_ns(3)
     ]
-    path = bag_kit.write({"/livox/lidar": messages})
+    path = ros2_kit.write({"/livox/lidar": messages})
     recording = open_recording(path)
     for scan in recording.scans():
         np.testing.assert_allclose(scan.time_offsets, offset_us * 1e-6, rtol=0.0, atol=1e-9)
@@ -112,13 +112,13 @@ def test_without_type_definitions(bag_kit, make_sweep):
     assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
 
 
-def test_a_definition_that_cannot_be_parsed_does_not_matter(bag_kit, make_sweep):
+def test_a_definition_that_cannot_be_parsed_does_not_matter(ros2_kit, make_sweep):
     def add_nonsense(writer):
-        digest = {"rihs01" if bag_kit.ros2 else "md5sum": "0"}
+        digest = {"rihs01" if ros2_kit.ros2 else "md5sum": "0"}
         writer.add_connection("/odd", "odd_msgs/msg/Odd", msgdef="((( no definition", **digest)
 
     sweep = make_sweep("velodyne", STAMP_NS)
-    path = bag_kit.write({"/points": recorded(bag_kit, [sweep])}, extra=add_nonsense)
+    path = ros2_kit.write({"/points": recorded(ros2_kit, [sweep])}, extra=add_nonsense)
     assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
 
 
@@ -197,16 +197,16 @@ def test_description(drive):
     assert info.notes == ()
 
 
-def test_a_cloud_topic_that_ends_early_has_its_own_duration(bag_kit, make_sweep):
-    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(4)])
-    late = (STAMP_NS + 500 * 10**9, bag_kit.header(STAMP_NS))
-    info = open_recording(bag_kit.write({"/points": clouds, "/late": [late]})).describe()
+def test_a_cloud_topic_that_ends_early_has_its_own_duration(ros2_kit, make_sweep):
+    clouds = recorded(ros2_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(4)])
+    late = (STAMP_NS + 500 * 10**9, ros2_kit.header(STAMP_NS))
+    info = open_recording(ros2_kit.write({"/points": clouds, "/late": [late]})).describe()
     assert info.duration_s == pytest.approx(0.3, abs=1e-6)
 
 
-def test_several_cloud_topics_are_listed(bag_kit, make_sweep):
-    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(2)])
-    path = bag_kit.write({"/front": clouds, "/rear": clouds[:1], "/empty": "sensor_msgs/msg/PointCloud2"})
+def test_several_cloud_topics_are_listed(ros2_kit, make_sweep):
+    clouds = recorded(ros2_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(2)])
+    path = ros2_kit.write({"/front": clouds, "/rear": clouds[:1], "/empty": "sensor_msgs/msg/PointCloud2"})
     with pytest.raises(InputError) as caught:
         open_recording(path)
     assert "--topic" in str(caught.value)
@@ -215,9 +215,9 @@ def test_several_cloud_topics_are_listed(bag_kit, make_sweep):
     assert "/empty" not in str(caught.value)
 
 
-def test_a_topic_with_few_messages_beside_many_is_left_out(bag_kit, make_sweep):
-    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(20)])
-    path = bag_kit.write({"/points": clouds, "/map_points": clouds[-1:]})
+def test_a_topic_with_few_messages_beside_many_is_left_out(ros2_kit, make_sweep):
+    clouds = recorded(ros2_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(20)])
+    path = ros2_kit.write({"/points": clouds, "/map_points": clouds[-1:]})
     told = "/points is read; /map_points (1) with few messages left out: choose with --topic."
     recording = open_recording(path)
     assert (len(recording), recording.describe().topic) == (20, "/points")
@@ -228,9 +228,9 @@ def test_a_topic_with_few_messages_beside_many_is_left_out(bag_kit, make_sweep):
 
 
 @pytest.mark.parametrize("topic", ["/rear", "rear"])
-def test_topic_that_is_asked_for(bag_kit, make_sweep, topic):
+def test_topic_that_is_asked_for(ros2_kit, make_sweep, topic):
     front, rear = make_sweep("velodyne", STAMP_NS), make_sweep("ouster", STAMP_NS)
-    path = bag_kit.write({"/front": recorded(bag_kit, [front] * 2), "/rear": recorded(bag_kit, [rear])})
+    path = ros2_kit.write({"/front": recorded(ros2_kit, [front] * 2), "/rear": recorded(ros2_kit, [rear])})
     recording = open_recording(path, ReaderConfig(topic=topic))
     assert len(recording) == 1
     assert_scan(next(recording.scans()), rear, STAMP_NS)
@@ -256,14 +256,14 @@ def test_bag_without_clouds(bag_kit):
         open_recording(path)
 
 
-def test_bag_of_raw_packets(bag_kit):
+def test_bag_of_raw_packets(ros2_kit):
     def add_packets(writer):
-        digest = {"rihs01" if bag_kit.ros2 else "md5sum": "0"}
+        digest = {"rihs01" if ros2_kit.ros2 else "md5sum": "0"}
         connection = writer.add_connection("/packets", "pandar_msgs/msg/PandarScan", msgdef="uint8 a", **digest)
         writer.write(connection, STAMP_NS, b"\0\1\0\0\0")
 
     with pytest.raises(InputError, match="/packets holds raw packets"):
-        open_recording(bag_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_packets))
+        open_recording(ros2_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_packets))
 
 
 def test_empty_bag(bag_kit):
@@ -271,14 +271,14 @@ def test_empty_bag(bag_kit):
         open_recording(bag_kit.write({}))
 
 
-def test_stamps_that_do_not_increase_are_skipped_and_counted(bag_kit, make_sweep, caplog):
+def test_stamps_that_do_not_increase_are_skipped_and_counted(ros2_kit, make_sweep, caplog):
     sweep = make_sweep("velodyne", STAMP_NS)
     steps = [0, 1, 1, 3, 2, 4]
     clouds = [
-        (STAMP_NS + i * PERIOD_NS, bag_kit.cloud(sweep.records, STAMP_NS + step * PERIOD_NS))
+        (STAMP_NS + i * PERIOD_NS, ros2_kit.cloud(sweep.records, STAMP_NS + step * PERIOD_NS))
         for i, step in enumerate(steps)
     ]
-    recording = open_recording(bag_kit.write({"/points": clouds}))
+    recording = open_recording(ros2_kit.write({"/points": clouds}))
     assert len(recording) == 6
     with caplog.at_level(logging.WARNING):
         stamps = [scan.stamp for scan in recording.scans()]
@@ -292,10 +292,10 @@ def test_stamps_that_do_not_increase_are_skipped_and_counted(bag_kit, make_sweep
     assert faults.left_out == 0
 
 
-def test_a_stamp_that_was_never_set_is_skipped(bag_kit, make_sweep):
+def test_a_stamp_that_was_never_set_is_skipped(ros2_kit, make_sweep):
     sweep = make_sweep("velodyne", STAMP_NS)
-    clouds = [(STAMP_NS + i, bag_kit.cloud(sweep.records, ns)) for i, ns in enumerate([0, STAMP_NS])]
-    recording = open_recording(bag_kit.write({"/points": clouds}))
+    clouds = [(STAMP_NS + i, ros2_kit.cloud(sweep.records, ns)) for i, ns in enumerate([0, STAMP_NS])]
+    recording = open_recording(ros2_kit.write({"/points": clouds}))
     assert [scan.stamp for scan in recording.scans()] == [STAMP_NS / 10**9]
 
 
@@ -365,12 +365,12 @@ def test_index_that_promises_more_messages(make_bag_kit, make_sweep, caplog):
 
 
 @pytest.fixture
-def two_sensors(bag_kit, make_sweep):
+def two_sensors(ros2_kit, make_sweep):
     """A topic that a front and a rear LiDAR send to in turn."""
-    messages = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(8)])
+    messages = recorded(ros2_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(8)])
     for i, (_, cloud) in enumerate(messages):
         cloud.header.frame_id = "rear" if i % 2 else "front"
-    return bag_kit.write({"/points": messages})
+    return ros2_kit.write({"/points": messages})
 
 
 def test_two_sensors_on_one_topic_are_told_apart(two_sensors):
@@ -400,12 +400,12 @@ def test_two_sensors_on_one_topic_are_told_apart(two_sensors):
         ({"fields": []}, "need the fields x, y and z"),
     ],
 )
-def test_a_damaged_message_costs_no_other(bag_kit, make_sweep, changes, reason):
-    messages = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(5)])
+def test_a_damaged_message_costs_no_other(ros2_kit, make_sweep, changes, reason):
+    messages = recorded(ros2_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(5)])
     sweep = make_sweep("velodyne", STAMP_NS)
     for place in (0, 3):
-        messages[place] = (messages[place][0], bag_kit.cloud(sweep.records, stamps_ns(5)[place], **changes))
-    recording, faults = open_recording(bag_kit.write({"/points": messages})), Faults()
+        messages[place] = (messages[place][0], ros2_kit.cloud(sweep.records, stamps_ns(5)[place], **changes))
+    recording, faults = open_recording(ros2_kit.write({"/points": messages})), Faults()
     scans = list(recording.scans(faults=faults))
     assert [scan.stamp for scan in scans] == [stamps_ns(5)[i] / 10**9 for i in (1, 2, 4)]
     assert all(scan.time_offsets is not None for scan in scans)
@@ -418,19 +418,19 @@ def test_a_damaged_message_costs_no_other(bag_kit, make_sweep, changes, reason):
 
 
 @pytest.mark.parametrize("header_ns", [0, STAMP_NS])
-def test_stamps_that_are_all_alike_give_way_to_the_times_of_recording(bag_kit, make_sweep, header_ns):
+def test_stamps_that_are_all_alike_give_way_to_the_times_of_recording(ros2_kit, make_sweep, header_ns):
     sweep = make_sweep("velodyne", STAMP_NS)
-    clouds = [(ns, bag_kit.cloud(sweep.records, header_ns)) for ns in stamps_ns(5)]
-    recording = open_recording(bag_kit.write({"/points": clouds}))
+    clouds = [(ns, ros2_kit.cloud(sweep.records, header_ns)) for ns in stamps_ns(5)]
+    recording = open_recording(ros2_kit.write({"/points": clouds}))
     assert [scan.stamp for scan in recording.scans()] == [ns / 10**9 for ns in stamps_ns(5)]
     assert recording.warnings == ("The message headers have no stamps, so the times of recording are used.",)
 
 
 @pytest.mark.parametrize("spoil", [np.nan, -1e30, 1e5])
-def test_a_scan_whose_times_are_worth_nothing_keeps_its_points(bag_kit, make_sweep, spoil):
+def test_a_scan_whose_times_are_worth_nothing_keeps_its_points(ros2_kit, make_sweep, spoil):
     sweeps = [make_sweep("velodyne", ns) for ns in stamps_ns(4)]
     sweeps[2].records["time"] *= spoil
-    recording, faults = open_recording(bag_kit.write({"/points": recorded(bag_kit, sweeps)})), Faults()
+    recording, faults = open_recording(ros2_kit.write({"/points": recorded(ros2_kit, sweeps)})), Faults()
     scans = list(recording.scans(faults=faults))
     assert [scan.time_offsets is None for scan in scans] == [False, False, True, False]
     assert [len(scan) for scan in scans] == [200] * 4
