@@ -36,14 +36,7 @@ def usable_samples(
     """The samples in the order of time; None where there are none.
 
     Samples with a number that is not finite or the stamp of another one are left out, and those out of the sensor's
-    range; accelerations in g are converted. All this is noted, and missing samples too.
-
-    Args:
-        stamps: (N,) seconds, in any order.
-        angular_velocities: (N, 3) rad/s.
-        accelerations: (N, 3) specific force, m/s^2 or g.
-        T_lidar_imu: (4, 4) or None if unknown.
-        notes: known facts about the samples.
+    range; accelerations (N, 3) in g are converted to m/s^2. All this is noted, and missing samples too.
     """
     finite = np.isfinite(np.column_stack([stamps, angular_velocities, accelerations])).all(axis=1)
     finite_rows = np.flatnonzero(finite)

@@ -79,14 +79,7 @@ def transform_of(mounting: Mounting) -> FloatArray:
 
 
 def corrected(scan: Scan, T_upright_recorded: FloatArray, raised_deg: float, time_scale: float) -> Scan:
-    """A scan of the recorded axes in upright ones.
-
-    Args:
-        scan: as recorded.
-        T_upright_recorded: (4, 4), a rotation.
-        raised_deg: added to the elevations of all points, above the recorded x-y plane.
-        time_scale: factor on the points' times from the stamp.
-    """
+    """A scan in upright axes, its points raised above the recorded x-y plane, their times from the stamp scaled."""
     scan = scan.with_times_scaled(time_scale)
     if raised_deg:
         scan = replace(scan, points=correct_elevation(scan.points, raised_deg))
@@ -115,19 +108,12 @@ def written(mounting: Mounting) -> str:
 
 
 def correct_elevation(points: NDArray[np.floating], angle_deg: float) -> FloatArray:
-    """Raise the elevation of every point, seen from the sensor, by the same angle.
+    """Points (N, 3), invalid ones too, whose elevation as seen from the sensor is raised by the same angle.
 
     Each point p turns about the axis p x z_hat, which leaves its range and azimuth as they were. With rho the
     horizontal range the turn happens in the (rho, z) plane: rho' = rho cos a - z sin a, z' = rho sin a + z cos a,
     and x and y scale by rho' / rho. The rule, with 0.205 degrees for KITTI, is that of KISS-ICP (Vizzo et al.,
     RA-L 2023) and of CT-ICP and IMLS-SLAM before it.
-
-    Args:
-        points: (N, 3), LiDAR frame; may hold invalid points, which stay invalid.
-        angle_deg: upwards positive.
-
-    Returns:
-        (N, 3) float64, a new array.
     """
     corrected, angle = np.empty((len(points), 3)), math.radians(angle_deg)
     _raise(points, math.sin(angle), math.cos(angle), corrected)
@@ -155,13 +141,9 @@ UPRIGHT = Guess()
 
 
 class MountedRecording:
-    """A recording whose LiDAR frame is turned to x forward, z up: scans, ground truth and extrinsics.
+    """A recording whose LiDAR frame is turned to x forward, z up: scans, corrected too, ground truth and extrinsics.
 
-    Args:
-        recorded: in its own axes.
-        mounting: of these; auto: guessed from the first scans, when it is needed.
-        raised_deg: added to the elevations of all points, above the recorded x-y plane.
-        time_scale: factor on the points' times from their scan's stamp.
+    A mounting `auto` is guessed from the first scans, when it is needed.
     """
 
     def __init__(

@@ -54,13 +54,7 @@ class RawCloud:
 def raw_cloud(
     table: NDArray[np.void], time_field: str | None = None, fields: tuple[PointField, ...] | None = None
 ) -> RawCloud:
-    """The points of a table (...), copied out of it.
-
-    Args:
-        table: of any byte order.
-        time_field: field with the per-point time; None: found by its name.
-        fields: all that are stored; None: those of the table.
-    """
+    """The points of a table (...) of any byte order, copied; the time field is found by its name unless it is given."""
     names = scalar_fields(table)
     time_field, ring_field = find_time_field(names, time_field), _first(names, _RINGS)
     try:

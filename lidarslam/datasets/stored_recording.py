@@ -259,14 +259,9 @@ def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
 
 
 def find_sequence(source: Path, folder: Path, marker: str, wanted: str | None, noun: str = "sequence") -> Path:
-    """The sequence of a data set: the source, or one of those in a folder, which are known by a file or folder in them.
+    """The sequence of a data set: the source, or one of those in a folder, which are known by a path in them.
 
-    Args:
-        source: as given.
-        folder: with the sequences, where the source is no sequence.
-        marker: the path in a sequence by which it is known.
-        wanted: its name, or the last number in it; None: the only one.
-        noun: the name of a sequence in this data set.
+    Wanted is one by its name, or the last number in it; None: the only one.
     """
     if (source / marker).exists():
         name = source.resolve().name

@@ -62,11 +62,7 @@ class VelodyneCapture(PacketRecording):
 
 
 def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> _StampedCloud:
-    """The host's stamp in seconds that the times of the points count from, and the points (N,), of one or more packets.
-
-    Args:
-        packets: stamps in seconds, and data of 1206 bytes each.
-    """
+    """The host's stamp that the times of the points count from, and the points (N,), of packets with their stamps."""
     import velodyne_decoder
 
     decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config(max_range=_FARTHEST_M))

@@ -8,18 +8,17 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.published.kitti_files import read_calibration, read_sweep_timing
-from lidarslam.datasets.published.stamped_files import increasing, poses_of_rows, read_table
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, find_sequence, first_file
+from lidarslam.datasets.stored_recording import find_sequence, first_file
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
 from lidarslam.datasets.times.stamps import scan_rate
 
@@ -32,7 +31,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     return Kitti360Recording(drive.resolve(), config)
 
 
-class Kitti360Recording(FileRecording):
+class Kitti360Recording(BinRecording):
     """One drive."""
 
     reader = "kitti-360"
@@ -73,12 +72,10 @@ class Kitti360Recording(FileRecording):
             raise InputError(f"{folder}: expected 12 numbers in {to_lidar.name} and at `image_00:` in {to_pose.name}")
         return poses_of_rows(T_pose_cam) @ inverse(poses_of_rows(T_lidar_cam[0]))
 
-    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index])
-        offsets = None
-        if self._point_time is not None:
-            offsets = -self._sweep_s * np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2.0 * np.pi)
-        return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, intensities=rows[:, 3])
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray | None:  # noqa: ARG002
+        if self._point_time is None:
+            return None
+        return -self._sweep_s * np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2.0 * np.pi)
 
     @cached_property
     def _notes(self) -> tuple[str, ...]:

@@ -73,12 +73,9 @@ class SweepTiming:
 
 
 def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], config: ReaderConfig) -> SweepTiming:
-    """Read timestamps.txt, timestamps_start.txt and timestamps_end.txt of a `velodyne_points` folder.
+    """By timestamps.txt, timestamps_start.txt and timestamps_end.txt in a `velodyne_points` folder, else by the rate.
 
-    Args:
-        folder: where the three files are, if they are.
-        numbers: (N,) the scans' numbers, which are the rows of the files; a missing scan has a blank row.
-        config: its rate makes the stamps when timestamps.txt is missing or useless.
+    The numbers (N,) of the scans are the rows of the files; a missing scan has a blank row.
     """
     try:
         found = _rows(folder / "timestamps.txt", numbers)

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.published.kitti_files import read_tr
+from lidarslam.datasets.published.stamped_files import BinRecording
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, find_sequence, first_file
+from lidarslam.datasets.stored_recording import find_sequence, first_file
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
 
 
@@ -30,7 +29,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     return KittiOdometryRecording(find_sequence(source, source / "sequences", "velodyne", config.sequence), config)
 
 
-class KittiOdometryRecording(FileRecording):
+class KittiOdometryRecording(BinRecording):
     """One sequence."""
 
     reader = "kitti-odometry"
@@ -96,10 +95,6 @@ class KittiOdometryRecording(FileRecording):
         # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
         T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
         return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
-
-    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index])
-        return Scan.from_raw(rows[:, :3], self.stamps[index], intensities=rows[:, 3])
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:

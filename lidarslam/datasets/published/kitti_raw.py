@@ -13,16 +13,13 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.kitti_files import read_raw_calibration, read_sweep_timing
-from lidarslam.datasets.published.stamped_files import increasing
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
 from lidarslam.datasets.times.stamps import read_stamps
 
@@ -73,7 +70,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     return KittiRawRecording(source.resolve(), config)
 
 
-class KittiRawRecording(FileRecording):
+class KittiRawRecording(BinRecording):
     """One drive."""
 
     reader = "kitti-raw"
@@ -161,14 +158,11 @@ class KittiRawRecording(FileRecording):
             return None
         return usable_samples(oxts.stamps, oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
-    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index])
-        points = rows[:, :3]
-        offsets = None
-        if self._point_time is not None:
-            before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
-            offsets = offsets_from_azimuth(points, float(before_s), float(after_s))
-        return Scan.from_raw(points, self.stamps[index], offsets, intensities=rows[:, 3])
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray | None:
+        if self._point_time is None:
+            return None
+        before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
+        return offsets_from_azimuth(rows, float(before_s), float(after_s))
 
     @cached_property
     def _notes(self) -> tuple[str, ...]:

@@ -17,15 +17,12 @@ from typing_extensions import TypedDict
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.json_text import parse_json, read_json
-from lidarslam.core.scan import Scan
 from lidarslam.core.text import stays_below
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.scan_files import read_bin
-from lidarslam.datasets.published.stamped_files import increasing, poses_wxyz
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_wxyz
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import FileRecording, choose_sequence
+from lidarslam.datasets.stored_recording import choose_sequence
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 _LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
@@ -64,7 +61,7 @@ _SCENES, _SAMPLES, _POSES = (TypeAdapter(list[_Scene]), TypeAdapter(list[_Sample
 _SWEEP, _POSE = TypeAdapter(_Sweep), TypeAdapter(_Pose)
 
 
-class NuScenesRecording(FileRecording):
+class NuScenesRecording(BinRecording):
     """One scene, given by its name and token: its sweeps in the order of time, samples (key frames) among them."""
 
     reader = "nuscenes"
@@ -110,10 +107,6 @@ class NuScenesRecording(FileRecording):
             raise InputError(f"{self._version}: has no pose {missing!r}; download the tables again")
         found = [by_token[token] for token in tokens]
         return poses_wxyz(self._version, [one["translation"] for one in found], [one["rotation"] for one in found])
-
-    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index], len(self._stored))
-        return Scan.from_raw(rows[:, :3], self.stamps[index], rings=rows[:, 4], intensities=rows[:, 3])
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

@@ -3,15 +3,30 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
+from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.stored_recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
+
+
+class BinRecording(FileRecording):
+    """A folder of .bin scans: x, y, z, intensity and perhaps a ring. A reader adds the stamps, and times of points."""
+
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
+        rows = read_bin(self._files[index], len(self._stored))
+        rings = rows[:, 4] if len(self._stored) > 4 else None
+        return Scan.from_raw(rows[:, :3], self.stamps[index], self._offsets(rows, index), rings, rows[:, 3])
+
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray | None:  # noqa: ARG002
+        return None
 
 
 class StampedRecording(FileRecording):

@@ -56,12 +56,7 @@ _ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
 
 
 def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
-    """The content of compressed frames, one after the other; ValueError where they are cut short or hold too much.
-
-    Args:
-        data: the frames.
-        make: a decompressor of one frame, as of the standard library.
-    """
+    """The content of compressed frames, one after the other; ValueError where they are cut short or hold too much."""
     frames, size = [], 0
     while data:
         decompressor = make()
@@ -301,11 +296,7 @@ class RecoveredMessage(NamedTuple):
 
 
 def recover(path: Path, suffix: str, report: Report) -> Iterator[RecoveredMessage]:
-    """The messages of a `.bag`, `.mcap` or `.db3` file up to its first damaged place, which is reported in a line.
-
-    Raises:
-        ValueError, OSError, sqlite3.Error: it is no such file at all.
-    """
+    """The messages of a `.bag`, `.mcap` or `.db3` file up to its first damaged place, which is reported in a line."""
     if suffix == ".db3":
         yield from _database(path, report)
         return

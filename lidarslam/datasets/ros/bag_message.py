@@ -85,10 +85,7 @@ class BagMessage:
 def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
     """Time stamp in nanoseconds and frame of a serialised message that begins with a std_msgs/Header.
 
-    They stand at fixed places, so that the message need not be decoded.
-
-    Raises:
-        ValueError: it is no such message.
+    They stand at fixed places, so that the message need not be decoded; ValueError where it is no such message.
     """
     if not isinstance(raw, bytes):  # a database may hold numbers and text too
         raise ValueError("a message that is no bytes")
@@ -131,12 +128,7 @@ def behind_header(raw: bytes, ros2: bool, alignment: int) -> tuple[ByteOrder, in
 
 
 def decode_custom_message(raw: bytes, ros2: bool) -> RawCloud:
-    """Decode a serialised CustomMsg; the times are nanoseconds of a clock, `timebase + offset_time`, as uint64.
-
-    Args:
-        raw: the message as it stands in the bag.
-        ros2: serialised by ROS 2 (CDR: aligned, of either byte order) rather than by ROS 1 (packed).
-    """
+    """Decode a serialised CustomMsg; the times are nanoseconds of a clock, `timebase + offset_time`, as uint64."""
     try:
         # timebase, point_num, lidar_id, rsvd[3], number of points, points
         order, start = behind_header(raw, ros2, 8)
@@ -176,12 +168,7 @@ def _records(
 
 
 def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> RawCloud:
-    """Copy the points out of a message, organised or not, of either byte order, with any padding.
-
-    Args:
-        message: of ROS 1 or ROS 2.
-        time_field: field with the per-point time; None: found by its name.
-    """
+    """Copy the points out of a message, organised or not, of either byte order, with any padding."""
     fields = {field.name: field for field in message.fields}
     if missing := [axis for axis in "xyz" if axis not in fields]:
         raise InputError(f"points need the fields x, y and z, {missing[0]} is missing; they have: {', '.join(fields)}")

@@ -57,16 +57,7 @@ def odometry(
     covariance: FloatArray | None,
     velocity: FloatArray | None,
 ) -> Any:
-    """A nav_msgs/Odometry.
-
-    Args:
-        store: of the types.
-        fixed_header: its frame is the fixed one.
-        child_frame_id: the frame of the moving body.
-        T_fixed_child: (4, 4) the pose of the body.
-        covariance: (6, 6) of its error in the frame of the body, rotation first; None where it is unknown.
-        velocity: (6,) in the frame of the body, rotation first; None where it is unknown.
-    """
+    """A nav_msgs/Odometry; covariance (6, 6) and velocity (6,) are in the frame of the body, rotation first."""
     types = store.types
     ros_covariance = np.zeros(36) if covariance is None else in_fixed_frame(covariance, T_fixed_child).ravel()
     angular, linear = np.zeros((2, 3)) if velocity is None else velocity.reshape(2, 3)

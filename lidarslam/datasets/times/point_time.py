@@ -120,12 +120,9 @@ def learn_point_time(
     period_s: float | None = None,
     defined_unit: TimeUnit | None = None,
 ) -> LearnedTime:
-    """By the first cloud whose times are unambiguous, else by the last with any; see `infer_point_time`.
+    """By the first cloud, with its scan's stamp if known, whose times are unambiguous, else by the last with any.
 
     Stamps close to zero are ambiguous: times from 0 to 0.1 s are then relative as well as absolute.
-
-    Args:
-        clouds: with the scans' stamps in seconds, if known; read only as far as needed.
     """
     learned, failures = LearnedTime(), 0
     for cloud, stamp in islice(clouds, _CLOUDS_LOOKED_AT):

@@ -121,13 +121,9 @@ def increasing_rows(stamps: FloatArray) -> FloatArray:
 
 
 def mend_stamps(stamps: FloatArray, numbers: FloatArray) -> tuple[FloatArray, int]:
-    """Replace stamps (N,) that are missing or do not increase, on a line over the scans' numbers (N,).
+    """The stamps (N,), of which those that are missing or do not increase are replaced, and the number of these.
 
-    Returns:
-        The strictly increasing stamps and the number of replaced ones.
-
-    Raises:
-        ValueError: fewer than two stamps increase, so that there is no line.
+    They lie on a line over the scans' numbers (N,); ValueError where fewer than two stamps increase.
     """
     kept = increasing_rows(stamps)
     if kept.all():
