@@ -41,9 +41,9 @@ _OUSTER = {
 }
 
 
-def _relative(dtype, factor, first_s=0.0):
+def _relative(dtype, factor):
     def times(seconds, stamp_ns):
-        return np.round((seconds + first_s) * factor, 0 if factor > 1 else 9).astype(dtype)
+        return np.round(seconds * factor, 0 if factor > 1 else 9).astype(dtype)
 
     return times
 
@@ -62,25 +62,13 @@ _DRIVERS = {
         _layout(22, **_XYZ, intensity=("f4", 12), ring=("u2", 16), time=("f4", 18)),
         ("time", "s", "relative", _relative("f4", 1)),
     ),
-    "velodyne-stamped-at-the-end": (
-        _layout(32, **_XYZ, intensity=("f4", 16), ring=("u2", 20), time=("f4", 24)),
-        ("time", "s", "relative", _relative("f4", 1, first_s=-0.1)),
-    ),
     "ouster": (_layout(48, **_OUSTER), ("t", "ns", "relative", _relative("u4", 1e9))),
-    "ouster-early": (
-        _layout(48, **{**_OUSTER, "ring": ("u1", 26)}),
-        ("t", "ns", "relative", _relative("u4", 1e9)),
-    ),
     "hesai": (
         _layout(48, **_XYZ, intensity=("f4", 16), timestamp=("f8", 24), ring=("u2", 32)),
         ("timestamp", "s", "absolute", _epoch_seconds),
     ),
     "robosense": (
         _layout(26, **_XYZ, intensity=("f4", 12), ring=("u2", 16), timestamp=("f8", 18)),
-        ("timestamp", "s", "absolute", _epoch_seconds),
-    ),
-    "robosense-early": (
-        _layout(32, **_XYZ, intensity=("u1", 16), ring=("u2", 18), timestamp=("f8", 24)),
         ("timestamp", "s", "absolute", _epoch_seconds),
     ),
     "livox": (

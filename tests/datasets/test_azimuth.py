@@ -141,22 +141,6 @@ def test_times_that_cannot_be_had_are_a_warning(tmp_path):
     assert any("farther apart" in said for said in every_fifth.warnings)
 
 
-@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
-@pytest.mark.parametrize("order", ["firing", "rings"])
-def test_formats_with_rings_alone(formats, tmp_path, suffix, order):
-    folder = record(tmp_path / "raw", order=order)
-    for path in folder.glob("*.npy"):
-        table = np.load(path)
-        path.with_suffix(suffix).write_bytes(
-            formats.pcd(table) if suffix == ".pcd" else formats.ply(table, "binary_little_endian")
-        )
-        path.unlink()
-    recording = open_recording(folder)
-    _, times, _ = sweep(0.0, order=order)
-    np.testing.assert_allclose(next(recording.scans()).time_offsets, times - times.min(), atol=2 * PERIOD_S / COLUMNS)
-    assert recording.warnings == ()
-
-
 def test_ranges_that_contradict_one_another_are_not_taken_for_compensation():
     # As where little but other cars moves: as many ranges speak for it as against it.
     measured = [sweep_order(RawCloud(points)) for points, _, _ in (sweep(number * PERIOD_S) for number in range(30))]

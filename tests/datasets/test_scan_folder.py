@@ -393,18 +393,6 @@ def test_organised_and_plain_npy(tmp_path, rng):
         next(open_recording(tmp_path).scans())
 
 
-def test_damaged_files_are_named(formats, tmp_path, rng):
-    for suffix in ("npy", "bin", "pcd", "ply"):
-        folder = tmp_path / suffix
-        _write_numbered(formats, folder, rng, [f"{i}.{suffix}" for i in range(3)])
-        path = folder / f"1.{suffix}"
-        path.write_bytes(path.read_bytes()[:-15])
-        recording = open_recording(folder)
-        next(recording.scans())
-        with pytest.raises(InputError, match=rf"1\.{suffix}: "):
-            next(recording.scans(1))
-
-
 def test_ply_with_lists_before_the_vertices_is_refused(formats, tmp_path, rng):
     before = "element face 1\nproperty list uchar int vertex_indices\n"
     (tmp_path / "0.ply").write_bytes(formats.ply(_rich(rng), "ascii", before, b"3 0 1 2\n"))
