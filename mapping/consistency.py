@@ -98,15 +98,10 @@ class Surfels:
 def shift_profile(
     first: Surfels, second: Surfels, T_first_second: FloatArray, direction: FloatArray
 ) -> FloatArray | None:
-    """Votes (S,) for shifts of the second scan along a direction, every 0.1 m, with the shift of zero in the middle.
+    """Votes (S,) for shifts of the second scan along a unit direction (3,) of the first one's frame.
 
-    Args:
-        first, second: surfels of two scans, each in its frame.
-        T_first_second: (4, 4) relative pose under test.
-        direction: (3,) unit vector in the first's frame.
-
-    Returns:
-        None where too few surfels face along the direction.
+    Every 0.1 m around the relative pose (4, 4) under test, which is in the middle. None where too few surfels face
+    along the direction.
     """
     held, moved = first.facing(direction), second.moved(T_first_second).facing(direction)
     if min(len(held.points), len(moved.points)) < _FEWEST_FACING:
@@ -311,13 +306,7 @@ class ConsistencyCheck(Stateful):
         self._since_due, self._due, self._T_due = 0, 0, None
 
     def add(self, points: FloatArray, number: int, T_world_lidar: FloatArray) -> None:
-        """Add the next scan of the map; some are kept and paired with the ones before.
-
-        Args:
-            points: (N, 3) in the LiDAR frame at the stamp, compensated.
-            number: of the scan in its run.
-            T_world_lidar: (4, 4), its pose.
-        """
+        """Add the next scan of the map, compensated points (N, 3); some are kept and paired with the ones before."""
         self._since_due += 1
         self._latest = _Candidate(number, T_world_lidar, points)
         if self._T_due is not None and self._since_due < _EVERY_SCANS:
@@ -366,11 +355,9 @@ def _tests(first: _Kept, second: _Kept) -> list[PairTest]:
 
 
 def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArray:
-    """The votes (S,) for shifts below half the period of the scene, and none for others.
+    """The votes (S,) for shifts below half the period of the scene, as another scan's votes on itself show it.
 
-    Args:
-        profile: votes of a scan on another.
-        of_itself: votes of the other on itself, periodic where surfaces stand at even distances, as columns do.
+    Those are periodic where surfaces stand at even distances, as columns do.
     """
     if of_itself is None:
         return profile

@@ -91,14 +91,9 @@ def combined(biases: Sequence[ElevationBias]) -> ElevationBias | None:
 
 
 def estimate_bias(scans: Sequence[PlacedPoints], edge_m: float) -> ElevationBias | None:
-    """The bias of a stretch, of elevations above the x-y plane.
+    """The bias of a stretch, of elevations above the x-y plane; None where too few surfaces were seen by several scans.
 
-    Args:
-        scans: with poses that are nearly right.
-        edge_m: of the cubes in which points are taken as one plane.
-
-    Returns:
-        None where too few surfaces were seen by several scans.
+    The poses of the scans are nearly right; points within a cube of this edge are taken as one plane.
     """
     points = np.concatenate([scan.points for scan in scans])
     number = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])

@@ -80,13 +80,9 @@ def smoothed_start(
     """Motions of the first scans, by stamp; empty where registration in order suffices.
 
     The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
-    scans are registered in order; from the last of them back, with the motions of the latest known, to a new map; and
-    the motions of the first half are those that this map shows. None is known where that loses track.
-
-    Args:
-        scans: of which the first are taken.
-        config: of the mapping.
-        inertial: a new one, whose samples are used in both directions of time.
+    scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
+    and the motions of the first half are those that this map shows. None is known where that loses track. A new
+    IMU's samples are used in both directions of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
     taken, rest = [], iter(scans)

@@ -20,12 +20,7 @@ _VIEW_SCALE, _VIEW_CELLS, _OVERLAP_CELLS = 4.0, 800, 30
 
 
 class FixedMap:
-    """Points with normals, which are never changed.
-
-    Args:
-        points: (M, 3) in the frame of the map.
-        normals: (M, 3) unit, towards the side that was seen.
-    """
+    """Points (M, 3) with unit normals (M, 3) towards the side that was seen, which are never changed."""
 
     def __init__(self, points: FloatArray, normals: FloatArray) -> None:
         self._points = points
@@ -84,15 +79,7 @@ def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bo
 
 
 class Regions:
-    """Regions of the map as surfels.
-
-    Args:
-        fixed_map: the map.
-        cell_m: edge of the surfel cells.
-        reach_m: distance around a position that a region must cover.
-        spare_m: margin beyond that, so that a region serves other positions too.
-        kept: number of regions that are kept.
-    """
+    """Regions of the map as surfels: all within reach of a position, and a margin; the latest few are kept."""
 
     def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:
         self._map, self.cell_m, self._reach_m, self._spare_m, self._kept = fixed_map, cell_m, reach_m, spare_m, kept

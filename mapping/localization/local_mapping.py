@@ -40,11 +40,12 @@ class KeptScan:
 
 
 class KeptScans:
-    """A bounded number of scans, apart from one another, and the latest."""
+    """A bounded number of scans, apart from one another, and the latest; searched once there is one."""
+
+    latest: KeptScan
 
     def __init__(self) -> None:
         self._apart: list[KeptScan] = []
-        self.latest: KeptScan | None = None
 
     def add(self, scan: KeptScan) -> None:
         """Add the next scan that was registered in the local frame."""
@@ -54,8 +55,6 @@ class KeptScans:
 
     def chosen(self, count: int) -> Sequence[KeptScan]:
         """The latest scan, and at most `count` others before it, backwards in time, evenly spread."""
-        if self.latest is None:
-            return []
         others = [scan for scan in reversed(self._apart) if scan is not self.latest]
         if not others:
             return [self.latest]
@@ -64,8 +63,6 @@ class KeptScans:
 
     def points_around(self, reach_m: float) -> FloatArray:
         """The points (N, 3) of all scans within reach of the latest, in its LiDAR frame."""
-        if self.latest is None:
-            return np.empty((0, 3))
         T_lidar_local, parts = inverse(self.latest.T_local_lidar), [self.latest.points]
         for scan in self._apart:
             T = T_lidar_local @ scan.T_local_lidar
@@ -77,12 +74,9 @@ class KeptScans:
 
 
 class LocalMapping:
-    """Maps scans in a frame of its own, and keeps some to search with.
+    """Maps scans, numbered from `first`, in a frame of its own, and keeps some to search with.
 
-    Args:
-        config: of the mapping.
-        T_map_local: (4, 4) where that frame is supposed in the finished map; None: anywhere.
-        first: number of the first scan in the recording.
+    `T_map_local` (4, 4) is where that frame is supposed in the finished map; None: anywhere.
     """
 
     def __init__(self, config: MappingConfig, T_map_local: FloatArray | None, first: int = 0) -> None:
@@ -114,14 +108,13 @@ class LocalMapping:
 
     def followed_within(self, ranges: float, before: int) -> list[int]:
         """Numbers of the scans before one, tracked without a break from there, up to a distance in median ranges."""
-        latest = self.kept.latest
         numbers = [number for number in self._followed if number < before]
-        if latest is None or not numbers:
+        if not numbers:
             return []
         positions = np.array([self.poses[number][:3, 3] for number in [*numbers, before]])
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         ways = np.cumsum(steps[::-1])[::-1]
-        return [number for number, way in zip(numbers, ways, strict=True) if way < ranges * latest.range_m]
+        return [number for number, way in zip(numbers, ways, strict=True) if way < ranges * self.kept.latest.range_m]
 
     @property
     def up(self) -> FloatArray:

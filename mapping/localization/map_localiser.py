@@ -44,13 +44,7 @@ class Localisation:
 
 
 class MapLocaliser(Stateful):
-    """Registers scans to a finished map. It cannot be saved and restored.
-
-    Args:
-        config: of the mapping.
-        fixed_map: the finished map.
-        guess: rough x, y and heading of the first scan; None: anywhere.
-    """
+    """Registers scans to a finished map, near a rough x, y and heading or anywhere. It cannot be saved."""
 
     def __init__(
         self, config: MappingConfig, fixed_map: FixedMap, guess: tuple[float, float, float] | None = None
@@ -79,15 +73,17 @@ class MapLocaliser(Stateful):
         """Register the next scan."""
         sampled = self._sampler.sample(scan)
         # An IMU predicts a pose in the map.
-        own = None if self._local is None else self._local.add(sampled, replace(prior, inertial=None))
+        local = self._local
+        own = None if local is None else local.add(sampled, replace(prior, inertial=None))
         if self._tracker is not None and self._last is not None:
             mapped = self._track(sampled, prior, self._tracker, self._last)
-            if mapped.status is Status.LOST and own is not None:  # the place was not confirmed
-                self._revoke()
-                mapped = self._dead_reckoned(own, f"the place that was found is not confirmed: {mapped.message}")
+            if mapped.status is Status.LOST and local is not None and own is not None:  # the place was not confirmed
+                self._revoke(local)
+                mapped = _dead_reckoned(local, own, f"the place that was found is not confirmed: {mapped.message}")
         else:
+            assert local is not None
             assert own is not None
-            mapped = self._look(sampled, own)
+            mapped = self._look(sampled, local, own)
         self._last = mapped.state
         self._count += 1
         return mapped
@@ -128,13 +124,11 @@ class MapLocaliser(Stateful):
         self._guess = None
         logger.info("found at scan %d, confirmed at scan %d", pending.scan, self._count)
 
-    def _revoke(self) -> None:
+    def _revoke(self, local: LocalMapping) -> None:
         """Give up a place that later scans contradict."""
-        local, pending = self._local, self._pending
-        assert local is not None
-        assert pending is not None
+        assert self._pending is not None
         T_map_local = np.eye(4) if local.T_map_local is None else local.T_map_local
-        for number in range(pending[0].scan, self._count):
+        for number in range(self._pending[0].scan, self._count):
             self.corrections[number] = T_map_local @ local.poses[number]
             self.revoked.append(number)
         self._tracker = self._pending = None
@@ -147,22 +141,18 @@ class MapLocaliser(Stateful):
             self._local = LocalMapping(self._config, prediction.T_world_lidar, self._count + 1)
         return lost
 
-    def _look(self, scan: SampledScan, own: MappedScan) -> MappedScan:
+    def _look(self, scan: SampledScan, local: LocalMapping, own: MappedScan) -> MappedScan:
         """Search for the place of the latest scans, if a search is due."""
-        found = self._searched(own)
+        found = None if own.status is Status.LOST else self._searched(local, own)
         if found is None:
-            return self._dead_reckoned(own, "the place is searched for")
+            return _dead_reckoned(local, own, "the place is searched for")
         if isinstance(found, str):
             self.refusals.append((self._count, found))
             logger.info("scan %d: not found: %s", self._count, found)
-            return self._dead_reckoned(own, f"not found: {found}")
+            return _dead_reckoned(local, own, f"not found: {found}")
         return self._begin(scan, own, found)
 
-    def _searched(self, own: MappedScan) -> Found | None:
-        local = self._local
-        assert local is not None
-        if own.status is Status.LOST:
-            return None
+    def _searched(self, local: LocalMapping, own: MappedScan) -> Found | None:
         nearby = None
         if local.searches_nearby:
             if self._guess is not None:
@@ -177,8 +167,6 @@ class MapLocaliser(Stateful):
 
     def _begin(self, scan: SampledScan, own: MappedScan, place: Place) -> MappedScan:
         """Track from a place on."""
-        local = self._local
-        assert local is not None
         T_map_local = place.T_map_lidar @ inverse(own.state.T_world_lidar)
         self._pending = Localisation(self._count, -1, place.fits), T_map_local
         self._tracker = Tracker(self._config)
@@ -192,14 +180,6 @@ class MapLocaliser(Stateful):
             place.registration.degeneracy.names, place.registration.iterations, is_connected=False,
         )  # fmt: skip
 
-    def _dead_reckoned(self, own: MappedScan, reason: str) -> MappedScan:
-        """A scan at its pose in the local map, placed where that is supposed."""
-        assert self._local is not None
-        T_map_local = self._local.T_map_local
-        T_map_lidar = own.state.T_world_lidar if T_map_local is None else T_map_local @ own.state.T_world_lidar
-        state = replace(own.state, T_world_lidar=T_map_lidar, covariance=LOST_MOTION)
-        return MappedScan(state, state.T_world_lidar, False, Status.LOST, reason, None, is_connected=False)
-
     def _regions_for(self, scan: SampledScan) -> Regions:
         """The drawn region of the map; a new one where the scale of the scene has changed."""
         cell_m = self._map.cell_m(scan.cell_m)
@@ -207,3 +187,10 @@ class MapLocaliser(Stateful):
             reach_m = min(_RANGES * scan.range_m, self._config.radius_m)
             self._regions = Regions(self._map, cell_m, reach_m, _SPARE * reach_m)
         return self._regions
+
+
+def _dead_reckoned(local: LocalMapping, own: MappedScan, reason: str) -> MappedScan:
+    """A scan at its pose in the local map, placed where that is supposed."""
+    T_map_lidar = own.state.T_world_lidar if local.T_map_local is None else local.T_map_local @ own.state.T_world_lidar
+    state = replace(own.state, T_world_lidar=T_map_lidar, covariance=LOST_MOTION)
+    return MappedScan(state, T_map_lidar, False, Status.LOST, reason, None, is_connected=False)

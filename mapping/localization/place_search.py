@@ -45,7 +45,6 @@ _LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
 # 0.8 a wrong place in a row of equal houses was taken.
 _RIVAL = 0.6
 _SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
-_NO_SCAN = "no scan could be registered to the scans before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +96,7 @@ Found: TypeAlias = Place | str
 
 
 class PlaceSearch:
-    """Searches a map.
-
-    Args:
-        fixed_map: the map.
-        max_range_m: farther points are left out.
-    """
+    """Searches a map, with the points of scans within a range."""
 
     def __init__(self, fixed_map: FixedMap, max_range_m: float) -> None:
         self._map = fixed_map
@@ -112,8 +106,6 @@ class PlaceSearch:
     def anywhere(self, scans: KeptScans, up: FloatArray) -> Found:
         """Search the whole map with the scans kept so far; `up` (3,) is the vertical of their local frame."""
         latest = scans.latest
-        if latest is None:
-            return _NO_SCAN
         cell_m, reach_m = self._map.cell_m(latest.cell_m), _RANGES * latest.range_m
         points = scans.points_around(reach_m)
         R_level_lidar = levelling(up) @ latest.T_local_lidar[:3, :3]
@@ -126,10 +118,9 @@ class PlaceSearch:
     def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Found:
         """The one of the places near poses (4, 4) of the latest scan where all scans fit, if no other fits as well."""
         kept = scans.chosen(_OTHERS)
-        if not kept or not starts:
+        if not starts:
             return "there is nothing upright to search with"
-        reach_m = self._reach_m(kept[0])
-        cell_m = self._map.cell_m(kept[0].cell_m)
+        reach_m, cell_m = self._reach_m(kept[0]), self._map.cell_m(kept[0].cell_m)
         if self._regions is None or self._regions.cell_m != cell_m:
             self._regions = Regions(self._map, cell_m, reach_m, _SPARE * reach_m, _REGIONS)
         regions = self._regions
@@ -158,11 +149,9 @@ class PlaceSearch:
                 places.append(place)
         return sorted(places, key=lambda place: -place.quality)
 
-    def guessed(self, scans: KeptScans, up: FloatArray, x: float, y: float, yaw: float) -> FloatArray | None:
+    def guessed(self, scans: KeptScans, up: FloatArray, x: float, y: float, yaw: float) -> FloatArray:
         """`T_map_local` (4, 4) for a rough position and heading of the local frame, at the height that fits."""
         latest = scans.latest
-        if latest is None:
-            return None
         reach_m, R_level_local = _RANGES * latest.range_m, levelling(up)
         points = transform_points(latest.T_local_lidar, scans.points_around(reach_m)) @ R_level_local.T
         view = min(self._map.views(self._map.cell_m(latest.cell_m)), key=lambda view: view.distance_m(x, y))
@@ -172,10 +161,7 @@ class PlaceSearch:
     def around(self, scans: KeptScans, T_map_lidar: FloatArray) -> Found:
         """Search near a pose (4, 4) of the latest scan."""
         latest = scans.latest
-        if latest is None:
-            return _NO_SCAN
-        cell_m = self._map.cell_m(latest.cell_m)
-        reach_m = self._reach_m(latest)
+        cell_m, reach_m = self._map.cell_m(latest.cell_m), self._reach_m(latest)
         region = self._map.region(T_map_lidar[:3, 3], 1.5 * reach_m, cell_m)
         up, starts = region.vertical(), []
         for yaw_deg in (0.0, _NEAR_YAW_DEG, -_NEAR_YAW_DEG):

@@ -180,13 +180,9 @@ def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig)
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(MotionState):
     """Predicted state of a scan before its registration."""
 
-    stamp: float  # seconds
-    T_world_lidar: FloatArray  # (4, 4) at the stamp
-    velocity: FloatArray  # (6,) during the sweep, in the LiDAR frame, rotation first
-    covariance: FloatArray  # (12, 12) of the errors of pose and velocity, as in `MotionState`
     contradicted: bool = False  # whether the odometry's motion fails the innovation test against the last velocity
     is_inertial: bool = False  # whether an IMU has a part in it
 
@@ -232,17 +228,9 @@ def predict(
 ) -> Prediction:  # fmt: skip
     """Propagate the last state to a stamp, and update it with the odometry's measurements.
 
-    The velocity is constant during a sweep and changes between two sweeps by white noise of the acceleration. Pose and
-    velocity are correlated: a velocity inconsistent with the motion between the poses is improbable.
-
-    Args:
-        last: state of the last scan.
-        stamp: of the next scan.
-        prior: the odometry's measurements.
-        process_noise: of the acceleration.
-        config: standard deviations of an odometry without a covariance.
-        seen_from_s: time from the first point of the next sweep to its stamp.
-        odometry_noise: scale of the odometry's covariance.
+    The velocity is constant during a sweep and changes between two sweeps by white noise of the acceleration. Pose
+    and velocity are correlated: a velocity inconsistent with the motion between the poses is improbable. The next
+    sweep begins `seen_from_s` before its stamp.
     """
     interval_s = stamp - last.stamp
     joint, contradicted = _Joint.propagated(last, interval_s, seen_from_s, process_noise), False
@@ -263,7 +251,9 @@ def predict(
         state = state.fused(prior.inertial)
     state.covariance[:6, :6] += np.diag(LEAST_SIGMA**2)
     is_inertial = prior.inertial is not None
-    return Prediction(stamp, state.T_world_lidar, state.velocity, state.covariance, contradicted, is_inertial)
+    return Prediction(
+        stamp, state.T_world_lidar, state.velocity, state.covariance, contradicted=contradicted, is_inertial=is_inertial
+    )
 
 
 @dataclass(frozen=True, eq=False)

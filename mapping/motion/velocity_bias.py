@@ -25,9 +25,7 @@ _COVERED = 0.8
 def velocity_error(last: MotionState, state: MotionState, share: float) -> FloatArray:
     """Velocity (6,) of the motion between two sweeps' poses, less their mean velocity.
 
-    Args:
-        last, state: of the two.
-        share: of the interval, in which the sensor moves with the first sweep's velocity.
+    In this share of the interval the sensor moves with the first sweep's velocity.
     """
     motion = body_velocity(inverse(last.T_world_lidar) @ state.T_world_lidar, state.stamp - last.stamp)
     return np.asarray(motion - (share * last.velocity + (1.0 - share) * state.velocity), dtype=np.float64)
@@ -40,12 +38,9 @@ class VelocityBias:
     correction: Annotated[FloatArray, Shape(6)] = field(default_factory=lambda: np.zeros(6))  # rotation first
 
     def updated(self, last: MotionState, state: MotionState, seen_from_s: float) -> "VelocityBias":
-        """The bias after another sweep; none where a gap lies between the sweeps.
+        """The bias after another sweep, as it was estimated, and the corrected one before; none after a gap.
 
-        Args:
-            last: state of the sweep before, corrected.
-            state: as it was estimated.
-            seen_from_s: time from the first point of the sweep to its stamp.
+        The sweep begins `seen_from_s` before its stamp.
         """
         interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
         if not covered_s > _COVERED * interval_s > 0.0:

@@ -81,15 +81,11 @@ def gauss_newton(
 def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray, lever_m: float) -> Degeneracy:
     """Find the directions of motion that a set of correspondences does not constrain.
 
-    The eigenvalues of the mean of `J^T J`, rotations made comparable by `lever_m`, lie between 0 and about 1, whatever
-    the number, unit or noise of the residuals. Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State
-    Estimation Problems" (ICRA 2016), take the eigenvalues of the sum, whose threshold depends on all three.
-
-    Args:
-        jacobian: (M, 6) of the residuals, rotation first, in the LiDAR frame.
-        weights: (M,).
-        tilt: (M,) standard deviation of each normal, radians.
-        lever_m: root mean square range of the points.
+    The Jacobian (M, 6) of the residuals, rotation first, is in the LiDAR frame; weights (M,); the tilt (M,) is the
+    standard deviation of each normal, radians; the lever the root mean square range. The eigenvalues of the mean of
+    `J^T J`, rotations made comparable by the lever, lie between 0 and about 1, whatever the number, unit or noise of
+    the residuals. Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems" (ICRA
+    2016), take the eigenvalues of the sum, whose threshold depends on all three.
     """
     constraint = (jacobian * weights[:, None]).T @ jacobian
     return degenerate_directions(constraint, float(weights @ tilt**2), float(weights.sum()), lever_m)

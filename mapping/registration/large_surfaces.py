@@ -26,14 +26,9 @@ def inflation_of_small(
 ) -> FloatArray | None:
     """Factors (N,) on the standard deviations of the points' surfaces, larger for small ones; None where these agree.
 
-    Relative to a crowd that walks along, a sensor is at rest; only walls, floor and ceiling differ. In a bare corridor
-    or a stairwell, large surfaces do not suffice for a pose, and small ones count in full.
-
-    Args:
-        points: (N, 3) in the LiDAR frame.
-        T_world_lidar: (4, 4) registered to all surfaces with equal weight.
-        surfaces: of the points.
-        local_map: map with these surfaces.
+    Relative to a crowd that walks along, a sensor is at rest; only walls, floor and ceiling differ. In a bare
+    corridor or a stairwell, large surfaces do not suffice for a pose, and small ones count in full. The points (N,
+    3) of the LiDAR frame were registered at the pose (4, 4) to all surfaces with equal weight.
     """
     matched = np.flatnonzero(surfaces.counts)
     world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]

@@ -64,10 +64,7 @@ class LocalMap(Stateful, ABC):
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> Matcher:
         """Finds correspondences of the points of a sweep; valid until the map changes.
 
-        Args:
-            sweep: which.
-            level: finest resolution that is used, for points that may be off by more than a cell.
-            is_inertial: whether an IMU predicts the pose.
+        The level is the finest resolution that is used, for points that may be off by more than a cell.
         """
 
     @abstractmethod
@@ -123,12 +120,8 @@ class LocalMap(Stateful, ABC):
     ) -> NDArray[np.bool_]:
         """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), extend over the coarsest cell.
 
-        Args:
-            points: in the world.
-            normals: unit.
-            sensor: position in the world.
-            cosine: least, between the normals.
-            thickness: largest standard deviation along the normal, as a share of the cell.
+        There, the normal has at least this cosine with theirs, and the standard deviation along it is at most this
+        share of the cell.
         """
         coarse, spread_m = self.coarse_planes(points, sensor)
         is_thin = spread_m < thickness * self.cell_m * LEVELS[-1]

@@ -83,15 +83,10 @@ def register(
     sweep: Sweep, prediction: Prediction, local_map: LocalMap, with_velocity: bool, coarse_first: bool = True,
     patient: bool = False,
 ) -> Registration | None:  # fmt: skip
-    """Register a sweep to the map; None where it has too few correspondences.
+    """Register the keypoints of a sweep to the map; None where they have too few correspondences.
 
-    Args:
-        sweep: the keypoints.
-        prediction: start, and prior with its covariance.
-        local_map: local map.
-        with_velocity: whether to estimate the velocity during the sweep.
-        coarse_first: whether to begin on coarse cells, for predictions that may be off by more than half a cell.
-        patient: whether to allow more iterations.
+    The prediction is the start, and a prior with its covariance. Begins on coarse cells for predictions that may be
+    off by more than half a cell; with more iterations if patient.
     """
     T_world_lidar, velocity, iterations = prediction.T_world_lidar, prediction.velocity, 0
     times = sweep.times if with_velocity and sweep.times is not None else np.empty(0)

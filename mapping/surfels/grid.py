@@ -77,13 +77,9 @@ class SurfelGrid(Stateful):
     def insert(
         self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]], weight: float = 1.0
     ) -> None:
-        """Insert points (N, 3) of the world.
+        """Insert points (N, 3) of the world, each of which counts as `weight`.
 
-        Args:
-            points: in the world.
-            elevations: (N,) their angles above the sensor's equator, radians.
-            views: (N, 3) unit directions from the points to the sensor.
-            weight: number of points that each of them counts as.
+        They have elevations (N,) above the sensor's equator, radians, and unit views (N, 3) towards the sensor.
         """
         if not len(points):
             return

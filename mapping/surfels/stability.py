@@ -24,13 +24,9 @@ _RIDGE = 1e-4
 
 
 def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: float, most: int) -> NDArray[np.intp]:
-    """Indices of the points (N, 3) of a scan with by far the most leverage on its registration, ascending.
+    """Indices of the at most `most` points (N, 3) with by far the most leverage on a scan's registration, ascending.
 
-    Args:
-        points: in the LiDAR frame.
-        elevations: (N,) above the sensor's equator, radians.
-        cell_m: of the map.
-        most: largest number of indices.
+    The points, in the LiDAR frame, have elevations (N,) above the sensor's equator, radians.
     """
     points, origin = np.ascontiguousarray(points), np.zeros(3)
     views = np.empty((len(points), 3), dtype=np.float32)

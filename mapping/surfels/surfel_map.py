@@ -32,16 +32,11 @@ _UNEVEN = np.array([0.46, 0.29, 0.84])
 
 
 class SurfelMatcher(Matcher):
-    """Surfels of the cells that points lie in.
+    """Surfels of the cells that N points lie in, of grids that do not change meanwhile, the finest first.
 
     A point that has stayed in its cell keeps its surface: once an iteration moves by a small part of a cell, few are
-    looked up again. The grids must not change meanwhile.
-
-    Args:
-        grids: the finest first; each cell of one lies within a cell of the next.
-        count: N.
-        keeps_finest: whether planes of uncertain normals are kept. In a young map coarser ones are of a few strokes;
-            without an IMU, whose prediction they would contradict, they still hold a fast start.
+    looked up again. With `keeps_finest`, planes of uncertain normals are kept: in a young map coarser ones are of a
+    few strokes. Without an IMU, whose prediction they would contradict, they still hold a fast start.
     """
 
     def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
@@ -112,13 +107,7 @@ class SurfelMap(LocalMap):
         self.insert(points, scan.elevations, sensor)
 
     def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
-        """Insert a scan.
-
-        Args:
-            points: (N, 3) in the world.
-            elevations: (N,) their angles above the sensor's equator, radians.
-            sensor: (3,) position in the world.
-        """
+        """Insert a scan: points (N, 3) of the world with elevations (N,), radians, seen from a position (3,)."""
         views = np.empty((len(points), 3), dtype=np.float32)
         write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
         self.insert_seen(points, elevations, views)

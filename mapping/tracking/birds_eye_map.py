@@ -57,14 +57,10 @@ class BirdsEyeMap:
     def find(
         self, points: FloatArray, T_world_lidar: FloatArray, reach_m: float, most: int, peaks_per_yaw: int = _PEAKS
     ) -> Steps[FloatArray]:
-        """Poses (K, 4, 4) of a scan by descending correlation, with the roll and pitch of a given pose.
+        """At most so many poses (K, 4, 4) of a scan by descending correlation, with the roll and pitch of a given pose.
 
-        Args:
-            points: (N, 3) of the scan, compensated.
-            T_world_lidar: (4, 4), of which only the rotation counts.
-            reach_m: radius of the scan's image.
-            most: largest K.
-            peaks_per_yaw: correlation peaks that are kept for each yaw; more where places are similar.
+        Of the scan's compensated points (N, 3), those within reach are drawn. More peaks per yaw are for similar
+        places.
         """
         level = points @ (self.R_level_world @ T_world_lidar[:3, :3]).T
         level = level[np.einsum("ij,ij->i", level[:, :2], level[:, :2]) < reach_m**2]

@@ -52,16 +52,10 @@ class Fit:
         cls, distances: FloatArray, normals: FloatArray, ranges: FloatArray, points: int, cell_m: float,
         thickness_m: FloatArray | None = None, tilt: FloatArray | None = None,
     ) -> "Fit":  # fmt: skip
-        """Fit of M correspondences.
+        """Fit of the M of so many points that have a correspondence, to a map of this spacing.
 
-        Args:
-            distances: (M,) of the matched points from their surfaces.
-            normals: (M, 3) unit, of the surfaces, in the world.
-            ranges: (M,) of the matched points from the sensor.
-            points: their number, with and without a correspondence.
-            cell_m: spacing of the map.
-            thickness_m, tilt: (M,) standard deviations of the surfaces along their normals, and of the normals in
-                radians; None where they are unknown.
+        They have distances (M,) from their surfaces and ranges (M,); the surfaces unit normals (M, 3) in the world,
+        standard deviations (M,) along these, and of the normals, radians; None where they are unknown.
         """
         if not len(distances):
             return NO_FIT
@@ -150,10 +144,8 @@ def translation_information(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Sums (3, 3) of `n n^T` without and with inlier weights `1 / (1 + d^2)`, and the mean inlier weight.
 
-    Args:
-        normals: (N, 3) unit, of the surfaces.
-        distances: (N,) of the points from them, in units at which a point has half the weight.
-        weights: (N,) of the points; None: they are equal.
+    Of unit normals (N, 3), distances (N,) in units at which a point has half the weight, and further weights (N,),
+    if any.
     """
     weights = np.ones(len(distances)) if weights is None else weights
     inlier = weights / (1.0 + distances**2)

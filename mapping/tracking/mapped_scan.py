@@ -45,14 +45,9 @@ class MappedScan:
 def judge(
     attempt: Attempt, is_unconfirmed: bool, unexpected: bool, adrift: bool, config: TrackingConfig
 ) -> tuple[Status, str]:
-    """The status of the fit; degraded as well for a pose that is unconfirmed, ambiguous or unconstrained.
+    """The status of the fit; degraded as well for a pose that is unconfirmed, ambiguous, unexpected or unconstrained.
 
-    Args:
-        attempt: registered.
-        is_unconfirmed: whether the sensor was relocalised a moment ago.
-        unexpected: whether odometry and last motion predicted another pose.
-        adrift: whether the map is a new one, at an unknown pose in the one before.
-        config: thresholds of the fit.
+    Adrift is a map that was begun at an unknown pose in the one before.
     """
     if attempt.status is not Status.OK:
         return attempt.status, attempt.fit.explain(config)

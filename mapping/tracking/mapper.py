@@ -53,12 +53,9 @@ class Insertion:
 
 
 class Mapper(Stateful):
-    """Holds the local map and the state of the last scan.
+    """Holds the local map and the state of the last scan; the latest `kept_scans` are kept for `redraw`.
 
-    Args:
-        config: of the mapping.
-        clock: seconds, for the budget of a scan.
-        kept_scans: number of the latest scans that are kept, for `redraw`.
+    The clock, in seconds, is for the budget of a scan.
     """
 
     _sampler: Sampler

@@ -68,14 +68,9 @@ class ScanMatcher:
         self, prediction: Prediction, start: Prediction, coarse_first: bool = True, patient: bool = False,
         keypoints: Sweep | None = None,
     ) -> Attempt:  # fmt: skip
-        """Register from a start.
+        """Register the keypoints, or some, from a start with the prior's covariance.
 
-        Args:
-            prediction: that the result is compared with.
-            start: with the covariance of the prior.
-            coarse_first: whether to begin on coarse cells.
-            patient: whether to allow more iterations.
-            keypoints: those of the scan, or some of them.
+        The result is compared with the prediction.
         """
         keypoints = keypoints or self.scan.keypoints
         attempt = self._registered(prediction, start, coarse_first, patient, keypoints)

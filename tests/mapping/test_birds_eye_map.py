@@ -20,8 +20,9 @@ def points(rng: np.random.Generator, l_shaped_room: RoomPoints) -> FloatArray:
     return l_shaped_room(rng, 20_000)
 
 
-@pytest.mark.parametrize("turned_deg", [0.0, 77.0, 180.0, -130.0])
-@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (-2.5, 3.0, -0.4), (4.0, -1.5, 0.5)])
+@pytest.mark.parametrize(("place", "turned_deg"), [
+    ((0.0, 0.0, 0.0), 180.0), ((-2.5, 3.0, -0.4), 77.0), ((4.0, -1.5, 0.5), -130.0),
+])  # fmt: skip
 def test_place_turn_and_height_are_found(rng, l_shaped_room, points, place, turned_deg):
     true = exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
     true[:3, 3] = place

@@ -145,7 +145,7 @@ def results(mapper: Mapper, faulty: Faulty, clock: FakeClock, first: int = 0) ->
         clock.taken_ms.append(1e3 * (clock.s - started))
 
 
-@pytest.mark.parametrize("fault", ["carried", "covered"])
+@pytest.mark.parametrize("fault", ["carried", pytest.param("covered", marks=pytest.mark.slow)])
 def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(simulation, clock, fault):
     if fault == "carried":
         faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)

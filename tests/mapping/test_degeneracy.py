@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Degeneracy
 from lidarslam.mapping.registration.gauss_newton import find_degeneracy
 
@@ -64,6 +64,11 @@ def test_a_corridor_leaves_its_own_direction_open_however_noisy(rng, tilt):
     found = find(tilted(rng, corridor(rng), tilt), tilt)
     assert found.names == ("x",)
     assert abs(found.directions[0, 3]) > 0.99
+    closed = joined(corridor(rng), wall(rng, 0, 9.0, (9.0, 1.2, 1.3), 40))
+    weights = np.ones(len(closed[0]))
+    assert len(find(closed)) == 0
+    weights[2_000:] = 0.0
+    assert find_degeneracy(jacobian(closed), weights, np.zeros(len(weights)), 6.0).names == ("x",)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.02])
@@ -71,16 +76,11 @@ def test_a_closed_room_leaves_nothing_open(rng, tilt):
     assert len(find(tilted(rng, closed_room(rng), tilt), tilt)) == 0
 
 
-def test_a_wall_at_the_end_closes_the_corridor(rng):
-    end = wall(rng, 0, 9.0, (9.0, 1.2, 1.3), 40)
-    assert len(find(joined(corridor(rng), end))) == 0
-
-
 def test_a_round_tunnel_leaves_x_and_roll_open(rng):
     assert sorted(find(round_tunnel(rng)).names) == ["roll", "x"]
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_plane_leaves_x_y_and_yaw_open(seed):
     assert sorted(find(field(np.random.default_rng(seed))).names) == ["x", "y", "yaw"]
 
@@ -92,12 +92,6 @@ def test_each_open_direction_has_a_name_of_its_own():
     directions[0, [3, 4]] = half * np.array([1.0 + 1e-9, 1.0])
     directions[1, [3, 4]] = half * np.array([1.0 + 1e-9, -1.0])
     assert sorted(Degeneracy(directions, 5.0).names) == ["x", "y"]
-
-
-def test_the_corridor_is_open_along_itself_in_the_lidars_own_frame(rng):
-    points, normals = corridor(rng)
-    R = exp(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0]))[:3, :3]  # the sensor looks along world y
-    assert find((points @ R, normals @ R)).names == ("y",)
 
 
 @pytest.mark.parametrize("factor", [0.1, 20.0])
@@ -118,13 +112,6 @@ def test_the_unit_of_the_weights_does_not_matter(rng, weight):
 def test_the_size_of_the_scene_does_not_matter(rng, metres):
     for scene in (corridor(rng), closed_room(rng), round_tunnel(rng)):
         assert len(find((metres * scene[0], scene[1]))) == len(find(scene))
-
-
-def test_points_without_weight_hold_nothing(rng):
-    scene = joined(corridor(rng), wall(rng, 0, 9.0, (9.0, 1.2, 1.3)))
-    weights = np.ones(len(scene[0]))
-    weights[2_000:] = 0.0
-    assert find_degeneracy(jacobian(scene), weights, np.zeros(len(weights)), 6.0).names == ("x",)
 
 
 def test_without_any_match_everything_is_open():

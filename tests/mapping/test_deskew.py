@@ -21,7 +21,7 @@ def test_equals_the_exponential_of_every_points_time(rng, scale):
     np.testing.assert_allclose(deskew(points, offsets, velocity, velocity), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.05, 0.05), (0.0, 0.1), (-0.1, 0.0)])
+@pytest.mark.parametrize(("low", "high"), [(-0.05, 0.05), (0.0, 0.1)])
 def test_points_before_and_after_the_stamp_move_with_their_own_velocity(rng, low, high):
     points, offsets = rng.normal(0.0, 10.0, (200, 3)), rng.uniform(low, high, 200)
     before, after = rng.normal(size=(2, 6))

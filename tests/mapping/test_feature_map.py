@@ -52,14 +52,6 @@ def test_a_voxel_has_the_mean_of_its_points(rng):
     np.testing.assert_allclose(grid.means[np.argsort(grid._keys)], means, atol=1e-12)
 
 
-def test_a_full_voxel_stays_as_it_is(rng):
-    grid = VoxelGrid(1.0)
-    grid.insert(rng.uniform(0.1, 0.2, (60, 3)))
-    before = grid.means
-    grid.insert(rng.uniform(0.8, 0.9, (60, 3)))
-    np.testing.assert_array_equal(grid.means, before)
-
-
 def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng):
     points = rng.uniform(-10.0, 10.0, (2000, 3))
     feature_map = map_of(points[:500], points[500:], radius_m=8.0)
@@ -94,7 +86,6 @@ def test_a_restored_map_goes_on(rng, through_disk):
 
 
 def test_a_local_map_is_restored_as_what_it_is(rng, through_disk):
-
     whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
     saved = through_disk({"map": whole.state()})
     assert isinstance(decode(LocalMap | None, saved.value("map"), saved), FeatureMap)
@@ -214,12 +205,10 @@ COVARIANCE = np.diag([0.05**2] * 3 + [0.3**2] * 3 + [1e-6] * 6)
 
 def registered(
     rng: np.random.Generator, edges: int, planes: int, feature_map: FeatureMap,
-    faces: tuple[int, ...] = (0, 1, 2), lines: tuple[int, ...] = (0, 1, 2), noise_m: float = 0.0,
+    faces: tuple[int, ...] = (0, 1, 2), lines: tuple[int, ...] = (0, 1, 2),
 ) -> Registration | None:  # fmt: skip
     seen = on_lines(rng, edges, lines), on_faces(rng, planes, faces)
-    points = transform_points(inverse(T_TRUE), np.concatenate(seen)) + noise_m * rng.standard_normal(
-        (edges + planes, 3)
-    )
+    points = transform_points(inverse(T_TRUE), np.concatenate(seen))
     prediction = Prediction(0.0, T_TRUE @ CLOSE, np.zeros(6), COVARIANCE)
     return register(Sweep(points, None, kinds_of(*seen)), prediction, feature_map, with_velocity=False)
 
@@ -239,24 +228,6 @@ def test_along_a_corridor_the_prediction_is_kept_and_the_covariance_grows(rng):
     np.testing.assert_allclose(error[1:], 0.0, atol=2e-3)
     along = T_TRUE[:3, :3].T[:, 0]
     assert along @ found.covariance[3:6, 3:6] @ along == pytest.approx(COVARIANCE[3, 3], rel=0.05)
-
-
-def test_too_few_correspondences_make_no_pose(rng):
-    feature_map = hall(rng)
-    assert registered(rng, 20, 20, feature_map) is None
-    assert registered(rng, 100, 300, FeatureMap(CELL_M, 100.0)) is None
-
-
-def test_the_covariance_is_no_smaller_than_the_errors(rng):
-    """Of independent noise; the errors of real scans are correlated, and the covariance allows for that."""
-    feature_map, errors, stated = hall(rng), [], []
-    for _ in range(30):
-        found = registered(rng, 100, 300, feature_map, noise_m=0.02)
-        errors.append(log(inverse(T_TRUE) @ found.T_world_lidar))
-        stated.append(np.diag(found.covariance)[:6])
-    ratio = np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0)
-    assert (ratio > 1.0).all()
-    assert (ratio < 100.0).all()
 
 
 def test_the_vertical_is_that_of_the_floor(rng):

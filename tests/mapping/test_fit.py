@@ -123,24 +123,17 @@ def support_of(normals: FloatArray, distances: FloatArray) -> float:
 
 
 def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supported(rng):
-    """One point in twelve shows the slide: the inlier ratio of all hardly changes, the support does."""
+    """One point in twelve shows the slide: the inlier ratio of all hardly changes, the support does.
+
+    In an even tunnel nothing shows a slide; that is a matter of degeneracy, not of the fit.
+    """
     normals = street_normals(rng, along=270)
     held, slid = (np.abs(normals @ [distance, 0.0, 0.0]) for distance in (0.05, 3.0))
     assert support_of(normals, held) > 0.99
     assert support_of(normals, slid) < 0.2
     assert np.mean(slid < 1.0) > 0.9
-
-
-def test_a_direction_that_nothing_constrains_is_supported_as_the_rest_is(rng):
-    """In an even tunnel nothing shows a slide; that is a matter of degeneracy, not of the fit."""
-    normals = street_normals(rng, along=0)
-    assert support_of(normals, np.full(len(normals), 0.1)) > 0.98
-
-
-def test_support_is_the_same_in_any_frame(rng):
-    normals, distances = street_normals(rng, along=270), rng.uniform(0.0, 2.0, 3_270)
-    turned = normals @ exp([0.3, -0.2, 1.0, 0.0, 0.0, 0.0])[:3, :3].T
-    assert support_of(turned, distances) == pytest.approx(support_of(normals, distances))
+    tunnel = street_normals(rng, along=0)
+    assert support_of(tunnel, np.full(len(tunnel), 0.1)) > 0.98
 
 
 @pytest.mark.parametrize(("support", "status"), [(0.7, Status.OK), (0.45, Status.DEGRADED), (0.2, Status.LOST)])

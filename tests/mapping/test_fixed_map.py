@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
@@ -142,10 +142,3 @@ def test_a_covered_sensor_is_lost_and_tracked_again(room, room_map):
     assert mapped[-1].status is Status.OK
     off_m, _ = errors(np.array([one.state.T_world_lidar for one in mapped]))
     assert off_m[-3:].max() < 0.03
-
-
-def test_surfels_of_a_region_are_those_around_its_centre(room_map):
-    centre = transform_points(T_MAP_ROOM, np.array([[-6.0, 0.0, 0.0]]))[0]
-    region = room_map.region(centre, 3.0, 0.4)
-    assert 0 < len(region) < len(room_map.region(centre, 50.0, 0.4))
-    assert np.linalg.norm(region.means() - centre, axis=1).max() < 3.0

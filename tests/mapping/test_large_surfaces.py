@@ -66,7 +66,7 @@ def inflation(surfel_map: SurfelMap, sweep: Sweep) -> FloatArray | None:
     return inflation_of_small(sweep.points, np.eye(4), matcher.surfaces, surfel_map)
 
 
-@pytest.mark.parametrize("crowd", [0, 2_000, 4_000, 5_000])
+@pytest.mark.parametrize("crowd", [0, 5_000])
 def test_a_crowd_that_walks_along_does_not_hold_the_sensor(crowd):
     np.testing.assert_allclose(registered(*scene(ALL, crowd)), WALKED, atol=0.02)
 

@@ -14,8 +14,6 @@ from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
-CONFIG = MappingConfig(keypoints=600)
-
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,15 +39,17 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
         assert getattr(found, name) == getattr(expected, name), name
 
 
-def test_a_mapper_goes_on(scans, through_disk):
-    whole = Mapper(CONFIG)
+@pytest.mark.parametrize(("method", "resumed_after"), [("surfels", (0, 1, 2, 6, 8)), ("loam", (1, 7))])
+def test_a_mapper_goes_on(scans, through_disk, method, resumed_after):
+    config = MappingConfig(keypoints=600, method=method)
+    whole = Mapper(config)
     expected = []
     for scan in scans:
         expected.append(whole.process(scan, Prior()))
     assert {mapped.status for mapped in expected} >= {Status.OK, Status.LOST}
     assert any("a new map" in mapped.message for mapped in expected)
-    for after in (0, 1, 2, 6, 7, 8, 10):
-        first, second = Mapper(CONFIG), Mapper(CONFIG)
+    for after in resumed_after:
+        first, second = Mapper(config), Mapper(config)
         for scan in scans[:after]:
             first.process(scan, Prior())
         second.restore(through_disk(first.state()))

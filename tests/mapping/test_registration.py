@@ -81,7 +81,7 @@ def box_map() -> SurfelMap:
     return map_of(sides(rng, 60_000))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map, seed):
     rng = np.random.default_rng(seed)
     axes = rng.normal(size=(2, 3))
@@ -172,22 +172,11 @@ def test_a_few_points_on_its_end_hold_a_corridor(off_m):
     assert_at(refined.T_world_lidar, T_TRUE, 2e-3, 0.02)
 
 
-@pytest.mark.parametrize(("count", "suffices"), [(59, False), (100, True)])
+@pytest.mark.parametrize(("count", "suffices"), [(0, False), (59, False), (100, True)])
 def test_too_few_points_make_no_pose(box_map, rng, count, suffices):
     few = snapshot(rng, count=count)
     assert (register_sweep(few, predicted(T_TRUE), box_map, with_velocity=False) is not None) == suffices
-
-
-@pytest.mark.parametrize("count", [0, 500])
-def test_nothing_to_meet_makes_no_pose(rng, count):
-    assert register_sweep(snapshot(rng, count=count), predicted(T_TRUE), SurfelMap(CELL, 10.0), False) is None
-
-
-def test_no_more_iterations_than_allowed(box_map, rng, monkeypatch):
-    off = exp([0.0, 0.0, 0.03, 0.05, -0.05, 0.0])
-    assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations > 2
-    monkeypatch.setattr("lidarslam.mapping.registration.registration._ITERATIONS", (3, 2))
-    assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations == 2
+    assert register_sweep(few, predicted(T_TRUE), SurfelMap(CELL, 10.0), with_velocity=False) is None
 
 
 def test_outliers_do_not_move_the_pose(box_map, rng):
@@ -211,23 +200,6 @@ def test_the_covariance_has_its_order_and_its_frame(corridor_map, rng):
     assert sigmas[:3].max() < np.deg2rad(1.0)
 
 
-def test_rotations_come_first_in_the_covariance(rng):
-    """A floor leaves yaw open, x and y, and holds roll, pitch and z."""
-    floor = np.column_stack([rng.uniform(-4, 4, (60_000, 2)), np.full(60_000, -1.5)])
-    sweep = Sweep(np.column_stack([rng.uniform(-3, 3, (2_000, 2)), np.full(2_000, -1.5)]))
-    prediction = predicted(np.eye(4), rotation_deg=10.0, metres=0.5)
-    sigmas = np.sqrt(np.diag(register(sweep, prediction, map_of(floor)).covariance)[:6])
-    assert sigmas[2] > 10.0 * sigmas[:2].max()
-    assert sigmas[3:5].min() > 10.0 * sigmas[5]
-
-
-def test_the_covariance_is_symmetric_and_positive(box_map, rng):
-    covariance = register(sweep_of(rng, TURNING), predicted(T_TRUE), box_map).covariance
-    assert covariance.shape == (12, 12)
-    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
-    assert np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() > 0.0
-
-
 @dataclass(frozen=True)
 class Consistency:
     """Squared errors of N registrations, normalised by their covariance: pose, and velocity."""
@@ -249,7 +221,7 @@ def noisy_scan(
     return directions * (ranges + rng.normal(0.0, sigma_m, count))[:, None], times
 
 
-def registrations(room: Any, sigma_m: float, count: int = 20) -> Consistency:
+def registrations(room: Any, sigma_m: float, count: int = 10) -> Consistency:
     """Of a noisy sweep with a map of three noisy sweeps from known poses along a way, all anew each time."""
     velocity = np.array([0.0, 0.0, 0.3, 0.8, 0.05, 0.0])
     start = exp([0.0, 0.0, 0.3, -4.0, 0.0, -0.4])

@@ -26,14 +26,10 @@ def cells(points: FloatArray, cell_m: float) -> FloatArray:
 
 
 def test_at_most_one_point_goes_into_the_map_from_each_half_cell(rng):
-    sampled = sample(shell(rng, 5.0, 50_000), cell_m=0.4)
-    assert len(np.unique(cells(sampled.sweep.points, 0.2), axis=0)) == len(sampled)
-
-
-def test_nearly_every_half_cell_gives_its_point(rng):
     scan = shell(rng, 5.0, 50_000)
-    occupied = len(np.unique(cells(scan.points, 0.2), axis=0))
-    assert len(sample(scan, cell_m=0.4)) > 0.95 * occupied
+    sampled = sample(scan, cell_m=0.4)
+    assert len(np.unique(cells(sampled.sweep.points, 0.2), axis=0)) == len(sampled)
+    assert len(sampled) > 0.95 * len(np.unique(cells(scan.points, 0.2), axis=0))
 
 
 def test_registered_points_are_spread_wider(rng):
@@ -43,7 +39,7 @@ def test_registered_points_are_spread_wider(rng):
     assert len(np.unique(cells(keys, 0.25), axis=0)) == len(keys)
 
 
-@pytest.mark.parametrize("keypoints", [100, 700, 2_000])
+@pytest.mark.parametrize("keypoints", [100, 2_000])
 def test_no_more_points_are_registered_than_wanted_and_they_come_from_everywhere(rng, keypoints):
     sampled = sample(shell(rng, 5.0), cell_m=0.05, keypoints=keypoints)
     keys = sampled.keypoints.points
@@ -75,23 +71,13 @@ def test_elevations_are_those_of_their_points(rng):
     np.testing.assert_allclose(sampled.elevations, np.arctan2(sampled.sweep.points[:, 2], upward), atol=1e-12)
 
 
-def test_a_scan_without_times_is_sampled_without(rng):
-    sampled = sample(Scan(shell(rng, 5.0).points, 1.5))
-    assert sampled.sweep.times is None
-    assert sampled.stamp == 1.5
-
-
-def test_nothing_is_sampled_from_nothing():
-    sampled = sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)))
+def test_nothing_is_sampled_from_nothing(rng):
+    sampler = Sampler(MappingConfig())
+    sampled = sampler.sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)))
     assert len(sampled) == len(sampled.keypoints) == 0
     assert sampled.is_sparse
     assert sampled.cell_m > 0.0
-
-
-def test_an_empty_scan_does_not_decide_on_the_cells(rng):
-    sampler = Sampler(MappingConfig())
-    sampler.sample(Scan(np.empty((0, 3)), 0.0))
-    assert sampler.sample(shell(rng, 12.0)).cell_m == pytest.approx(0.4, rel=0.02)
+    assert sampler.sample(shell(rng, 12.0)).cell_m == pytest.approx(0.4, rel=0.02), "it decided on no cells"
 
 
 @pytest.mark.parametrize(("radius_m", "cell_m"), [(6.0, 0.2), (24.0, 0.8), (0.6, 0.05), (60.0, 1.0)])
@@ -110,7 +96,8 @@ def cell_sizes(rng: np.random.Generator, radii_m: list[float]) -> list[float]:
 
 
 def test_a_scene_that_changes_by_less_than_two_keeps_its_cells(rng):
-    sizes = cell_sizes(rng, [6.0] + [10.5] * 100 + [3.6] * 100 + [10.5] * 100)
+    """Nor does one scan of another scale change them."""
+    sizes = cell_sizes(rng, [6.0] + [10.5] * 100 + [60.0] + [3.6] * 100 + [10.5] * 100)
     assert len(set(sizes)) == 1
 
 
@@ -119,11 +106,6 @@ def test_a_scene_that_has_changed_by_more_has_other_cells_in_the_end(rng, before
     sizes = cell_sizes(rng, [before_m] + [after_m] * 120)
     assert len(set(sizes)) == 2, "it changes once"
     assert sizes[-1] == pytest.approx(after_m / 30.0, rel=0.25)
-
-
-def test_one_scan_of_another_scale_changes_nothing(rng):
-    sizes = cell_sizes(rng, [6.0] * 10 + [60.0] + [6.0] * 10)
-    assert len(set(sizes)) == 1
 
 
 @pytest.mark.parametrize("numbered", [False, True])

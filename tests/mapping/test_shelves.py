@@ -9,8 +9,11 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.attempt import Attempt
 from lidarslam.mapping.tracking.budget import Budget
+from lidarslam.mapping.tracking.near_search import NearSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
+from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 CELL_M, SPACING_M = 0.05, 0.2
 HERE = np.eye(4)
@@ -42,18 +45,27 @@ def matcher() -> ScanMatcher:
     return ScanMatcher(scan, last, surfel_map, MappingConfig(), Budget())
 
 
+def searched(matcher: ScanMatcher, prediction: Prediction, prior: Prior) -> Attempt:
+    """Near a prediction that was good lately."""
+    return NearSearch(matcher, TrackingState(velocity_known=True, prediction_error_m=0.0), prior, prediction).best()
+
+
 def test_the_odometrys_motion_is_tried_where_the_prediction_is_uncertain(matcher):
     predicted = HERE.copy()
     predicted[2, 3] = -1.5 * SPACING_M
-    near = matcher.register(Prediction(1.1, predicted, np.zeros(6), np.diag(VARIANCES)), coarse_first=False)
+    prediction = Prediction(1.1, predicted, np.zeros(6), np.diag(VARIANCES))
+    near = matcher.register(prediction, coarse_first=False)
     assert near.T_world_lidar[2, 3] == pytest.approx(-SPACING_M, abs=0.01)
-    best = matcher.or_from_odometry(near, Prior(HERE))
+    best = searched(matcher, prediction, Prior(HERE))
     np.testing.assert_allclose(best.T_world_lidar[:3, 3], 0.0, atol=0.005)
-    assert matcher.or_from_odometry(near, Prior()) is near
+    alone = searched(matcher, prediction, Prior())
+    np.testing.assert_array_equal(alone.T_world_lidar, near.T_world_lidar)
 
 
 def test_the_odometrys_motion_is_not_taken_where_it_fits_no_better(matcher):
-    right = matcher.register(Prediction(1.1, HERE, np.zeros(6), np.diag(VARIANCES)), coarse_first=False)
+    prediction = Prediction(1.1, HERE, np.zeros(6), np.diag(VARIANCES))
+    right = matcher.register(prediction, coarse_first=False)
     lower = HERE.copy()
     lower[2, 3] = -1.5 * SPACING_M
-    assert matcher.or_from_odometry(right, Prior(lower)) is right
+    best = searched(matcher, prediction, Prior(lower))
+    np.testing.assert_array_equal(best.T_world_lidar, right.T_world_lidar)

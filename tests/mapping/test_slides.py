@@ -77,7 +77,7 @@ def test_normals_are_those_of_the_walls(room):
     assert np.quantile(-surfels.normals[on_wall, 0] * np.sign(surfels.points[on_wall, 0]), 0.1) > 0.99
 
 
-@pytest.mark.parametrize("shift_m", [0.0, 0.4, -1.3, 20.0])
+@pytest.mark.parametrize("shift_m", [0.0, -1.3, 20.0])
 def test_the_profile_peaks_at_the_shift(scans, shift_m):
     first, second = Surfels.of(scans[0]), Surfels.of(scans[10])
     T = np.eye(4)
@@ -89,9 +89,10 @@ def test_the_profile_peaks_at_the_shift(scans, shift_m):
 def test_true_poses_are_not_contradicted(scans):
     assert len(check(scans, TRUE).tests) >= 6
     assert found(scans, TRUE) == ()
+    assert found([np.ones((3, 3))] * SCANS, TRUE) == (), "without surfaces"
 
 
-@pytest.mark.parametrize("scale", [0.96, 0.9, 0.05, 1.1])
+@pytest.mark.parametrize("scale", [0.96, 0.05, 1.1])
 def test_a_slide_of_the_whole_run_is_found(scans, scale):
     (stretch,) = found(scans, poses([scale * STEP_M] * (SCANS - 1)))
     assert np.sign(stretch.shift_m) == np.sign(1.0 - scale)
@@ -157,13 +158,6 @@ def test_it_goes_on_from_its_state(scans, through_disk):
     for test, other in zip(resumed.tests, check(scans, slid).tests, strict=True):
         assert (test.first, test.second, test.shift_m) == (other.first, other.second, other.shift_m)
         np.testing.assert_array_equal(test.near, other.near)
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_scans_without_surfaces_are_no_matter(count):
-    nothing = [np.ones((count, 3))] * SCANS
-    assert found(nothing, TRUE) == ()
-    assert found([], np.empty((0, 4, 4))) == ()
 
 
 def test_long_runs_are_sampled(monkeypatch):

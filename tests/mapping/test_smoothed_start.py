@@ -24,9 +24,14 @@ def walk(sensor: str, start: int, count: int = 25, name: str = "office") -> tupl
     return scans, np.asarray(inverse(T_map_lidar[:-1]) @ T_map_lidar[1:], dtype=np.float64)
 
 
-@pytest.mark.parametrize("start", [0, 40])
-def test_motions_of_a_sensor_without_rings_are_true(start):
-    scans, truth = walk("mid-360", start)
+@pytest.fixture(scope="module")
+def strokes() -> tuple[list[Scan], FloatArray]:
+    """Scans of a sensor without rings, and their motions."""
+    return walk("mid-360", 40)
+
+
+def test_motions_of_a_sensor_without_rings_are_true(strokes):
+    scans, truth = strokes
     smoothed = smoothed_start(scans, MappingConfig())
     assert list(smoothed) == [scan.stamp for scan in scans[1:SMOOTHED]]
     for motion, T_true in zip(smoothed.values(), truth, strict=False):
@@ -40,13 +45,13 @@ def test_registration_in_order_suffices_where_a_sweep_makes_a_map():
     assert smoothed_start(iter(scans), MappingConfig()) == {}
 
 
-def test_nothing_is_smoothed_across_another_place():
-    scans, _ = walk("mid-360", 40)
+def test_nothing_is_smoothed_across_another_place(strokes):
+    scans, _ = strokes
     elsewhere, _ = walk("mid-360", 40, name="tunnel")
     assert smoothed_start(scans[:12] + elsewhere[12:], MappingConfig()) == {}
 
 
-def test_too_few_scans_are_left_as_they_are():
-    scans, _ = walk("mid-360", 40)
+def test_too_few_scans_are_left_as_they_are(strokes):
+    scans, _ = strokes
     assert smoothed_start(scans[:5], MappingConfig()) == {}
     assert smoothed_start([], MappingConfig()) == {}

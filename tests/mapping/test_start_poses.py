@@ -1,7 +1,6 @@
 """Starts all around, and the right one among them."""
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,10 +17,6 @@ UP = np.array([0.0, 0.0, 1.0])
 T_GIVEN = exp([0.1, -0.2, 0.7, 3.0, -2.0, 0.5])
 
 
-def test_the_given_pose_comes_first():
-    np.testing.assert_allclose(turned_poses(T_GIVEN, UP, 15.0)[0], T_GIVEN, atol=1e-12)
-
-
 @pytest.mark.parametrize(("step_deg", "count"), [(15.0, 24), (90.0, 4), (50.0, 7), (400.0, 1)])
 def test_turns_are_even_and_go_all_around(step_deg, count):
     starts = turned_poses(T_GIVEN, UP, step_deg)
@@ -29,18 +24,11 @@ def test_turns_are_even_and_go_all_around(step_deg, count):
     turns = starts[:, :3, :3] @ T_GIVEN[:3, :3].T
     yaw_deg = np.sort(np.rad2deg(np.arctan2(turns[:, 1, 0], turns[:, 0, 0])) % 360.0)
     np.testing.assert_allclose(np.diff(yaw_deg), 360.0 / count, atol=1e-9)
-
-
-def test_small_turns_come_before_large_ones():
-    starts = turned_poses(T_GIVEN, UP, 15.0)
     angles = rotation_angle(inverse(T_GIVEN) @ starts)
-    assert all(after >= before - 1e-9 for before, after in pairwise(angles))
-
-
-def test_all_starts_are_rigid_and_at_the_same_place():
-    starts = turned_poses(T_GIVEN, UP, 15.0)
+    assert angles[0] == pytest.approx(0.0, abs=1e-9)
+    assert (np.diff(angles) > -1e-9).all(), "small turns first"
     assert is_rigid(starts, 1e-12)
-    np.testing.assert_array_equal(starts[:, :3, 3], np.tile(T_GIVEN[:3, 3], (len(starts), 1)))
+    np.testing.assert_array_equal(starts[:, :3, 3], np.tile(T_GIVEN[:3, 3], (count, 1)))
 
 
 def test_turns_are_about_the_given_vertical():
@@ -59,20 +47,19 @@ def l_map(rng: np.random.Generator, l_shaped_room: RoomPoints) -> SurfelMap:
     return local_map
 
 
-@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 100.0, 180.0, -97.0, 40.0])
+@pytest.mark.parametrize("turned_deg", [0.0, 180.0, -97.0])
 def test_the_right_yaw_is_found_in_an_l_shaped_room(rng, l_shaped_room, l_map, turned_deg):
     """The sensor was turned on the spot by some angle that nobody knows."""
     before = exp([0.0, 0.0, 0.2, 0.5, -0.5, 0.1])
     after = before @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
     points = transform_points(inverse(after), l_shaped_room(rng, 3_000))
     best = complete(best_starts(points, turned_poses(before, UP, 15.0), l_map))
-    assert (
-        np.rad2deg(rotation_angle(inverse(best[0]) @ after)) < 9.0
-    )  # of steps of 15; -97 lies 7 from one and 8 from the next
+    # Of steps of 15; -97 lies 7 from one and 8 from the next.
+    assert np.rad2deg(rotation_angle(inverse(best[0]) @ after)) < 9.0
     assert 1 < len(best) < 6
 
 
-@pytest.mark.parametrize("true_deg", [-250.0, -50.0, 0.0, 200.0, 400.0])
+@pytest.mark.parametrize("true_deg", [-250.0, 0.0, 400.0])
 def test_the_rate_of_turning_that_bent_a_sweep_is_found(rng, l_shaped_room, l_map, true_deg):
     """Points of the room as a sweep of 0.1 s sees them that turns so fast; the best of steps of 50 deg/s."""
     velocities = np.zeros((17, 6))

@@ -55,30 +55,6 @@ def distances(points: FloatArray, matches: Correspondences) -> FloatArray:
     return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
 
 
-def test_a_wall_pulls_nobody_who_looks_at_its_back(rng):
-    """What is seen from the other side of a thin wall is its other side."""
-    wall = np.column_stack([np.full(20_000, 2.0), rng.uniform(-3.0, 3.0, (20_000, 2))])
-    local_map, asked = map_of(wall), np.column_stack([np.full(200, 2.1), rng.uniform(-2.0, 2.0, (200, 2))])
-    behind = HERE.copy()
-    behind[0, 3] = 4.0
-    assert len(local_map.match(asked, HERE)) == len(asked)
-    assert len(local_map.match(asked, behind)) == 0
-
-
-def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng):
-    """Though they lie in neighbouring cells, and in the same one of the coarser grids; seen more across than along."""
-    sides = [np.column_stack([np.full(20_000, x), rng.uniform(-1.3, 1.3, (20_000, 2))]) for x in (1.93, 2.02)]
-    sensors = [np.array([x, 0.0, 0.0]) for x in (0.0, 4.0)]
-    local_map = SurfelMap(0.07, 100.0)
-    for wall, sensor in zip(sides, sensors, strict=True):
-        local_map.insert(wall, rng.uniform(-0.3, 0.3, len(wall)), sensor)
-    for wall, sensor in zip(sides, sensors, strict=True):
-        asked = wall[np.abs(wall[:, 1:]).max(axis=1) < 1.0]
-        matches = local_map.match(asked, make_transform(np.eye(3), sensor))
-        assert len(np.unique(matches.index)) > 0.95 * len(asked)
-        assert distances(asked, matches).max() < 0.005
-
-
 def test_points_on_walls_meet_the_walls(rng):
     local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
     matches = local_map.match(asked, HERE)
@@ -87,16 +63,6 @@ def test_points_on_walls_meet_the_walls(rng):
     assert matches.thickness_m.max() < 1e-3
     side = (np.abs(np.abs(asked) - HALF) < 1e-9).argmax(axis=1)[matches.index]
     np.testing.assert_allclose(np.abs(matches.normals[np.arange(len(side)), side]), 1.0, atol=1e-9)
-
-
-def test_the_finest_grid_that_shows_a_plane_decides(rng):
-    """Two floors, one above the other: only fine cells keep them apart."""
-    lower, upper = floor_points(rng, 20_000, z=-1.0), floor_points(rng, 20_000, z=-1.0 + 3.2 * CELL)
-    local_map = map_of(np.concatenate([lower, upper]))
-    inner = np.abs(lower[:, :2]).max(axis=1) < 2.0
-    fine = local_map.match(lower[inner], HERE)
-    assert len(fine) == inner.sum()
-    assert distances(lower[inner], fine).max() < 1e-5
 
 
 def test_where_fine_cells_show_nothing_coarse_ones_do(rng):
@@ -128,22 +94,10 @@ def test_finer_grids_are_left_out_on_request(rng):
     assert distances(asked, local_map.match(asked, HERE, len(LEVELS) - 1)).min() > 0.01
 
 
-@pytest.mark.parametrize("elevation_deg", [-4.0, 0.5, 8.0])
-def test_a_ring_bent_around_a_corner_is_no_plane(elevation_deg):
-    points = ring(elevation_deg, walls=(4.0, 5.0))
+@pytest.mark.parametrize(("elevation_deg", "z"), [(-4.0, None), (0.5, None), (8.0, None), (-5.7, -1.0)])
+def test_a_ring_bent_around_a_corner_or_on_the_ground_is_no_plane(elevation_deg, z):
+    points = ring(elevation_deg, walls=(4.0, 5.0) if z is None else None, z=z)
     assert len(map_of(points).match(points, HERE)) == 0
-
-
-def test_a_ring_on_the_ground_far_away_is_no_plane():
-    points = ring(-5.7, z=-1.0)
-    assert len(map_of(points).match(points, HERE)) == 0
-
-
-def test_two_rings_on_the_ground_show_it():
-    points = np.concatenate([ring(-5.7, z=-1.0), ring(-6.7, z=-1.0)])
-    matches = map_of(points).match(points, HERE)
-    assert len(np.unique(matches.index)) > 0.95 * len(points)
-    np.testing.assert_allclose(np.abs(matches.normals[:, 2]), 1.0, atol=1e-6)
 
 
 def test_two_rings_on_walls_show_them():
@@ -152,18 +106,6 @@ def test_two_rings_on_walls_show_them():
     matches = map_of(points).match(points[away], HERE)
     assert len(np.unique(matches.index)) > 0.9 * away.sum()
     assert distances(points[away], matches).max() < 1e-5
-
-
-def test_memory_does_not_grow_along_the_way(rng):
-    local_map = SurfelMap(0.5, 50.0)
-    sizes = []
-    for step in range(200):
-        sensor = np.array([10.0 * step, 0.0, 0.0])
-        points = sensor + rng.uniform(-30.0, 30.0, (300, 3)) * [1.0, 1.0, 0.1]
-        local_map.insert(points, np.zeros(300), sensor)
-        sizes.append(len(local_map))
-    assert max(sizes[100:]) < 1.2 * max(sizes[:30])
-    assert min(sizes[100:]) > 0.5 * max(sizes[:30])
 
 
 def test_the_map_stays_around_the_sensor(rng):
@@ -176,7 +118,7 @@ def test_the_map_stays_around_the_sensor(rng):
     assert len(local_map.match(away[:200], make_transform(np.eye(3), [30.0, 0.0, 0.0]))) == 200
 
 
-@pytest.mark.parametrize("factor", [0.45, 0.5, 0.8, 1.5, 2.0, 2.2])
+@pytest.mark.parametrize("factor", [0.45, 0.8, 2.0])
 def test_planes_stay_in_place_when_cells_change_their_size(rng, factor):
     """By more than two it changes when the sensor leaves a hall for a corridor, or the other way round."""
     resized = map_of(box_points(rng, 60_000)).resized(CELL * factor)
@@ -198,19 +140,15 @@ def test_grazed_ground_is_still_known_when_cells_change_their_size(rng):
     assert after > 0.8 * before > 350
 
 
-@pytest.mark.parametrize("roll_deg", [0.0, 10.0, -35.0])
-@pytest.mark.parametrize("pitch_deg", [0.0, 25.0])
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (10.0, 25.0), (-35.0, 0.0)])
 def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_deg):
     R = exp(np.deg2rad([roll_deg, pitch_deg, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
     vertical = map_of(box_points(rng, 40_000) @ R.T).vertical()
     tilt_deg = np.hypot(roll_deg, pitch_deg)  # the corners of a room as small as this pull at it
     assert np.rad2deg(np.arccos(vertical @ R[:, 2])) < 1.0 + 0.16 * tilt_deg
     assert np.linalg.norm(vertical) == pytest.approx(1.0)
-
-
-def test_without_a_floor_the_vertical_is_the_worlds(rng):
     wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
-    np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])  # without a floor the world's
 
 
 def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(monkeypatch, rng):

@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.surfaces import Correspondences
-from lidarslam.mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.grid import MEAN, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.hash_kernels import OTHER_SIDE
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
@@ -17,7 +17,7 @@ from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_key
 CELL = 0.5
 NOISE_M = 0.005
 SENSORS = (np.array([0.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]))
-OFFSETS = np.arange(8) / 8.0
+OFFSETS = np.arange(4) / 4.0
 ONE_AFTER_THE_OTHER, IN_TURNS = [0] * 20 + [1] * 20, [0, 1] * 20
 
 
@@ -50,8 +50,7 @@ def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int)
 
 
 @pytest.mark.parametrize("sides", [ONE_AFTER_THE_OTHER, IN_TURNS], ids=["one after the other", "in turns"])
-@pytest.mark.parametrize("thickness_m", [0.03, 0.10])
-@pytest.mark.parametrize("cell_m", [0.07, 0.15, 0.25, 0.5])
+@pytest.mark.parametrize(("cell_m", "thickness_m"), [(0.07, 0.03), (0.25, 0.10), (0.5, 0.03)])
 def test_each_side_of_a_wall_within_a_cell_pulls_those_who_see_it(rng, cell_m, thickness_m, sides):
     off: list[FloatArray] = []
     for offset in OFFSETS * cell_m:
@@ -66,7 +65,7 @@ def test_each_side_of_a_wall_within_a_cell_pulls_those_who_see_it(rng, cell_m, t
     assert np.percentile(together, 90) < 0.005
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0, 2.2])
+@pytest.mark.parametrize("factor", [0.5, 2.2])
 def test_both_sides_stay_when_cells_change_their_size(rng, factor):
     cell_m, faces = 0.25, (2.03, 2.13)
     resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(cell_m * factor)
@@ -83,15 +82,6 @@ def grid_of_both_sides(rng: np.random.Generator, count: int = 4_000) -> tuple[Su
     for points, view in zip(faces, (-1.0, 1.0), strict=True):
         grid.insert(points, np.zeros(count), np.tile([view, 0.0, 0.0], (count, 1)))
     return grid, *faces
-
-
-def test_the_side_that_faces_the_sensor_is_found_and_each_has_its_own_plane(rng):
-    grid, near, far = grid_of_both_sides(rng)
-    for points, sensor, x, normal in ((near, SENSORS[0], 2.1, -1.0), (far, SENSORS[1], 2.2, 1.0)):
-        surfels = grid.surfels(grid.find(points, sensor))
-        assert surfels[:, IS_PLANE].all()
-        np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
-        np.testing.assert_allclose(surfels[:, NORMAL][:, 0], normal, atol=1e-5)
 
 
 def test_another_side_takes_cells_only_where_it_was_seen(rng):

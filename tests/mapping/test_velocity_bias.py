@@ -32,13 +32,6 @@ def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s):
     np.testing.assert_allclose(bias.correction, -BIAS, atol=1e-6)
 
 
-def test_velocities_that_agree_with_the_motion_stay():
-    state = swept(1, VELOCITY, 0.0)
-    bias = VelocityBias().updated(swept(0, VELOCITY, 0.0), state, 0.0)
-    np.testing.assert_allclose(bias.correction, np.zeros(6), atol=1e-12)
-    np.testing.assert_allclose(bias.corrected(state).T_world_lidar, state.T_world_lidar, atol=1e-12)
-
-
 def test_a_sudden_acceleration_is_no_bias():
     """Of 360 deg/s and 30 m/s, a degree and 6 cm per second are taken over."""
     sudden = np.array([0.0, 0.0, np.deg2rad(360.0), 30.0, 0.0, 0.0])

@@ -54,14 +54,6 @@ def test_points_below_zero_lie_in_the_cells_below_zero():
     assert key_cells(point_keys(points, 0.5)).tolist() == [[-1, 0, 0], [-2, 1, 1]]
 
 
-def test_a_key_repeated_in_one_insertion_has_one_row():
-    table = VoxelHash()
-    rows = table.insert(keys_of([(1, 2, 3), (0, 0, 0), (1, 2, 3), (1, 2, 3)]))
-    assert len(table) == 2
-    assert len({rows[0], rows[2], rows[3]}) == 1
-    assert rows[0] != rows[1]
-
-
 def test_rows_of_before_stay_while_the_table_grows(rng):
     table = VoxelHash()
     first = cell_keys(random_cells(rng, 3_000))
@@ -70,23 +62,6 @@ def test_rows_of_before_stay_while_the_table_grows(rng):
         table.insert(cell_keys(random_cells(rng, 15_000)))
     assert len(table) > 50_000
     np.testing.assert_array_equal(table.find(first), rows)
-
-
-def test_a_full_neighbourhood_is_told_apart(rng):
-    """Cells side by side, as a wall's are, all find their own row."""
-    cells = np.stack(np.meshgrid(*[np.arange(-15, 15)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    keys = cell_keys(rng.permutation(cells))
-    table = VoxelHash()
-    table.insert(keys)
-    assert np.unique(table.find(keys)).size == len(keys)
-
-
-def test_rows_have_the_shape_of_the_keys(rng):
-    table = VoxelHash()
-    keys = cell_keys(random_cells(rng, 60).reshape(20, 3, 3))
-    table.insert(keys.ravel())
-    assert table.find(keys).shape == (20, 3)
-    np.testing.assert_array_equal(table.find(keys).ravel(), table.find(keys.ravel()))
 
 
 def test_rebuilt_it_holds_the_new_keys_only_in_their_order(rng):
