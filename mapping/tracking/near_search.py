@@ -58,12 +58,12 @@ class NearSearch:
         """The best attempt of all strategies, each of which takes the best so far and returns that or a better one."""
         best = self.at_prediction()
         for strategy in (
-            self._held_by_odometry,
-            self._with_any_acceleration,
-            self._without_odometry,
-            self._at_any_speed,
-            self._from_odometry,
-            self._along_weakest,
+            self.held_by_odometry,
+            self.with_any_acceleration,
+            self.without_odometry,
+            self.at_any_speed,
+            self.from_odometry,
+            self.along_weakest,
         ):
             if self.matcher.budget.is_spent:
                 break
@@ -83,7 +83,7 @@ class NearSearch:
     def _predict(self, prior: Prior, process_noise: ProcessNoise | None = None) -> Prediction:
         return self.state.predict(self.matcher.scan, prior, self.matcher.last, self.matcher.config, process_noise)
 
-    def _held_by_odometry(self, near: Attempt) -> Attempt:
+    def held_by_odometry(self, near: Attempt) -> Attempt:
         """Where the scan constrains a direction poorly: held closer to the odometry's motion.
 
         Errors of an odometry are correlated in time, but so are those of the few surfaces that constrain the scan.
@@ -99,7 +99,7 @@ class NearSearch:
         held = self.matcher.register(self._predict(replace(prior, caution=WEAK_CAUTION)), coarse_first=False)
         return replace(held, prediction=near.prediction) if _BETTER * held.quality > near.quality else near
 
-    def _with_any_acceleration(self, near: Attempt) -> Attempt:
+    def with_any_acceleration(self, near: Attempt) -> Attempt:
         """Where the scan fits poorly: from several yaw rates, patiently, with any acceleration.
 
         An unexpected motion bends the sweep, which then fits halfway at a wrong pose and velocity.
@@ -119,19 +119,19 @@ class NearSearch:
         is_better = (turning.is_reliable or is_near) and turning.quality > _BETTER * near.quality
         return replace(turning, prediction=self.prediction) if is_better else near
 
-    def _without_odometry(self, near: Attempt) -> Attempt:
+    def without_odometry(self, near: Attempt) -> Attempt:
         """Where the odometry is contradicted, or the scan fits poorly with it: by the last motion alone."""
         if not self.state.velocity_known or not (self.prediction.contradicted or self._is_poor(near)):
             return near
         prior = self.prior.without_odometry()
         alone = replace(self, prior=prior, prediction=self._predict(prior))
         other = alone.at_prediction()
-        other = other if self.matcher.budget.is_spent else alone._with_any_acceleration(other)
+        other = other if self.matcher.budget.is_spent else alone.with_any_acceleration(other)
         # Where odometry and last motion agree, another pose is that of a similar place, as the next flight.
         is_similar = not self.prediction.contradicted and self.contradicts(other)
         return other if other.quality > near.quality and not is_similar else near
 
-    def _at_any_speed(self, near: Attempt) -> Attempt:
+    def at_any_speed(self, near: Attempt) -> Attempt:
         """Where the velocity is unknown or the odometry poor: displaced; ambiguous where another place fits as well."""
         if self.state.velocity_known and not self._is_poor(near):
             return near
@@ -174,7 +174,7 @@ class NearSearch:
             attempts.append(self.matcher.attempt(prediction, prediction, patient=True))
         return [attempt for attempt in attempts if attempt.status is Status.OK]
 
-    def _from_odometry(self, near: Attempt) -> Attempt:
+    def from_odometry(self, near: Attempt) -> Attempt:
         """Where the prediction is uncertain along the weakest direction: from the odometry's motion.
 
         Of several optima, as on stairs, the prediction's may be the next step's.
@@ -192,7 +192,7 @@ class NearSearch:
         start = replace(prediction, T_world_lidar=T_world_lidar)
         return _clearly_best(near, [self.matcher.attempt(prediction, start, coarse_first=False)])
 
-    def _along_weakest(self, near: Attempt) -> Attempt:
+    def along_weakest(self, near: Attempt) -> Attempt:
         """Where the scan fits poorly: a few cells away along its weakest direction.
 
         Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks the same.

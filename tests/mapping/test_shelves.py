@@ -45,27 +45,22 @@ def matcher() -> ScanMatcher:
     return ScanMatcher(scan, last, surfel_map, MappingConfig(), Budget())
 
 
-def searched(matcher: ScanMatcher, prediction: Prediction, prior: Prior) -> Attempt:
-    """Near a prediction that was good lately."""
-    return NearSearch(matcher, TrackingState(velocity_known=True, prediction_error_m=0.0), prior, prediction).best()
+def from_odometry(matcher: ScanMatcher, near: Attempt, prior: Prior) -> Attempt:
+    return NearSearch(matcher, TrackingState(), prior, near.prediction).from_odometry(near)
 
 
 def test_the_odometrys_motion_is_tried_where_the_prediction_is_uncertain(matcher):
     predicted = HERE.copy()
     predicted[2, 3] = -1.5 * SPACING_M
-    prediction = Prediction(1.1, predicted, np.zeros(6), np.diag(VARIANCES))
-    near = matcher.register(prediction, coarse_first=False)
+    near = matcher.register(Prediction(1.1, predicted, np.zeros(6), np.diag(VARIANCES)), coarse_first=False)
     assert near.T_world_lidar[2, 3] == pytest.approx(-SPACING_M, abs=0.01)
-    best = searched(matcher, prediction, Prior(HERE))
+    best = from_odometry(matcher, near, Prior(HERE))
     np.testing.assert_allclose(best.T_world_lidar[:3, 3], 0.0, atol=0.005)
-    alone = searched(matcher, prediction, Prior())
-    np.testing.assert_array_equal(alone.T_world_lidar, near.T_world_lidar)
+    assert from_odometry(matcher, near, Prior()) is near
 
 
 def test_the_odometrys_motion_is_not_taken_where_it_fits_no_better(matcher):
-    prediction = Prediction(1.1, HERE, np.zeros(6), np.diag(VARIANCES))
-    right = matcher.register(prediction, coarse_first=False)
+    right = matcher.register(Prediction(1.1, HERE, np.zeros(6), np.diag(VARIANCES)), coarse_first=False)
     lower = HERE.copy()
     lower[2, 3] = -1.5 * SPACING_M
-    best = searched(matcher, prediction, Prior(lower))
-    np.testing.assert_array_equal(best.T_world_lidar, right.T_world_lidar)
+    assert from_odometry(matcher, right, Prior(lower)) is right
