@@ -68,7 +68,7 @@ def test_a_map_of_other_cells_has_the_same_points(rng):
     resized = fine.resized(0.4)
     assert fine.resized(0.1) is fine
     assert resized.scans == fine.scans
-    for found, expected in zip(resized.grids, coarse._grids, strict=True):
+    for found, expected in zip(resized.grids, coarse.grids, strict=True):
         assert found._sums[:, 0].sum() == expected._sums[:, 0].sum()
         assert len(found) == pytest.approx(len(expected), rel=0.2)
 
@@ -78,7 +78,7 @@ def test_a_restored_map_goes_on(rng, through_disk):
     restored = FeatureMap(1.0, 1.0)
     restored.restore(through_disk(whole.state()))
     for _ in range(2):
-        for one, other in zip(whole.grids, restored._grids, strict=True):
+        for one, other in zip(whole.grids, restored.grids, strict=True):
             np.testing.assert_array_equal(one.means, other.means)
         more = rng.uniform(-5.0, 5.0, (3000, 3))
         for held in (whole, restored):

@@ -295,7 +295,8 @@ def test_scans_still_fit_when_the_cells_become_smaller(mapper):
 
 def test_a_sensor_that_was_carried_away_is_relocalised_in_loams_map(ring_scans, room_truth):
     """Covered for a second and turned by 100 degrees in the meantime."""
-    process(ring_scans[:10], true_priors(room_truth)[:10])
+    mapper = Mapper(LOAM)
+    process(mapper, ring_scans[:10], true_priors(room_truth)[:10])
     assert mapper.process(empty(ring_scans[10].stamp), NOTHING).status is Status.LOST
     turn = exp([0.0, 0.0, np.deg2rad(100.0), 0.0, 0.0, 0.0])
     turned = [replace(scan, points=scan.points @ turn[:3, :3], stamp=scan.stamp + 1.0) for scan in ring_scans[11:20]]

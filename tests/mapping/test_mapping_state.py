@@ -39,15 +39,15 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
         assert getattr(found, name) == getattr(expected, name), name
 
 
-@pytest.mark.parametrize(("method", "resumed_after"), [("surfels", (0, 1, 2, 6, 8)), ("loam", (1, 7))])
-def test_a_mapper_goes_on(scans, through_disk, method, resumed_after):
-    config = MappingConfig(keypoints=600, method=method)
+@pytest.mark.parametrize(
+    ("method", "recording", "resumed_after"), [("surfels", "scans", (0, 1, 2, 6, 8)), ("loam", "ring_scans", (1, 7))]
+)
+def test_a_mapper_goes_on(through_disk, request, method, recording, resumed_after):
+    config, scans = MappingConfig(keypoints=600, method=method), request.getfixturevalue(recording)[:12]
     whole = Mapper(config)
-    expected = []
-    for scan in scans:
-        expected.append(whole.process(scan, Prior()))
-    assert {mapped.status for mapped in expected} >= {Status.OK, Status.LOST}
-    assert any("a new map" in mapped.message for mapped in expected)
+    expected = [whole.process(scan, Prior()) for scan in scans]
+    assert Status.OK in {mapped.status for mapped in expected}
+    assert any("a new map" in mapped.message for mapped in expected) == (method == "surfels")
     for after in resumed_after:
         first, second = Mapper(config), Mapper(config)
         for scan in scans[:after]:

@@ -97,7 +97,7 @@ def cell_sizes(rng: np.random.Generator, radii_m: list[float]) -> list[float]:
 
 def test_a_scene_that_changes_by_less_than_two_keeps_its_cells(rng):
     """Nor does one scan of another scale change them."""
-    sizes = cell_sizes(rng, [6.0] + [10.5] * 100 + [60.0] + [3.6] * 100 + [10.5] * 100)
+    sizes = cell_sizes(rng, [6.0] * 10 + [60.0] + [10.5] * 100 + [3.6] * 100 + [10.5] * 100)
     assert len(set(sizes)) == 1
 
 
