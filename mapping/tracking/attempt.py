@@ -24,8 +24,6 @@ _MORE_SPEED_M_S, _MORE_TURN_RAD_S, _REACH_S = 3.0, np.deg2rad(200.0), 1.0
 _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S = 0.3, np.deg2rad(20.0), 3.0
 # A turn that a gyroscope measured is known to this.
 _MEASURED_TURN = np.deg2rad(5.0)
-# Share of inliers that a scan needs at its prediction after a lost one.
-_PLAUSIBLE_SHARE = 0.5
 # A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place this many
 # cells away. On simulated recordings the inlier ratio was 57 to 74 % at wrong places, at right ones 94 % and more; the
 # share of inliers depends on how much of the view is new.
@@ -44,11 +42,6 @@ class Attempt:
     status: Status  # by the fit
     relocalised: bool = False  # whether it began elsewhere than at the prediction
     ambiguous: bool = False  # whether another displacement fits nearly as well while the velocity is unknown
-
-    @property
-    def is_plausible(self) -> bool:
-        """Whether the fit suffices at the prediction after a lost scan."""
-        return self.fit.inlier_share > _PLAUSIBLE_SHARE
 
     @property
     def is_reliable(self) -> bool:

@@ -19,6 +19,9 @@ from lidarslam.mapping.tracking.relocalisation import ArchivedMaps, SpreadSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
+# Share of inliers that a scan needs at its prediction after a lost one.
+_PLAUSIBLE_SHARE = 0.5
+
 
 class Tracker(Stateful):
     """Tracks the sensor through one local map after another."""
@@ -94,7 +97,7 @@ class Tracker(Stateful):
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not relocalised:
             tracking = tracking.moved(last, state, motion, prior, self._config)
-        tracking = tracking.predicted_within(displacement_m(attempt.correction, scan.range_m))
+        tracking = tracking.with_prediction_error(displacement_m(attempt.correction, scan.range_m))
         velocity_known = not (jumped or relocalised)
         self.tracking = replace(tracking, velocity_known=velocity_known, velocity_bias=bias)
         if not velocity_known:
@@ -149,7 +152,7 @@ class Tracker(Stateful):
 
         The nearby attempt does not count before a search is done.
         """
-        sufficient = near.is_reliable if self.tracking.is_unconfirmed else near.is_plausible
+        sufficient = near.is_reliable if self.tracking.is_unconfirmed else near.fit.inlier_share > _PLAUSIBLE_SHARE
         counts, in_vain = near.status is not Status.LOST and sufficient, self._in_vain
         self._in_vain = False
         if counts and in_vain:

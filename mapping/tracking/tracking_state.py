@@ -132,6 +132,6 @@ class TrackingState:
         odometry_noise = self.odometry_noise.updated(prior, motion, config)
         return replace(self, process_noise=process_noise, odometry_noise=odometry_noise)
 
-    def predicted_within(self, error_m: float) -> "TrackingState":
+    def with_prediction_error(self, error_m: float) -> "TrackingState":
         """With the error of the latest prediction."""
         return replace(self, prediction_error_m=max(_ERROR_DECAY * self.prediction_error_m, error_m))
