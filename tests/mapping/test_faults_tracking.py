@@ -180,9 +180,8 @@ def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper, drive_by)
     assert_recovered(back, recorded, 3)
 
 
-@pytest.mark.parametrize("count", [3, 10])
-def test_dropped_scans_do_no_harm(mapper, drive_by, count):
-    recorded = dropped(drive_by, range(AT, AT + count))
+def test_dropped_scans_do_no_harm(mapper, drive_by):
+    recorded = dropped(drive_by, range(AT, AT + 10))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded)
@@ -196,7 +195,8 @@ def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper, drive_by):
     assert_recovered(results, recorded, 3)
 
 
-@pytest.mark.parametrize("turn", [(1500.0, 250.0), pytest.param((600.0, 180.0), marks=pytest.mark.slow)])
+@pytest.mark.slow  # follows a hundred scans
+@pytest.mark.parametrize("turn", [(1500.0, 250.0), (600.0, 180.0)])
 def test_sudden_turns_on_the_spot_are_followed(turn):
     """After four seconds of rest as fast as that one way round, then the other; nothing tells but the scans."""
     acceleration_deg, rate_deg = turn
@@ -234,13 +234,13 @@ def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> 
 
 @pytest.mark.parametrize("name", ["office", pytest.param("forest", marks=pytest.mark.slow)])
 def test_nothing_drifts_while_the_sensor_stands_still(name):
-    """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 80 scans."""
-    recorded = stand(build_world(name, 0), 80)
+    """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 50 scans."""
+    recorded = stand(build_world(name, 0), 50)
     mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
     assert {result.status for result in results} == {Status.OK}
     poses = np.array([result.state.T_world_lidar for result in results])
-    drift = inverse(poses[10]) @ poses[70:]
+    drift = inverse(poses[10]) @ poses[40:]
     assert np.linalg.norm(drift[:, :3, 3].mean(axis=0)) < 0.01
     assert np.rad2deg(rotation_angle(drift)).mean() < 0.1
 

@@ -45,6 +45,7 @@ def test_registration_in_order_suffices_where_a_sweep_makes_a_map():
     assert smoothed_start(iter(scans), MappingConfig()) == {}
 
 
+@pytest.mark.slow  # registers forty scans of a Mid-360
 def test_nothing_is_smoothed_across_another_place(strokes):
     scans, _ = strokes
     elsewhere, _ = walk("mid-360", 40, name="tunnel")
