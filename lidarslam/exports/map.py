@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import make_directory, replacing
-from lidarslam.core.geometry import FloatArray, make_transform, transform_points
+from lidarslam.core.geometry import FloatArray, make_transform, rotation_angle, transform_points
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import read_transform
 from lidarslam.datasets.mounting import recorded_axes
@@ -117,7 +118,7 @@ def _levelled(whole: _Map, first: Path, asked: MapEdits) -> Generator[str, None,
             up, by = ground.up, f"the ground, {100.0 * ground.share:.0f} % of what faces upwards"
         T = edits.levelling(up)
         whole = whole.moved(T)
-        yield f"levelled by {edits.tilt_deg(T):.2f} degrees, to {by}"
+        yield f"levelled by {np.rad2deg(rotation_angle(T)):.2f} degrees, to {by}"
     if asked.ground_at_zero:
         ground = _ground(whole, first)
         z = ground.height_m / float(ground.up[2])
@@ -136,12 +137,12 @@ def _ground(whole: _Map, first: Path) -> edits.GroundPlane:
 def _cropped(whole: _Map, asked: MapEdits) -> Generator[str, None, PointCloud]:
     cloud, kept = whole.cloud, np.ones(len(whole.cloud), dtype=np.bool_)
     if asked.box is not None:
-        bounds = np.array(asked.box).reshape(3, 2)
-        kept &= edits.in_box(cloud.points, bounds[:, 0], bounds[:, 1])
+        low, high = np.array(asked.box).reshape(3, 2).T
+        kept &= ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
     if asked.within_m is not None:
         if not len(whole.positions):
             raise InputError("--within needs the path of a run; name a run directory, or use --box")
-        kept &= edits.near_path(cloud.points, whole.positions, asked.within_m)
+        kept &= np.isfinite(cKDTree(whole.positions).query(cloud.points, distance_upper_bound=asked.within_m)[0])
     if not kept.any():
         raise InputError("no point is left of the map; take a larger --box or --within")
     if not kept.all():

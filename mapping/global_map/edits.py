@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, exp, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
 
@@ -58,16 +58,10 @@ def without_outliers(
     for `sigmas` (k, s), and points with fewer than k neighbours within r metres, for `radius` (k, r).
     """
     if sigmas is not None:
-        cloud = _chosen(cloud, cloud.to_open3d().remove_statistical_outlier(*sigmas)[1])
+        cloud = cloud.select(np.sort(cloud.to_open3d().remove_statistical_outlier(*sigmas)[1]))
     if radius is not None:
-        cloud = _chosen(cloud, cloud.to_open3d().remove_radius_outlier(*radius)[1])
+        cloud = cloud.select(np.sort(cloud.to_open3d().remove_radius_outlier(*radius)[1]))
     return cloud
-
-
-def _chosen(cloud: PointCloud, indices: Sequence[int]) -> PointCloud:
-    chosen = np.zeros(len(cloud), dtype=np.bool_)
-    chosen[np.asarray(indices, dtype=np.intp)] = True
-    return cloud.select(chosen)
 
 
 def ground_plane(cloud: PointCloud) -> GroundPlane | None:
@@ -111,21 +105,6 @@ def levelling(up: FloatArray) -> FloatArray:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(axis), up[2])
     return exp([*(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)), 0.0, 0.0, 0.0])
-
-
-def tilt_deg(T: FloatArray) -> float:
-    """The angle of a rotation, degrees."""
-    return float(np.rad2deg(rotation_angle(T)))
-
-
-def in_box(points: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
-    """(N,) which points (N, 3) lie in a box, borders included."""
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
-
-
-def near_path(points: FloatArray, positions: FloatArray, radius_m: float) -> NDArray[np.bool_]:
-    """(N,) which points (N, 3) lie within a distance of a position (K, 3)."""
-    return np.isfinite(cKDTree(positions).query(points, distance_upper_bound=radius_m)[0])
 
 
 @dataclass(frozen=True, eq=False)

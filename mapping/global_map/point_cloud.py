@@ -43,8 +43,8 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, chosen: NDArray[np.bool_]) -> "PointCloud":
-        """Some of the points, by a mask (N,)."""
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PointCloud":
+        """Some of the points, by a mask (N,) or by indices."""
         return PointCloud(self.points[chosen], self.normals[chosen], self.attributes.select(chosen))
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -129,17 +129,10 @@ _Columns = dict[str, NDArray[np.generic]]
 
 def _columns(cloud: PointCloud) -> _Columns:
     """The columns (N,) of a table of the points, by the names of PLY properties."""
-    known = cloud.attributes
     columns: _Columns = dict(zip("xyz", cloud.points.astype(np.float32).T, strict=True))
     columns |= zip(_NORMALS, cloud.normals.astype(np.float32).T, strict=True)
-    if known.intensity is not None:
-        columns["intensity"] = known.intensity
-    if known.rgb is not None:
-        columns |= zip(_COLOURS, known.rgb.T, strict=True)
-    if known.ring is not None:
-        columns["ring"] = known.ring
-    if known.time is not None:
-        columns["time"] = known.time
+    for name, values in cloud.attributes.present():
+        columns |= zip(_COLOURS, values.T, strict=True) if name == "rgb" else [(name, values)]
     return columns
 
 

@@ -55,16 +55,6 @@ class Tiling:
         return [(x, y) for x in xs for y in ys]
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Contents of a block."""
-
-    # x, y: the tile
-    x: int
-    y: int
-    layout: Layout
-
-
 class TileStore(BlockFile):
     """Voxels on disk, a block for all those of a tile that left memory together.
 
@@ -72,7 +62,7 @@ class TileStore(BlockFile):
     the voxels that leave memory, and nothing in it is ever changed: see `BlockFile`.
     """
 
-    _parts: list[_Part]
+    _parts: list[tuple[Tile, Layout]]  # of blocks
     brightest: float  # the largest intensity of a voxel here
 
     def __init__(self, directory: Path | None = None, file: Path | None = None) -> None:
@@ -82,8 +72,8 @@ class TileStore(BlockFile):
 
     def _after_restore(self) -> None:
         self._blocks = {}
-        for index, part in enumerate(self._parts):
-            self._blocks.setdefault((part.x, part.y), []).append(index)
+        for index, (tile, _) in enumerate(self._parts):
+            self._blocks.setdefault(tile, []).append(index)
 
     @property
     def tiles(self) -> set[Tile]:
@@ -93,7 +83,7 @@ class TileStore(BlockFile):
     @property
     def layout(self) -> Layout:
         """The columns that any of the voxels has."""
-        return Layout.union([part.layout for part in self._parts])
+        return Layout.union([layout for _, layout in self._parts])
 
     def take(self, voxels: Voxels, tiling: Tiling, recent: NDArray[np.int64], most: int) -> Voxels:
         """What is left in memory of sorted voxels, without the tiles that have no recent ones, by sorted keys (R,).
@@ -111,20 +101,20 @@ class TileStore(BlockFile):
 
     def voxels(self, tile: Tile) -> list[Voxels]:
         """The blocks of a tile, the earliest first, each of them sorted."""
-        return [self._block(index) for index in self._blocks.get(tile, [])]
+        found = []
+        for index in self._blocks.get(tile, []):
+            block, layout = self.read(index), self._parts[index][1]
+            count = len(block) // (8 + 4 * layout.width)
+            rows = np.frombuffer(block, dtype="<f4", offset=8 * count).reshape(count, layout.width)
+            found.append(Voxels(np.frombuffer(block, dtype="<i8", count=count), rows, layout))
+        return found
 
     def _append(self, tile: Tile, voxels: Voxels) -> None:
         keys, rows = (np.ascontiguousarray(a, dtype=t) for a, t in ((voxels.keys, "<i8"), (voxels.sums, "<f4")))
         self.write(keys.tobytes() + rows.tobytes())
         self._blocks.setdefault(tile, []).append(len(self._parts))
-        self._parts.append(_Part(*tile, voxels.layout))
+        self._parts.append((tile, voxels.layout))
         self.brightest = max(self.brightest, voxels.layout.largest_intensity(voxels.sums))
-
-    def _block(self, index: int) -> Voxels:
-        block, layout = self.read(index), self._parts[index].layout
-        count = len(block) // (8 + 4 * layout.width)
-        rows = np.frombuffer(block, dtype="<f4", offset=8 * count).reshape(count, layout.width)
-        return Voxels(np.frombuffer(block, dtype="<i8", count=count), rows, layout)
 
 
 def _distinct(codes: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """Integration of a gyroscope's samples: turns between instants, and sweeps as of a constant rate."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,25 +13,6 @@ _STEP_S = 0.0025
 # A gap between samples is longer than this many usual intervals, and than this time, seconds.
 _GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.02
 _NO_BIAS = np.zeros(3)
-
-
-@dataclass(frozen=True, eq=False)
-class _Turns:
-    """The LiDAR's rotations R_stamp_t (N, 3, 3) at N times from a scan's stamp, seconds."""
-
-    times: FloatArray
-    rotations: FloatArray
-
-    def mean_rate(self) -> FloatArray:
-        """(3,) rad/s: the constant rate that fits the rotations best."""
-        vectors = log(make_transform(self.rotations, np.zeros(3)))[:, :3]
-        return np.asarray(self.times @ vectors / (self.times @ self.times), dtype=np.float64)
-
-    def uneven(self, rate: FloatArray) -> FloatArray:
-        """(N, 3) rotation vectors that remain of the rotations when those of a constant rate are undone."""
-        steady = exp(np.pad(self.times[:, None] * rate, ((0, 0), (0, 3))))
-        vectors = log(inverse(steady) @ make_transform(self.rotations, np.zeros(3)))[:, :3]
-        return np.asarray(vectors, dtype=np.float64)
 
 
 class Integral:
@@ -94,7 +75,7 @@ class Gyroscope:
     def mean_rate(self, scan: Scan) -> FloatArray | None:
         """(3,) the constant rate during a sweep, rad/s, with the bias; None where sweep or samples have no times."""
         turns = self._turns(scan)
-        return None if turns is None else turns.mean_rate()
+        return None if turns is None else turns[2]
 
     def evened(self, scan: Scan) -> Scan:
         """The sweep as if the sensor had turned at `mean_rate` all the time.
@@ -105,11 +86,14 @@ class Gyroscope:
         turns = self._turns(scan)
         if turns is None or scan.time_offsets is None:
             return scan
-        remaining = turns.uneven(turns.mean_rate())
-        vectors = np.stack([np.interp(scan.time_offsets, turns.times, axis) for axis in remaining.T], axis=1)
+        times, T_stamp_t, rate = turns
+        steady = exp(np.pad(times[:, None] * rate, ((0, 0), (0, 3))))
+        remaining = log(inverse(steady) @ T_stamp_t)[:, :3]
+        vectors = np.stack([np.interp(scan.time_offsets, times, axis) for axis in remaining.T], axis=1)
         return replace(scan, points=_rotated(scan.points, vectors))
 
-    def _turns(self, scan: Scan) -> _Turns | None:
+    def _turns(self, scan: Scan) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Times (N,) during a sweep, the turns (N, 4, 4) since its stamp, and the nearest constant rate (3,)."""
         if scan.time_offsets is None or not len(scan):
             return None
         begin, end = min(0.0, float(scan.time_offsets.min())), max(0.0, float(scan.time_offsets.max()))
@@ -117,7 +101,8 @@ class Gyroscope:
             return None
         times = np.union1d(np.linspace(begin, end, max(2, int(np.ceil((end - begin) / _STEP_S)) + 1)), [0.0])
         rotations = self.rotations(scan.stamp + times, _NO_BIAS)
-        return _Turns(times, rotations[np.searchsorted(times, 0.0)].T @ rotations)
+        T_stamp_t = make_transform(rotations[np.searchsorted(times, 0.0)].T @ rotations, np.zeros(3))
+        return times, T_stamp_t, np.asarray(times @ log(T_stamp_t)[:, :3] / (times @ times), dtype=np.float64)
 
 
 def _rotated(points: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -48,7 +48,7 @@ class Inertial(Stateful):
     _measured_s: float | None  # stamp at which gravity was measured last
     _up_world: Annotated[FloatArray, Shape(3)] | None  # unit, as first known well
     _up_sigma: float  # radians
-    _direction: GravityDirection | None
+    direction: GravityDirection | None  # gravity as measured until the last scan, in its LiDAR frame
     # of the turns that were compared: their number, and the sums of squares of their angles and of the differences
     _turns: int
     _angles2: float
@@ -59,14 +59,14 @@ class Inertial(Stateful):
         self._integrate(samples)
         self._window = InertialWindow(self._preintegration, T_lidar_imu[:3, 3], lever_sigma_m)
         self._predicted: Knot | None = None
-        self._registered_s, self._measured_s, self._direction = None, None, None
+        self._registered_s, self._measured_s, self.direction = None, None, None
         self._up_world, self._up_sigma = None, np.pi
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
 
     def use(self, samples: ImuSamples) -> None:
         """Continue with other samples of the same IMU, such as the latest ones."""
         self._integrate(samples)
-        self._window.use(self._preintegration)
+        self._window.preintegration = self._preintegration
 
     def anew(self) -> "Inertial":
         """A new instance with the same samples."""
@@ -82,7 +82,11 @@ class Inertial(Stateful):
     @property
     def warnings(self) -> list[str]:
         """Problems of the IMU, one sentence each."""
-        warnings, last = [] if self._disagreement is None else [self._disagreement], self._window.last
+        warnings, last = [], self._window.last
+        differences2 = self._differences2 - self._turns * _REGISTRATION_ERROR**2
+        if self._turns >= _FEWEST_TURNS and differences2 >= _MOST_DIFFERENT**2 * self._angles2:
+            differ = f"differ by {100.0 * np.sqrt(differences2 / self._angles2):.0f} %"
+            warnings.append(f"the turns that IMU and LiDAR measured {differ}: the IMU's mounting or clock is wrong")
         if last is not None:
             whole = self._window.covariance()
             covariance = whole[9:15, 9:15]
@@ -101,20 +105,6 @@ class Inertial(Stateful):
         """(3,) position of the IMU in the LiDAR frame, as estimated."""
         return self._extrinsics[:3, 3] if self._window.last is None else self._window.last.lever
 
-    @property
-    def _disagreement(self) -> str | None:
-        """Where the turns of IMU and LiDAR disagree, its mounting or its clock is wrong; None else."""
-        differences2 = self._differences2 - self._turns * _REGISTRATION_ERROR**2
-        if self._turns < _FEWEST_TURNS or differences2 < _MOST_DIFFERENT**2 * self._angles2:
-            return None
-        percent = 100.0 * np.sqrt(differences2 / self._angles2)
-        return f"the turns that IMU and LiDAR measured differ by {percent:.0f} %: the IMU's mounting or clock is wrong"
-
-    @property
-    def direction(self) -> GravityDirection | None:
-        """Gravity as measured until the last scan, in its LiDAR frame; None where it was not."""
-        return self._direction
-
     def prior(self, scan: Scan, prior: Prior) -> Prior:
         """The odometry's prior of a scan, with the state that the IMU predicts."""
         last, self._predicted = self._window.last, None
@@ -127,20 +117,19 @@ class Inertial(Stateful):
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
         """Update with the result of a scan: biases, velocity and gravity follow it."""
-        knot, self._predicted, self._direction = self._predicted, None, None
-        follows = mapped.registered and mapped.is_connected
+        knot, self._predicted, self.direction = self._predicted, None, None
         if knot is None or (mapped.registered and not mapped.is_connected):
             self._up_world = None
             if mapped.registered or self._window.last is None:
                 self._begin(scan, mapped.state.T_world_lidar)
             return
-        if follows and mapped.measured is not None:
+        if mapped.registered and mapped.measured is not None:
             self._compare(knot, mapped)
             root = _root_of(mapped.measured.information)
             knot = replace(knot, T_world_lidar=mapped.measured.T_world_lidar, sqrt_information=root)
             self._registered_s = scan.stamp
         self._window.add(knot)
-        self._direction = self._gravity(knot.stamp)
+        self.direction = self._gravity(knot.stamp)
 
     def _gravity(self, stamp: float) -> GravityDirection | None:
         """Gravity once a second, as soon as its direction in the world is known."""

@@ -16,6 +16,7 @@ from gtsam import PreintegratedCombinedMeasurements, PreintegrationCombinedParam
 from gtsam.imuBias import ConstantBias
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import solve_triangular
+from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
@@ -170,14 +171,10 @@ class InertialWindow(Stateful):
     _latest: Annotated[FloatArray, Shape(_SIZE, _SIZE)]  # square root of the latest state's information
 
     def __init__(self, preintegration: Preintegration, lever: FloatArray, lever_sigma_m: float) -> None:
-        self._preintegration = preintegration
+        self.preintegration = preintegration  # of the samples from here on
         self._lever, self._lever_sigma_m = lever, lever_sigma_m
         self._measurements: dict[float, gtsam.PreintegratedCombinedMeasurements] = {}
         self._knots, self._prior, self._latest = [], None, np.eye(_SIZE)
-
-    def use(self, preintegration: Preintegration) -> None:
-        """Integrate these samples from here on."""
-        self._preintegration = preintegration
 
     @property
     def last(self) -> Knot | None:
@@ -195,8 +192,9 @@ class InertialWindow(Stateful):
         sigmas[_VELOCITY], sigmas[9:12], sigmas[12:15], sigmas[_WORLD] = _SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT
         sigmas[SCALE], sigmas[LEVER] = _SCALE, self._lever_sigma_m
         A = np.diag(1.0 / sigmas)
-        T_nav_world: FloatArray = np.eye(4)
-        T_nav_world[:3, :3] = _turn_to_vertical(T_world_lidar[:3, :3] @ up)
+        # The shortest rotation that turns the force to the z axis.
+        vertical = Rotation.align_vectors([[0.0, 0.0, 1.0]], [T_world_lidar[:3, :3] @ up])[0]
+        T_nav_world = make_transform(vertical.as_matrix(), np.zeros(3))
         bias, scale, lever = np.zeros(6), 1.0, self._lever
         if last is not None:
             bias, scale, lever = last.bias, last.scale, last.lever
@@ -214,7 +212,7 @@ class InertialWindow(Stateful):
     def predicted(self, stamp: float) -> Knot:
         """The state at the next stamp by the IMU alone."""
         last = self._knots[-1]
-        pim = self._preintegration.between(last.stamp, stamp, last.bias)
+        pim = self.preintegration.between(last.stamp, stamp, last.bias)
         self._measurements[stamp] = pim
         pose, velocity = _scaled(last, last)
         state = pim.predict(gtsam.NavState(pose, velocity), ConstantBias(last.bias[:3], last.bias[3:]))
@@ -276,7 +274,10 @@ class InertialWindow(Stateful):
             values.insert(X(n), pose)
             values.insert(V(n), velocity)
             values.insert(B(n), ConstantBias(knot.bias[:3], knot.bias[3:]))
-        pim = self._measured(first, second)
+        pim = self._measurements.get(second.stamp)
+        if pim is None:
+            pim = self.preintegration.between(first.stamp, second.stamp, second.integrated_at)
+            self._measurements[second.stamp] = pim
         factor = gtsam.CombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), pim).linearize(values)
         rows: FloatArray = np.zeros((_SIZE, 2 * _SIZE + 1))
         rows[:15, _OF_IMU] = factor.augmentedJacobian()
@@ -291,11 +292,6 @@ class InertialWindow(Stateful):
         rows[15:, 15:_SIZE], rows[15:, _SIZE + 15 : -1] = -np.diag(root), np.diag(root)
         rows[15:, -1] = -root * away
         return rows
-
-    def _measured(self, before: Knot, knot: Knot) -> gtsam.PreintegratedCombinedMeasurements:
-        if knot.stamp not in self._measurements:
-            self._measurements[knot.stamp] = self._preintegration.between(before.stamp, knot.stamp, knot.integrated_at)
-        return self._measurements[knot.stamp]
 
 
 def _scaled(knot: Knot, origin: Knot) -> tuple[gtsam.Pose3, FloatArray]:
@@ -328,13 +324,8 @@ def _remaining(second: Knot, R: FloatArray) -> _Prior:
 
 
 def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:
-    """Whitened rows `[own | b]` (31, 26) of a knot's Gaussian and its registered pose."""
+    """Whitened rows `[own | b]` (31, 26) of a knot's Gaussian, and of its registered pose, by Huber's kernel."""
     away = (prior.b - prior.A @ knot.away_from(prior.mean))[:, None]
-    return np.vstack([np.hstack([prior.A, away]), _registered_rows(knot)])
-
-
-def _registered_rows(knot: Knot) -> FloatArray:
-    """Whitened rows `[own | b]` (6, 26) of a registered pose, robust by Huber's kernel."""
     expected, root = knot.T_world_estimated, knot.sqrt_information
     residual = root @ log(inverse(knot.T_world_lidar) @ expected)
     norm = float(np.linalg.norm(residual))
@@ -343,11 +334,4 @@ def _registered_rows(knot: Knot) -> FloatArray:
     rows[:, _POSE] = root @ adjoint(inverse(knot.T_imu_lidar))
     rows[:, _WORLD] = -root @ adjoint(inverse(expected))
     rows[:, LEVER], rows[:, -1] = -root[:, 3:], -residual
-    return weight * rows
-
-
-def _turn_to_vertical(up: FloatArray) -> FloatArray:
-    """(3, 3) the shortest rotation that turns a vector (3,) to the z axis."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix(), dtype=np.float64)
+    return np.vstack([np.hstack([prior.A, away]), weight * rows])

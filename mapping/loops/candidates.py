@@ -133,22 +133,22 @@ class KeyframeDatabase(Stateful):
         """Earlier keyframes of the segment within reach of the estimate."""
         track, submap = self.track, self.submaps[index]
         others = others[track.segment[others] == track.segment[index]]
-        rotation, translation = track.drift(others, index)
+        _, translation = track.drift(others, index)
         distance = np.linalg.norm(track.T_world_lidar[others, :3, 3] - track.T_world_lidar[index, :3, 3], axis=1)
         within = distance < submap.range_m + 2.0 * translation
         if not within.any():
             return
-        others, rotation, translation, distance = (v[within] for v in (others, rotation, translation, distance))
+        others, translation, distance = others[within], translation[within], distance[within]
         similarity, _ = self._compare(BirdEyeView.of(submap), others)
         # The nearest while drift is small, the most similar once it is large.
         cost = distance / (submap.range_m + translation) - similarity
         for k in _spread(others, cost, _NEARBY_CANDIDATES):
-            guess = self._near_estimate(int(others[k]), index, float(rotation[k]), float(translation[k]))
-            yield Candidate(int(others[k]), False, guess)
+            yield Candidate(int(others[k]), False, self._near_estimate(int(others[k]), index))
 
-    def _near_estimate(self, first: int, second: int, rotation: float, translation: float) -> FloatArray:
+    def _near_estimate(self, first: int, second: int) -> FloatArray:
         """`T_first_second` (4, 4) by aligning the views, within standard deviations of the drift."""
         estimate = self.track.between(first, second)
+        rotation, translation = (float(sigma[0]) for sigma in self.track.drift(np.array([first]), second))
         target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
         level = target.R_level_lidar @ estimate[:3, :3] @ source.R_level_lidar.T
         half = max(_YAW_MIN, _YAW_SIGMAS * rotation)
@@ -158,12 +158,11 @@ class KeyframeDatabase(Stateful):
 
     def starts(self, first: int, second: int) -> list[FloatArray]:
         """`T_first_second` (4, 4) to begin with: estimated, of views aligned within the drift, and in each sector."""
-        rotation, translation = self.track.drift(np.array([first]), second)
         target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
         sectors = np.linspace(-np.pi, np.pi, _ALL_YAWS, endpoint=False).reshape(_SECTORS, -1)
         return [
             self.track.between(first, second),
-            self._near_estimate(first, second, float(rotation[0]), float(translation[0])),
+            self._near_estimate(first, second),
             *(align(target, source, yaws, self.radius_m)[0] for yaws in sectors),
         ]
 

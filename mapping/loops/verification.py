@@ -237,14 +237,15 @@ def verify(target: SubmapCloud, source: SubmapCloud, guess: FloatArray) -> Verif
 def evaluate(target: SubmapCloud, source: SubmapCloud, T_target_source: FloatArray) -> Verification:
     """Inliers and covariance at a pose (4, 4)."""
     T = T_target_source
-    forward, backward = _Fit.of(target, source, T), _Fit.of(source, target, inverse(T))
+    inliers, overlap, information = _fit(target, source, T)
+    _, overlap_back, information_back = _fit(source, target, inverse(T))
     cell_m = max(target.submap.cell_m, source.submap.cell_m)
-    found = correspondences(target, source, T, np.flatnonzero(forward.inliers), _REACH * cell_m)
+    found = correspondences(target, source, T, np.flatnonzero(inliers), _REACH * cell_m)
     residual_m = float(np.sqrt(np.mean(found.residuals**2))) if len(found.residuals) else np.inf
     covariance, names = _covariance(found, residual_m, np.array([target.middle_m, source.middle_m]))
     return Verification(
-        T, covariance, min(forward.overlap, backward.overlap), min(forward.information, backward.information),
-        residual_m, float(forward.inliers.mean()), int(forward.inliers.sum()), names,
+        T, covariance, min(overlap, overlap_back), min(information, information_back), residual_m,
+        float(inliers.mean()), int(inliers.sum()), names,
     )  # fmt: skip
 
 
@@ -265,33 +266,25 @@ def _covariance(found: Correspondences, residual_m: float, middles_m: FloatArray
     return np.asarray(np.linalg.inv(information) + np.diag(variances), dtype=np.float64), degeneracy.names
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Inliers (N,) of one side, and their share of its points that the other side sees, plainly and by information."""
-
-    inliers: NDArray[np.bool_]
-    overlap: float
-    information: float
-
-    @classmethod
-    def of(cls, target: SubmapCloud, source: SubmapCloud, T: FloatArray) -> "_Fit":
-        cell_m = max(target.submap.cell_m, source.submap.cell_m)
-        gate_m = max(_GATE * cell_m, _GATE_MIN_M)
-        there = transform_points(T, source.points)
-        ranges = np.linalg.norm(there, axis=1)
-        reach_m = np.maximum(_REACH * cell_m, _REACH_PER_RANGE * ranges)
-        s, t = match(target, source, T, np.arange(len(there)), float(reach_m.max(initial=0.0)))
-        apart = there[s] - target.points[t]
-        along = np.einsum("ij,ij->i", apart, target.axes[t])
-        squared = np.einsum("ij,ij->i", apart, apart)
-        off = np.where(target.is_line[t], np.sqrt(np.maximum(squared - along**2, 0.0)) - _LINE_NOISE_M, np.abs(along))
-        inliers = np.zeros(len(there), dtype=bool)
-        inliers[s[(off < gate_m) & (squared < reach_m[s] ** 2)]] = True
-        # The other side should have seen a point that is nearer than the nearest range that it saw in its direction.
-        seen = target.submap.nearest_ranges(there)
-        in_view = inliers | ((seen > 0.0) & (ranges < seen + gate_m))
-        overlap = float(inliers.sum() / max(in_view.sum(), 1))
-        return cls(inliers, overlap, _information_share(source, inliers, in_view))
+def _fit(target: SubmapCloud, source: SubmapCloud, T: FloatArray) -> tuple[NDArray[np.bool_], float, float]:
+    """Inliers (N,) of the source, and their share of what the target sees of it, plainly and by information."""
+    cell_m = max(target.submap.cell_m, source.submap.cell_m)
+    gate_m = max(_GATE * cell_m, _GATE_MIN_M)
+    there = transform_points(T, source.points)
+    ranges = np.linalg.norm(there, axis=1)
+    reach_m = np.maximum(_REACH * cell_m, _REACH_PER_RANGE * ranges)
+    s, t = match(target, source, T, np.arange(len(there)), float(reach_m.max(initial=0.0)))
+    apart = there[s] - target.points[t]
+    along = np.einsum("ij,ij->i", apart, target.axes[t])
+    squared = np.einsum("ij,ij->i", apart, apart)
+    off = np.where(target.is_line[t], np.sqrt(np.maximum(squared - along**2, 0.0)) - _LINE_NOISE_M, np.abs(along))
+    inliers = np.zeros(len(there), dtype=bool)
+    inliers[s[(off < gate_m) & (squared < reach_m[s] ** 2)]] = True
+    # The other side should have seen a point that is nearer than the nearest range that it saw in its direction.
+    seen = target.submap.nearest_ranges(there)
+    in_view = inliers | ((seen > 0.0) & (ranges < seen + gate_m))
+    overlap = float(inliers.sum() / max(in_view.sum(), 1))
+    return inliers, overlap, _information_share(source, inliers, in_view)
 
 
 def _information_share(source: SubmapCloud, inliers: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> float:

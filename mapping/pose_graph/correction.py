@@ -45,10 +45,7 @@ def recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDA
 
 
 def in_frames(poses: FloatArray, frames: NDArray[np.intp], registered: FloatArray) -> FloatArray:
-    """Keyframe poses (K, 4, 4) moved rigidly for each frame (K,), its first keyframe to its registered pose (K, 4, 4).
-
-    An outlier closure may have moved a component that no edge moves back.
-    """
+    """Keyframe poses (K, 4, 4) moved rigidly for each frame (K,), its first keyframe to its registered pose."""
     moved = poses.copy()
     for frame in np.unique(frames):
         keys = np.flatnonzero(frames == frame)

@@ -147,6 +147,7 @@ class SlamGraph(KeyframeGraph):
         of = recordings_of(scans, firsts)
         frames = first_connected(len(firsts), [(int(of[loop.first]), int(of[loop.second])) for loop in loops])
         registered = np.array(self.scan_poses)
+        # An outlier closure may have moved a component that no edge moves back.
         poses = in_frames(optimised.poses, frames[of], registered[scans])
         corrected, measured = corrected_recordings(registered, firsts, scans, poses), (*self.edges, *loops)
         return Corrected(corrected, scans, poses, tuple(closures), inliers, measured, firsts, frames)

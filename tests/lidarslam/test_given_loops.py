@@ -39,24 +39,14 @@ def test_a_given_loop_is_closed_and_part_of_the_run(small_recording: Path, tmp_p
 
 @pytest.mark.parametrize(
     ("overlap", "pair", "reason"),
-    [
-        ("1.0", (0, 5), "of the points in view are inliers"),
-        ("0.75", (4, 5), "no keyframe lies between the scans"),
-    ],
+    [("1.0", (0, 5), "of the points in view are inliers"), ("0.75", (4, 5), "no keyframe lies between the scans")],
 )
 def test_a_loop_that_cannot_be_closed_is_said_in_a_line(
     small_recording: Path, tmp_path: Path, overlap: str, pair: tuple[int, int], reason: str
 ) -> None:
     distance = () if pair == (0, 5) else ("--set", "pose_graph.keyframes.distance_m=50")
-    ran = run(
-        small_recording,
-        tmp_path / "run",
-        "--loop",
-        *pair,
-        "--set",
-        f"pose_graph.loops.min_overlap={overlap}",
-        *distance,
-    )
+    given = ("--loop", *pair, "--set", f"pose_graph.loops.min_overlap={overlap}", *distance)
+    ran = run(small_recording, tmp_path / "run", *given)
     assert ran.exit_code == 0, ran.output
     (line,) = [line for line in ran.stdout.splitlines() if "--loop" in line]
     assert line.startswith(f"warning: --loop {pair[0]} {pair[1]} was not closed: ")

@@ -53,11 +53,6 @@ class Later(Motion):
         return super().pose_at(times + self.since_s)
 
 
-def brightness(in_office: FloatArray) -> FloatArray:
-    """Intensities (N,) that say where in the office points (N, 3) lie."""
-    return np.asarray(in_office @ [1.0, 2.0, 3.0])
-
-
 def record(folder: Path, office: int, since_s: float, scans: int, noise: int) -> Path:
     """Part of a walk through an office with a VLP-16, as .npy scans with times, stamps and ground truth."""
     world = build_world("office", office)
@@ -67,15 +62,13 @@ def record(folder: Path, office: int, since_s: float, scans: int, noise: int) ->
         world, find_sensor("vlp-16"), motion, mount_pose("upright", motion.sensor_height_m), scans, noise
     )
     folder.mkdir()
-    types = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8"), ("intensity", "f4")])
+    types = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8")])
     stamps = []
     for index, scan in enumerate(simulation.scans()):
         assert scan.time_offsets is not None
         table = np.empty(len(scan), dtype=types)
         table["x"], table["y"], table["z"] = scan.points.T
         table["time"] = scan.time_offsets
-        poses = simulation.T_world_lidar_at(scan.stamp + scan.time_offsets)
-        table["intensity"] = brightness(np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points) + poses[:, :3, 3])
         np.save(folder / f"{index:06d}.npy", table)
         stamps.append(scan.stamp)
     np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
@@ -142,18 +135,6 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(
     # Walls that both saw are one wall.
     both = cKDTree(first).query(second)[0]
     assert np.median(both) < 0.06
-
-
-def test_the_common_map_has_the_intensities_of_both(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
-    T_office_common = read_tum(places["first"] / "ground_truth.tum").T_world_lidar[0]
-    for name in (".", "01_first", "03_second"):
-        cloud = load_map(merged[0] / name)
-        assert cloud.attributes.intensity is not None
-        off = np.abs(cloud.attributes.intensity - brightness(transform_points(T_office_common, cloud.points)))
-        # The frame is up to 10 cm off, and the intensity changes by 3.7 a metre.
-        assert np.ptp(cloud.attributes.intensity) > 20.0
-        assert np.median(off) < 0.3
-        assert np.percentile(off, 99.0) < 1.0
 
 
 def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
@@ -337,6 +318,7 @@ def killed_merges(root: Path, kills: list[int], rooms: list[Path], *more: str) -
     return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
 
 
+@pytest.mark.slow
 def test_a_killed_merge_is_refused_and_resumed_or_made_again(
     rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
 ) -> None:
@@ -369,6 +351,7 @@ def test_a_killed_merge_is_refused_and_resumed_or_made_again(
     assert sorted(path.name for path in reversed_out.iterdir() if path.is_dir()) == ["01_in_room_1", "02_in_room_0"]
 
 
+@pytest.mark.slow
 def test_what_a_killed_overwrite_of_a_merge_was_to_replace_is_given_back(
     rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
 ) -> None:

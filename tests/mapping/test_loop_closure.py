@@ -140,16 +140,8 @@ def test_nothing_is_closed_on_a_way_without_return(hall):
     assert accepted(closures) == []
 
 
-@pytest.mark.parametrize(
-    "mount",
-    [
-        pytest.param(np.eye(4), id="upright", marks=pytest.mark.slow),
-        pytest.param(UPSIDE_DOWN, id="upside down"),
-        pytest.param(exp([0.1, 0.35, 0, 0, 0, 0]), id="tilted", marks=pytest.mark.slow),
-    ],
-)
-def test_segments_are_joined_whatever_their_worlds_and_mounts(hall, mount):
-    first, second = round_trip(0.6), round_trip(0.9)[9:] @ exp([0, 0, 0.2, 0.3, -0.2, 0.0]) @ mount
+def test_segments_are_joined_whatever_their_worlds_and_mounts(hall):
+    first, second = round_trip(0.6), round_trip(0.9)[9:] @ exp([0, 0, 0.2, 0.3, -0.2, 0.0]) @ UPSIDE_DOWN
     submaps = submaps_of(hall, first, 0) + submaps_of(hall, second, 1, len(first))
     unrelated = exp([0.1, 0.2, 2.0, 300.0, 5.0, -9.0])
     closures, _ = detect(submaps, np.concatenate([first, unrelated @ second]))

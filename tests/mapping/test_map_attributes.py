@@ -75,6 +75,9 @@ def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng):
             submap.add(points, np.eye(4), known)
             direct.add(points, pose, known)
         drawn.add_means(submap.means(), pose)
+    for hits in (1, 3):
+        np.testing.assert_allclose(drawn.points(hits), direct.points(hits), atol=1e-5)
+    np.testing.assert_allclose(drawn.cloud().normals, direct.cloud().normals, atol=1e-3)
     expected = dict(direct.cloud().attributes.present())
     assert len(expected) == 4
     for name, values in drawn.cloud().attributes.present():

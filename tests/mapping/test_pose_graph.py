@@ -191,7 +191,6 @@ def test_of_two_loops_that_contradict_one_another_at_most_one_is_an_inlier(rng):
     "covariance",
     [
         np.zeros((6, 6)),
-        np.full((6, 6), 1e-12),
         np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e8]),
         np.diag([-1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4]),
         np.eye(6) + np.triu(np.ones((6, 6)), 1) * 1e-3,
@@ -208,14 +207,7 @@ def test_bad_covariances_are_bounded_and_do_no_harm(covariance):
 
 
 @pytest.mark.parametrize(
-    "variances",
-    [
-        [1e-6, 1e-6, 1e-6, 1e8, 1e-4, 1e-4],
-        [1e-12, 1e-12, 1e-12, 1e8, 1e-12, 1e-12],
-        [1e8, 1e8, 1e8, 1e-8, 1e-8, 1e-8],
-        [1e8] * 6,
-        [0.0] * 6,
-    ],
+    "variances", [[1e-6, 1e-6, 1e-6, 1e8, 1e-4, 1e-4], [1e8, 1e8, 1e8, 1e-8, 1e-8, 1e-8], [0.0] * 6]
 )
 def test_a_chain_that_is_loose_in_some_directions_can_be_solved(variances):
     truth = laps(2 * LAP)

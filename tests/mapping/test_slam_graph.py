@@ -103,13 +103,6 @@ def second_walk() -> Walk:
     return _walk(world, np.arange(27.0, 57.0, 0.4), np.random.default_rng(8), T_own_block)
 
 
-@pytest.fixture(scope="module")
-def foreign_walk() -> Walk:
-    """Through another block."""
-    rng = np.random.default_rng(99)
-    return _walk(_block(rng), np.arange(0.0, 40.0, 0.4), rng)
-
-
 def _walk(world: FloatArray, ways: FloatArray, rng: np.random.Generator, T_own_block: FloatArray | None = None) -> Walk:
     truth = np.array([exp([0.0, 0.0, 0.0, *_along(w)[:2], 1.0]) @ exp([0, 0, _heading(w), 0, 0, 0]) for w in ways])
     points = []
@@ -412,17 +405,6 @@ def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace
     )
     np.testing.assert_allclose(steps, as_joined, atol=1e-3)
     np.testing.assert_allclose(result.T_world_lidar[:count], joined.T_world_lidar[:count], atol=1e-3)
-
-
-def test_recordings_of_different_places_stay_apart(walk, foreign_walk):
-    graph, result = follow_all(
-        replace(walk, truth=walk.truth[:80], estimate=walk.estimate[:80], points=walk.points[:80]), foreign_walk
-    )
-    assert result.frames.tolist() == [0, 1]
-    assert not any(result.inliers)
-    np.testing.assert_allclose(result.T_world_lidar[80:], foreign_walk.estimate, atol=1e-6)
-    np.testing.assert_allclose(result.T_world_lidar[:80], walk.estimate[:80], atol=1e-6)
-    graph.close()
 
 
 def test_recordings_without_a_keyframe_are_in_frames_of_their_own(walk):
