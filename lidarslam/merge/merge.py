@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.tasks import open_tasks
 from lidarslam.core.text import count
 from lidarslam.datasets.faults import Faults
@@ -24,7 +24,6 @@ from lidarslam.merge.parts import (
     PartDone,
     PartTask,
     Show,
-    closing_loops,
     earlier_parts,
     open_parts,
     remove_part,
@@ -51,7 +50,12 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
     killed or interrupted can be resumed.
     """
     started = time.perf_counter()
-    request = replace(request, config=closing_loops(request.config))
+    if request.config.odometry.method == "external":
+        raise ConfigError(
+            "odometry.method is external: one trajectory is not that of several recordings; choose another"
+        )
+    pose_graph = request.config.pose_graph.model_copy(update={"enabled": True})
+    request = replace(request, config=request.config.model_copy(update={"pose_graph": pose_graph}))
     runs, earlier = open_parts(request), earlier_parts(request.out)
     names = {run.out.name for run, _ in runs}
     config = _on_common_voxels(request.config, [recording for _, recording in runs])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.config.settings import Config
-from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
 from lidarslam.core.state import Saved, decode, encode
 from lidarslam.core.tasks import SERIAL, Where
@@ -53,15 +53,6 @@ class MergeRequest:
     def describe(self) -> dict[str, Any]:
         """For config.yaml, and for the parts of an unfinished merge."""
         return {"version": version("lidarslam"), "sources": [str(resolved(source)) for source in self.sources]}
-
-
-def closing_loops(config: Config) -> Config:
-    """The configuration with the pose graph; ConfigError where the odometry is a trajectory of one recording."""
-    if config.odometry.method == "external":
-        raise ConfigError(
-            "odometry.method is external: one trajectory is not that of several recordings; choose another"
-        )
-    return config.model_copy(update={"pose_graph": config.pose_graph.model_copy(update={"enabled": True})})
 
 
 def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:

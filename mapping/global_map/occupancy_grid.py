@@ -95,11 +95,9 @@ def occupancy_grid(
     eyes = (viewpoints[:, 1::-1] - origin[::-1]) / step
     mark_visible(occupied, np.ascontiguousarray(eyes), options.max_range_m / step, visible)
     by_ground = binary_dilation(ground.observed, iterations=_GROUND_REACH)
-    y = origin[1] + step * (np.arange(rows) + 0.5)
-    x = origin[0] + step * (np.arange(columns) + 0.5)
-    ground_row, _ = ground.cells(np.column_stack([np.full(rows, x[0]), y]))
-    _, ground_column = ground.cells(np.column_stack([x, np.full(columns, y[0])]))
-    free |= visible & by_ground[np.ix_(ground_row, ground_column)]
+    middles = origin + step * (np.arange(max(rows, columns))[:, None] + 0.5)
+    ground_row, ground_column = ground.cells(middles)
+    free |= visible & by_ground[np.ix_(ground_row[:rows], ground_column[:columns])]
 
     cells = np.full((rows, columns), UNKNOWN, dtype=np.int8)
     cells[free] = FREE
@@ -170,17 +168,7 @@ def find_ground(points: FloatArray, normals: FloatArray, positions: FloatArray) 
     order = np.lexsort((upright[:, 2], cell))
     starts = np.searchsorted(cell[order], np.arange(rows * columns + 1))
     row, column = ground.cells(seeds)
-    grow_ground(
-        upright[order, 2],
-        starts,
-        row * columns + column,
-        heights,
-        _STEP_M,
-        _FEWEST_GROUND_POINTS,
-        _LONGEST_GAP,
-        ground.heights,
-        ground.observed,
-    )
+    grow_ground(upright[order, 2], starts, row * columns + column, heights, ground.heights, ground.observed)
     return ground
 
 
@@ -216,9 +204,6 @@ def grow_ground(
     starts: NDArray[np.int64],
     seeds: NDArray[np.int64],
     seed_heights: FloatArray,
-    step_m: float,
-    fewest: int,
-    longest_gap: int,
     heights: FloatArray,
     observed: NDArray[np.bool_],
 ) -> None:
@@ -243,10 +228,10 @@ def grow_ground(
                 cell, expected, gap = row * columns + column, flat[parent], gaps[parent] + 1
             if not math.isnan(flat[cell]):
                 continue
-            measured_height = _height_near(z, starts[cell], starts[cell + 1], expected, step_m * max(1, gap), fewest)
+            measured_height = _height_near(z, starts[cell], starts[cell + 1], expected, _STEP_M * max(1, gap))
             if not math.isnan(measured_height):
                 flat[cell], measured[cell], gaps[cell] = measured_height, True, 0
-            elif gap > longest_gap:
+            elif gap > _LONGEST_GAP:
                 continue
             else:
                 flat[cell], gaps[cell] = expected, gap
@@ -256,13 +241,13 @@ def grow_ground(
 
 
 @compiled_part
-def _height_near(z: FloatArray, first: int, last: int, expected: float, tolerance: float, fewest: int) -> float:
+def _height_near(z: FloatArray, first: int, last: int, expected: float, tolerance: float) -> float:
     """Median of those of the ascending heights z[first:last] that are near the expected one; NaN of too few."""
     while first < last and z[first] < expected - tolerance:
         first += 1
     while last > first and z[last - 1] > expected + tolerance:
         last -= 1
-    return z[(first + last - 1) // 2] if last - first >= fewest else np.nan
+    return z[(first + last - 1) // 2] if last - first >= _FEWEST_GROUND_POINTS else np.nan
 
 
 @compiled
