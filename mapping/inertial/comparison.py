@@ -12,7 +12,6 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, log, make_transform
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
-from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.window import Preintegration
 
 # Turns and velocities are compared over this time: long enough for errors of registered poses to matter little.
@@ -120,8 +119,7 @@ class Comparison:
 
     def use(self, samples: ImuSamples) -> None:
         """Continue with other samples of the same IMU, such as the latest ones."""
-        self._gyroscope = Gyroscope(samples, self._T_lidar_imu[:3, :3])
-        self._preintegration = Preintegration(samples, self._T_lidar_imu[:3, :3])
+        self._imu = Preintegration(samples, self._T_lidar_imu[:3, :3])
 
     def add(self, stamp: float, T_world_lidar: FloatArray, is_connected: bool) -> None:
         """Add a registered pose (4, 4); one that does not follow from those before restarts the comparison."""
@@ -129,11 +127,11 @@ class Comparison:
             self._recent.clear()
         self._recent.append((stamp, T_world_lidar))
         first = self._before(stamp - _SPAN_S)
-        if first is None or not self._gyroscope.covers(first[0] - _SHIFT_S, stamp + _SHIFT_S):
+        if first is None or not self._imu.covers(first[0] - _SHIFT_S, stamp + _SHIFT_S):
             return
         self._compare_turns(first, (stamp, T_world_lidar))
         earlier = self._before(first[0] - _SPAN_S)
-        if earlier is not None and self._gyroscope.covers(earlier[0], stamp):
+        if earlier is not None and self._imu.covers(earlier[0], stamp):
             self._compare_velocities(earlier, first, (stamp, T_world_lidar))
         while self._recent and self._recent[0][0] < stamp - _LONGEST_S:
             self._recent.popleft()
@@ -230,10 +228,10 @@ class Comparison:
     def _compare_turns(self, first: tuple[float, FloatArray], last: tuple[float, FloatArray]) -> None:
         begin, end = first[0], last[0]
         none = np.zeros(3)
-        imu = _vector(self._gyroscope.turn(begin, end, none))
-        later = _vector(self._gyroscope.turn(begin + _SHIFT_S, end + _SHIFT_S, none))
+        imu = _vector(self._imu.turn(begin, end, none))
+        later = _vector(self._imu.turn(begin + _SHIFT_S, end + _SHIFT_S, none))
         lidar = _vector(first[1][:3, :3].T @ last[1][:3, :3])
-        integral = self._preintegration.means(np.array([begin, end]))[0, :3] * (end - begin)
+        integral = self._imu.means(np.array([begin, end]))[0, :3] * (end - begin)
         self._turns.append(np.concatenate([lidar, imu, (later - imu) / _SHIFT_S, [end - begin], integral]))
 
     def _compare_velocities(self, *poses: tuple[float, FloatArray]) -> None:
@@ -242,7 +240,7 @@ class Comparison:
         rotations = np.stack([T[:3, :3] for _, T in poses])
         positions = np.stack([T[:3, 3] + T[:3, :3] @ self._T_lidar_imu[:3, 3] for _, T in poses])
         first, second = np.diff(stamps)
-        pims = [self._preintegration.between(a, b, np.zeros(6)) for a, b in pairwise(stamps)]
+        pims = [self._imu.between(a, b, np.zeros(6)) for a, b in pairwise(stamps)]
         lidar = (positions[2] - positions[1]) / second - (positions[1] - positions[0]) / first
         imu = (
             rotations[0] @ (pims[0].deltaVij() - pims[0].deltaPij() / first)

@@ -1,4 +1,4 @@
-"""Integration of a gyroscope's samples: turns between instants, and sweeps as of a constant rate."""
+"""Integration of an IMU's samples: turns between instants, and sweeps as of a constant rate."""
 
 from dataclasses import replace
 
@@ -15,31 +15,33 @@ _GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.02
 _NO_BIAS = np.zeros(3)
 
 
-class Integral:
-    """The integral of samples (N, 3), linear between their stamps (N,)."""
-
-    def __init__(self, stamps: FloatArray, samples: FloatArray) -> None:
-        from scipy.interpolate import make_interp_spline  # takes a while to load
-
-        self._begin = stamps[0]  # of clocks that count from 1970 half the digits would be lost
-        self._curve = make_interp_spline(stamps - stamps[0], samples, k=1).antiderivative()
-
-    def between(self, instants: FloatArray) -> FloatArray:
-        """(M - 1, 3) from each of M instants to the next."""
-        return np.diff(self._curve(instants - self._begin), axis=0)
-
-    def rates(self, instants: FloatArray) -> FloatArray:
-        """(M, 3) the samples' values at M instants."""
-        return np.asarray(self._curve(instants - self._begin, 1), dtype=np.float64)
-
-
 class Gyroscope:
-    """The angular velocity of the LiDAR, linear between two samples or more, by the extrinsic rotation (3, 3)."""
+    """An IMU's two samples or more in the LiDAR's axes, linear between stamps, by the extrinsic rotation (3, 3)."""
 
     def __init__(self, samples: ImuSamples, R_lidar_imu: FloatArray) -> None:
+        from scipy.interpolate import make_interp_spline  # takes a while to load
+
         self._stamps = samples.stamps
-        self._angle = Integral(samples.stamps, samples.angular_velocities @ R_lidar_imu.T)
+        self._rows = np.hstack([samples.angular_velocities @ R_lidar_imu.T, samples.accelerations @ R_lidar_imu.T])
+        # From the first stamp on: of clocks that count from 1970 half the digits would be lost.
+        self._curve = make_interp_spline(self._stamps - self._stamps[0], self._rows, k=1).antiderivative()
         self._longest_s = max(_GAP_INTERVALS * float(np.median(np.diff(samples.stamps))), _LEAST_GAP_S)
+
+    def _integrals(self, instants: FloatArray) -> FloatArray:
+        """(M - 1, 6) of angular velocity and specific force, from each of M instants to the next."""
+        return np.diff(self._curve(instants - self._stamps[0]), axis=0)
+
+    def _samples(self, instants: FloatArray) -> FloatArray:
+        """(M, 6) at M instants."""
+        return np.asarray(self._curve(instants - self._stamps[0], 1), dtype=np.float64)
+
+    def means(self, instants: FloatArray) -> FloatArray:
+        """(M - 1, 6) mean angular velocity and specific force between M instants."""
+        inside = np.clip(instants, self._stamps[0], self._stamps[-1])
+        steps = np.diff(inside)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            means = self._integrals(inside) / steps[:, None]
+        return np.where(steps[:, None] > 0.0, means, self._samples(inside[1:]))
 
     def covers(self, first_s: float, last_s: float) -> bool:
         """Whether samples without a gap surround a time."""
@@ -61,10 +63,10 @@ class Gyroscope:
     def rotations(self, instants: FloatArray, bias: FloatArray) -> FloatArray:
         """(N, 3, 3) R_first_t of the LiDAR at N instants, the first of which is the reference."""
         inside = np.clip(instants, self._stamps[0], self._stamps[-1])  # the last rate is held for the rest
-        angles = self._angle.between(inside)
+        angles = self._integrals(inside)[:, :3]
         beyond = np.diff(instants) - np.diff(inside)
         if beyond.any():
-            angles = angles + beyond[:, None] * self._angle.rates(inside[1:])
+            angles = angles + beyond[:, None] * self._samples(inside[1:])[:, :3]
         steps = exp(np.pad(angles - np.diff(instants)[:, None] * bias, ((0, 0), (0, 3)))).reshape(-1, 4, 4)[:, :3, :3]
         rotations: FloatArray = np.empty((len(instants), 3, 3))
         rotations[0] = np.eye(3)

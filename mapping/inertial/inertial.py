@@ -9,7 +9,6 @@ from lidarslam.core.geometry import FloatArray, adjoint, inverse, rotation_angle
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
-from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.window import LEVER, SCALE, STANDARD_GRAVITY, InertialWindow, Knot, Preintegration
 from lidarslam.mapping.motion.prediction import GravityDirection, MotionState, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
@@ -57,7 +56,7 @@ class Inertial(Stateful):
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray, lever_sigma_m: float = KNOWN_LEVER_M) -> None:
         self._extrinsics, self._lever_sigma_m = T_lidar_imu, lever_sigma_m
         self._integrate(samples)
-        self._window = InertialWindow(self._preintegration, T_lidar_imu[:3, 3], lever_sigma_m)
+        self._window = InertialWindow(self.gyroscope, T_lidar_imu[:3, 3], lever_sigma_m)
         self._predicted: Knot | None = None
         self._registered_s, self._measured_s, self.direction = None, None, None
         self._up_world, self._up_sigma = None, np.pi
@@ -66,7 +65,7 @@ class Inertial(Stateful):
     def use(self, samples: ImuSamples) -> None:
         """Continue with other samples of the same IMU, such as the latest ones."""
         self._integrate(samples)
-        self._window.preintegration = self._preintegration
+        self._window.preintegration = self.gyroscope
 
     def anew(self) -> "Inertial":
         """A new instance with the same samples."""
@@ -151,15 +150,14 @@ class Inertial(Stateful):
 
     def _integrate(self, samples: ImuSamples) -> None:
         self._samples = samples
-        self.gyroscope = Gyroscope(samples, self._extrinsics[:3, :3])
-        self._preintegration = Preintegration(samples, self._extrinsics[:3, :3])
+        self.gyroscope = Preintegration(samples, self._extrinsics[:3, :3])
 
     def _begin(self, scan: Scan, T_world_lidar: FloatArray) -> None:
         if self.gyroscope.covers(scan.stamp, scan.stamp):
             instants = self.gyroscope.within(scan.stamp - _LEVEL_S, scan.stamp + _LEVEL_S, _STEP_S)
             turns = self.gyroscope.rotations(instants, np.zeros(3))
             at = self.gyroscope.turn(scan.stamp, instants[0], np.zeros(3))
-            up = at @ np.einsum("nij,nj->i", turns[:-1], self._preintegration.means(instants)[:, 3:])
+            up = at @ np.einsum("nij,nj->i", turns[:-1], self.gyroscope.means(instants)[:, 3:])
             is_level = self._registered_s is not None and scan.stamp - self._registered_s < _DEAD_RECKONING_S
             self._window.begin(scan.stamp, T_world_lidar, np.diag(1.0 / _REGISTRATION), up, is_level)
             self._registered_s = scan.stamp
@@ -170,7 +168,7 @@ class Inertial(Stateful):
         T_world_lidar, R = knot.T_world_estimated, T_nav_lidar[:3, :3]
         begin, end = _sweep(scan)
         around = scan.stamp + (np.array([begin, end]) if end > begin else np.array([-0.005, 0.005]))
-        mean = self._preintegration.means(around)[0]
+        mean = self.gyroscope.means(around)[0]
         rate = self.gyroscope.mean_rate(scan)
         rate = (mean[:3] if rate is None else rate) - knot.bias[3:]
         acceleration, own = (mean[3:] - knot.bias[:3] - R[2] * STANDARD_GRAVITY) / knot.scale, R.T @ knot.velocity

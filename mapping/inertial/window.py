@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.state import TRANSFORM, Shape, Stateful
-from lidarslam.mapping.inertial.gyroscope import Integral
+from lidarslam.mapping.inertial.gyroscope import Gyroscope
 
 STANDARD_GRAVITY = 9.81  # m/s^2
 # Least white noise: rad/s/sqrt(Hz) and m/s^2/sqrt(Hz); walk of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s).
@@ -49,14 +49,13 @@ _HUBER = 4.0
 _OF_IMU = np.r_[0:9, _SIZE : _SIZE + 9, 9:15, _SIZE + 9 : _SIZE + 15, 2 * _SIZE]
 
 
-class Preintegration:
-    """Three samples or more in the LiDAR's axes, linear between their stamps, given the extrinsic rotation (3, 3)."""
+class Preintegration(Gyroscope):
+    """Three samples or more, integrated with their noise between the stamps of scans."""
 
     def __init__(self, samples: ImuSamples, R_lidar_imu: FloatArray) -> None:
-        rates, forces = samples.angular_velocities @ R_lidar_imu.T, samples.accelerations @ R_lidar_imu.T
-        self._stamps, self._integral = samples.stamps, Integral(samples.stamps, np.hstack([rates, forces]))
+        super().__init__(samples, R_lidar_imu)
         # Second differences of samples show noise and vibration, which the integration takes for motion.
-        second = np.diff(np.hstack([rates, forces]), n=2, axis=0).reshape(-1, 2, 3)
+        second = np.diff(self._rows, n=2, axis=0).reshape(-1, 2, 3)
         self._variances = np.cumsum(np.pad((second**2).mean(axis=2) / 6.0, ((2, 0), (0, 0))), axis=0)
 
     def between(self, first_s: float, last_s: float, bias: FloatArray) -> PreintegratedCombinedMeasurements:
@@ -76,21 +75,12 @@ class Preintegration:
                 pim.integrateMeasurement(mean[3:], mean[:3], step)
         return pim
 
-    def means(self, instants: FloatArray) -> FloatArray:
-        """(M - 1, 6) mean angular velocity and specific force between M instants."""
-        inside = np.clip(instants, self._stamps[0], self._stamps[-1])
-        steps = np.diff(inside)
-        at_ends = self._integral.rates(inside[1:])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            means = self._integral.between(inside) / steps[:, None]
-        return np.where(steps[:, None] > 0.0, means, at_ends)
-
     def _noise(self, first_s: float, last_s: float, count: int) -> PreintegrationCombinedParams:
         interval_s = last_s - first_s
         begin, end = np.searchsorted(self._stamps, (first_s, last_s)).clip(0, len(self._stamps) - 1)
         variances = (self._variances[end] - self._variances[begin]) / max(end - begin, 1)
         densities2 = variances * interval_s / max(count, 1) + np.array([_GYROSCOPE, _ACCELEROMETER]) ** 2
-        ends = self._integral.rates(np.clip([first_s, last_s], self._stamps[0], self._stamps[-1]))
+        ends = self._samples(np.clip([first_s, last_s], self._stamps[0], self._stamps[-1]))
         change = (ends[1] - ends[0]).reshape(2, 3)
         mean = self.means(np.array([first_s, last_s]))[0].reshape(2, 3)
         mean[1] -= STANDARD_GRAVITY * mean[1] / max(float(np.linalg.norm(mean[1])), 1e-9)

@@ -31,7 +31,7 @@ from lidarslam.mapping.pose_graph.edges import ProjectedTrack, drift_covariance,
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
 from lidarslam.mapping.pose_graph.optimizer import Optimised, RelaxSchedule, optimise, relax
-from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, as_registered, connected_with_last
+from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, connected_with_last
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 logger = logging.getLogger(__name__)
@@ -246,12 +246,9 @@ class SlamGraph(KeyframeGraph):
         first, second = self.keyframes[closure.first], self.keyframes[closure.second]
         # Of a recording that was added, the places of submaps in its rebuilt local maps are unknown.
         is_unknown = self._first_scans and any(closure.first < count <= closure.second for count in self.redraws)
-        place = self._laid.place(closure.first, first.scan, self.scan_poses[first.scan], second.scan)
-        if first.segment != second.segment or is_unknown or place is None:
+        if first.segment != second.segment or is_unknown:
             return closure
-        T_odom_first, since = place
-        way = np.array(self.scan_poses[since : second.scan + 1])
-        return as_registered(closure, T_odom_first, way, first.covariance, second.covariance, self._laid.radius_m)
+        return self._laid.as_registered(closure, first, second, self.scan_poses)
 
     def _dense_submap(self, key: int, cell_m: float) -> DenseSubmap:
         """A keyframe's submap united with its neighbours'."""

@@ -123,6 +123,30 @@ class SubmapPlacement(Stateful):
         rows = np.flatnonzero(drawn.keys == key)
         return (drawn.T_odom_keyframe[rows[0]], drawn.since) if len(rows) else None
 
+    def as_registered(
+        self, closure: LoopClosure, first: Keyframe, second: Keyframe, scan_poses: Sequence[FloatArray]
+    ) -> LoopClosure:
+        """The closure with the motion along the registered poses, where the map held its place along the whole path.
+
+        A scan registered to surfaces seen from an earlier keyframe measures its pose relative to that keyframe, with
+        all its points and without drift. Registering the two submaps measures the same again from the same points, with
+        more noise. Where the map did not hold the place, or the two contradict one another, the closure is as it was.
+        """
+        place = self.place(closure.first, first.scan, scan_poses[first.scan], second.scan)
+        if place is None or first.covariance is None or second.covariance is None:
+            return closure
+        T_odom_first, since = place
+        way = np.array(scan_poses[since : second.scan + 1])
+        if np.linalg.norm(way[:, :3, 3] - T_odom_first[:3, 3], axis=1).max() > _PART_OF_RADIUS * self.radius_m:
+            return closure
+        T_first_second = inverse(T_odom_first) @ way[-1]
+        A = adjoint(inverse(T_first_second))
+        covariance = second.covariance + A @ first.covariance @ A.T
+        difference = log(inverse(T_first_second) @ closure.T_first_second)
+        if difference @ np.linalg.solve(covariance + closure.covariance, difference) > _CHI_SQUARED_999:
+            return closure
+        return replace(closure, T_first_second=T_first_second, covariance=covariance)
+
     def _distances(self, poses: FloatArray) -> FloatArray:
         """(K,) of poses (K, 4, 4) from the last keyframe."""
         return np.asarray(np.linalg.norm(poses[:, :3, 3] - self._poses[-1][:3, 3], axis=1), dtype=np.float64)
@@ -146,38 +170,3 @@ def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, ra
         points = transform_points(T_odom_keyframe, rows[:, POSITION].astype(np.float64))
         drawn.insert_seen(points, elevations, views / lengths @ T_odom_keyframe[:3, :3].T, _WEIGHT)
     return drawn
-
-
-def as_registered(
-    closure: LoopClosure,
-    T_odom_first: FloatArray,
-    way: FloatArray,
-    first: FloatArray | None,
-    second: FloatArray | None,
-    radius_m: float,
-) -> LoopClosure:
-    """The closure with the motion along the trajectory, where the local map held its place along the whole path.
-
-    A scan registered to surfaces seen from an earlier keyframe measures its pose relative to that keyframe, with all
-    its points and without drift. Registering the two submaps measures the same again from the same points, with more
-    noise. Where the map did not hold the place, or the two contradict one another, the closure is as it was.
-
-    Args:
-        closure: of two keyframes.
-        T_odom_first: (4, 4) pose of the first one in the local map.
-        way: (N, 4, 4) registered poses of the scans from the one since which it is there to the second keyframe.
-        first, second: (6, 6) covariances of the poses of the keyframes, rotation first, in their LiDAR frames; None of
-            one that was not registered.
-        radius_m: of the local map; 0 without one.
-    """
-    if first is None or second is None or not len(way):
-        return closure
-    if np.linalg.norm(way[:, :3, 3] - T_odom_first[:3, 3], axis=1).max() > _PART_OF_RADIUS * radius_m:
-        return closure
-    T_first_second = inverse(T_odom_first) @ way[-1]
-    A = adjoint(inverse(T_first_second))
-    covariance = second + A @ first @ A.T
-    difference = log(inverse(T_first_second) @ closure.T_first_second)
-    if difference @ np.linalg.solve(covariance + closure.covariance, difference) > _CHI_SQUARED_999:
-        return closure
-    return replace(closure, T_first_second=T_first_second, covariance=covariance)

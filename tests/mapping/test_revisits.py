@@ -5,7 +5,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.mapping.pose_graph.submap_placement import as_registered
+from lidarslam.mapping.pose_graph.keyframes import Keyframe
+from lidarslam.mapping.pose_graph.submap_placement import Drawn, SubmapPlacement
 
 SIGMA = np.array([1e-3] * 3 + [5e-3] * 3)
 REGISTERED = np.diag(SIGMA**2)
@@ -31,8 +32,22 @@ def closure(way: FloatArray, off: FloatArray, sigma: float = 0.01) -> LoopClosur
 NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
 
 
+def as_registered(
+    measured: LoopClosure,
+    way: FloatArray,
+    radius_m: float,
+    first: FloatArray | None = REGISTERED,
+    drawn: tuple[Drawn, ...] = (),
+) -> LoopClosure:
+    """The closure of the first and last scan, in a local map of that radius."""
+    placement = SubmapPlacement(radius_m)
+    placement._drawn = [*drawn]
+    ends = Keyframe(0, 0, 0.0, first), Keyframe(len(way) - 1, 0, 1.0, REGISTERED)
+    return placement.as_registered(measured, *ends, list(way))
+
+
 def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip):
-    found = as_registered(closure(round_trip, NEAR), round_trip[0], round_trip, REGISTERED, REGISTERED, radius_m=100.0)
+    found = as_registered(closure(round_trip, NEAR), round_trip, 100.0)
     np.testing.assert_allclose(found.T_first_second, inverse(round_trip[0]) @ round_trip[-1], atol=1e-12)
     assert found.accepted
     assert np.linalg.eigvalsh(found.covariance - REGISTERED).min() > 0.0, "both registrations err"
@@ -40,8 +55,9 @@ def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_
 
 def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip):
     """The local map was drawn anew before the last ten scans, which are registered to its surfaces."""
-    measured, T_odom_first = closure(round_trip, NEAR), round_trip[0] @ exp(0.5 * NEAR)
-    found = as_registered(measured, T_odom_first, round_trip[-10:], REGISTERED, REGISTERED, radius_m=30.0)
+    T_odom_first = round_trip[0] @ exp(0.5 * NEAR)
+    drawn = Drawn(len(round_trip) - 10, np.array([0]), 1, T_odom_first[None])
+    found = as_registered(closure(round_trip, NEAR), round_trip, 30.0, drawn=(drawn,))
     np.testing.assert_allclose(found.T_first_second, inverse(T_odom_first) @ round_trip[-1], atol=1e-12)
 
 
@@ -57,4 +73,4 @@ def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip):
 )
 def test_elsewhere_the_closure_counts(round_trip, radius_m, first, off):
     measured = closure(round_trip, off)
-    assert as_registered(measured, round_trip[0], round_trip, first, REGISTERED, radius_m) is measured
+    assert as_registered(measured, round_trip, radius_m, first) is measured
