@@ -81,7 +81,7 @@ def poses(results: list[ScanEstimate]) -> FloatArray:
     return np.array([result.T_world_lidar for result in results])
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def corrected(room_scans: list[Scan], room_truth: Trajectory) -> FloatArray:
     return poses(list(pipeline_of(ExternalOdometry(room_truth), Graph()).run(room_scans)))
 
@@ -98,15 +98,14 @@ def test_the_map_is_replaced_so_many_scans_after_the_closure(
     assert (shift @ APART > 0.1 * (APART @ APART)).all()
 
 
-@pytest.mark.parametrize("delay_s", [0.005, 0.03])
 def test_it_does_not_depend_on_how_fast_the_graph_is(
-    corrected: FloatArray, room_scans: list[Scan], room_truth: Trajectory, delay_s: float
+    corrected: FloatArray, room_scans: list[Scan], room_truth: Trajectory
 ) -> None:
-    found = poses(list(pipeline_of(ExternalOdometry(room_truth), Graph(delay_s)).run(room_scans)))
+    found = poses(list(pipeline_of(ExternalOdometry(room_truth), Graph(delay_s=0.02)).run(room_scans)))
     np.testing.assert_array_equal(found, corrected)
 
 
-@pytest.mark.parametrize("at", [CLOSED_AT, CLOSED_AT + 4, CLOSED_AT + SCANS_LATER, CLOSED_AT + SCANS_LATER + 2])
+@pytest.mark.parametrize("at", [CLOSED_AT, CLOSED_AT + 4, CLOSED_AT + SCANS_LATER + 2])
 def test_a_map_that_waits_is_in_the_state(
     corrected: FloatArray,
     room_scans: list[Scan],

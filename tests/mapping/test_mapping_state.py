@@ -7,8 +7,6 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import KeyframeConfig, MappingConfig
-from lidarslam.mapping.global_map import global_map
-from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
@@ -81,24 +79,6 @@ def test_a_map_that_has_forgotten_goes_on(rng, through_disk, monkeypatch, tidied
         found = restored.match(queries, np.eye(4))
         for name, value in vars(whole.match(queries, np.eye(4))).items():
             np.testing.assert_array_equal(getattr(found, name), value)
-
-
-def test_a_global_map_goes_on(rng, through_disk, monkeypatch):
-    """It is merged when it would have been: sums in another order are rounded otherwise."""
-    monkeypatch.setattr(global_map, "_MIN_PENDING", 2500)
-    clouds = [rng.uniform(-3.0, 3.0, (1000, 3)) for _ in range(9)]
-    whole = GlobalMap(0.5)
-    for cloud in clouds:
-        whole.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-    for after in range(9):
-        part = GlobalMap(0.5)
-        for cloud in clouds[:after]:
-            part.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-        restored = GlobalMap(1.0)
-        restored.restore(through_disk(part.state()))
-        for cloud in clouds[after:]:
-            restored.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
 
 
 def test_keyframes_are_chosen_as_before(rng, through_disk):
