@@ -44,7 +44,7 @@ class Walk:
     def errors_m(self, poses: FloatArray) -> FloatArray:
         """(M,) how far poses are from the truth, where both begin alike."""
         T = self.truth[0] @ inverse(poses[0]) @ poses
-        return np.asarray(np.linalg.norm(T[:, :3, 3] - self.truth[:, :3, 3], axis=1))
+        return np.asarray(np.linalg.norm(T[:, :3, 3] - self.truth[: len(T), :3, 3], axis=1))
 
 
 def _block(rng: np.random.Generator) -> FloatArray:
@@ -205,22 +205,6 @@ def test_a_given_loop_is_closed_from_a_wrong_estimate(walk):
     assert walk.errors_m(result.T_world_lidar)[keys[1]] < 0.1 < walk.errors_m(estimate)[keys[1]]
 
 
-def test_loops_are_closed_on_the_way_and_nothing_changes(walk, closed):
-    """Asked now and then, the graph gives what it has, and ends up the same."""
-    graph, presents = SlamGraph(CONFIG), []
-    for i, scan in enumerate(walk.scans()):
-        go_on(graph, [scan])
-        if i in (60, len(walk.truth) - 1):
-            presents.append(graph.present())
-    early, late = presents
-    np.testing.assert_allclose(early.T_world_lidar, walk.estimate[:61], atol=1e-6)
-    before, after = walk.errors_m(walk.estimate), walk.errors_m(late.T_world_lidar)
-    assert np.sqrt(np.mean(after**2)) < 0.25 * np.sqrt(np.mean(before**2))
-    finished = graph.finish()
-    np.testing.assert_allclose(finished.T_world_lidar, closed[1].T_world_lidar, atol=1e-4)
-    assert finished.inliers == closed[1].inliers
-
-
 def test_every_loop_that_is_inlier_is_one(walk, closed):
     _, result = closed
     for closure, inlier in zip(result.closures, result.inliers, strict=True):
@@ -324,11 +308,13 @@ def test_a_run_without_a_scan_has_nothing_to_correct():
 
 
 def test_a_graph_that_is_restored_goes_on_to_the_same_result(walk, closed, through_disk, tmp_path):
-    """After loops were closed."""
+    """After loops were closed, which the present poses show without a change of the graph."""
     scans, file = list(walk.scans()), tmp_path / "submaps.bin"
     begun = SlamGraph(CONFIG, file=file)
     until = int(0.97 * len(scans))
     go_on(begun, scans[:until])
+    before, after = walk.errors_m(walk.estimate)[:until], walk.errors_m(begun.present().T_world_lidar)
+    assert np.sqrt(np.mean(after**2)) < 0.25 * np.sqrt(np.mean(before**2))
     saved = through_disk(begun.state())
     go_on(begun, scans[until : until + 20])  # more lies in the file by the time that it is killed
     begun.close()
