@@ -26,7 +26,6 @@ from lidarslam.merge.parts import (
     Show,
     earlier_parts,
     open_parts,
-    remove_part,
     track_part,
 )
 from lidarslam.merge.writing import MergeOutcome, Part, missing, write_merge
@@ -36,7 +35,7 @@ from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished
+from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished, remove_run
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -83,8 +82,9 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
             if not any(part.scans for part in parts):
                 raise InputError(f"no scan of any recording could be used: {'; '.join(missing(parts))}")
             outcome = write_merge(request, directory, parts, graph, started)
-            for name in earlier - names:
-                remove_part(request.out / name)
+            for path in (request.out / name for name in earlier - names):
+                if path.is_dir() and not path.is_symlink():  # the target of a link is not of this merge
+                    remove_run(path)
         interrupted = any(part.done is not None and part.done.interrupted for part in parts)
         for part in reversed(parts):
             about = About.read(part.request.out)

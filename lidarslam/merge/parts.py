@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import only_writer, remove_partial_files
+from lidarslam.core.files import only_writer
 from lidarslam.core.state import Saved, decode, encode
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.core.text import safe_name
@@ -27,11 +27,10 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.results import TrackedScans
 from lidarslam.run.session import RunSession, open_odometry, require_apart
 from lidarslam.run.tracking import NoScanError, Progress, track
-from lidarslam.storage import directory as files
-from lidarslam.storage.directory import RunDirectory, files_in, remove_run
+from lidarslam.storage.directory import RunDirectory, files_in
 from lidarslam.storage.finished_run import read_summary
 from lidarslam.storage.state_file import read_state, write_state
-from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished, remove_unfinished
+from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished
 
 # The names that `open_parts` gives to directories; other directories in a summary must not be removed.
 _PART = re.compile(r"\d{2,}_[\w.-]+")
@@ -86,19 +85,6 @@ def earlier_parts(out: Path) -> set[str]:
         about = About.read(out)
         names += [] if about is None else about.description.get("parts", [])
     return {name for name in names if _PART.fullmatch(name)}
-
-
-def remove_part(path: Path) -> None:
-    """Remove the run of a recording that is no longer merged, finished or not."""
-    if path.is_symlink():  # its target is not of this merge
-        return
-    if (path / files.ABOUT).exists():
-        remove_unfinished(path)
-        return
-    if path.is_dir():
-        with only_writer(path):
-            remove_partial_files(path)
-    remove_run(path)
 
 
 def read_part(saved: Saved) -> TrackedScans:

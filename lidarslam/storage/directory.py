@@ -78,7 +78,7 @@ class RunDirectory:
                 try:
                     yield directory
                 except BaseException:
-                    if not _is_run(path):  # files that no config.yaml describes would obstruct the next attempt
+                    if not describes_run(path):  # files that no config.yaml describes would obstruct the next attempt
                         _remove(path, directory._written)
                     raise
                 _remove(path, directory._stale)
@@ -159,14 +159,6 @@ def _remove(path: Path, names: Iterable[str]) -> None:
             folder.rmdir()
 
 
-def remove_run(path: Path) -> None:
-    """Remove a run's files, and its directory when it is empty then; leave all other files."""
-    if _is_run(path):
-        remove_files(path)
-        if not any(path.iterdir()):
-            path.rmdir()
-
-
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that is in the directory already, if it may be replaced."""
     present = files_in(path)
@@ -178,14 +170,14 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
         return [*present, *([] if resume else [ABOUT])]
     if present and not resume:
         listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
-        if not _is_run(path):
+        if not describes_run(path):
             raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
         if not overwrite:
             raise OutputError(f"{path}: holds a run ({listed}); name another directory, or replace it with --overwrite")
     return present
 
 
-def _is_run(path: Path) -> bool:
+def describes_run(path: Path) -> bool:
     """Whether there is a run's config.yaml: its first section describes the run."""
     try:
         return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{RUN_SECTION}:")

@@ -15,7 +15,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
 from lidarslam.core.json_text import read_json
 from lidarslam.core.state import Saved
-from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
+from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, describes_run, remove_files
 from lidarslam.storage.state_file import read_state
 
 logger = logging.getLogger(__name__)
@@ -147,12 +147,13 @@ class CheckpointFiles:
             path.unlink(missing_ok=True)
 
 
-def remove_unfinished(run: Path) -> None:
-    """Remove a run that was killed, and its directory when it is empty then; OutputError where it is running."""
+def remove_run(run: Path) -> None:
+    """Remove a run, finished or not, and its directory when it is empty then; OutputError where it is running."""
     with only_writer(run):
         remove_partial_files(run)
-        remove_files(run)
-        CheckpointFiles(run).remove()
+        if (run / ABOUT).exists() or describes_run(run):
+            remove_files(run)
+            CheckpointFiles(run).remove()
     if not any(run.iterdir()):
         run.rmdir()
 
