@@ -57,10 +57,10 @@ def without_outliers(
     Left out are points whose mean distance to k neighbours exceeds the mean of all by more than s standard deviations,
     for `sigmas` (k, s), and points with fewer than k neighbours within r metres, for `radius` (k, r).
     """
-    if sigmas is not None:
-        cloud = cloud.select(np.sort(cloud.to_open3d().remove_statistical_outlier(*sigmas)[1]))
-    if radius is not None:
-        cloud = cloud.select(np.sort(cloud.to_open3d().remove_radius_outlier(*radius)[1]))
+    for method, parameters in (("remove_statistical_outlier", sigmas), ("remove_radius_outlier", radius)):
+        if parameters is not None:
+            _, kept = getattr(cloud.to_open3d(), method)(*parameters)
+            cloud = cloud.select(np.sort(np.asarray(kept, dtype=np.intp)))
     return cloud
 
 

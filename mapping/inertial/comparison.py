@@ -102,7 +102,7 @@ class Alignment:
 
 
 class Comparison:
-    """The motion since half a second before each registered pose, by both; the identity is an unknown calibration."""
+    """The motion since half a second before each registered pose, by both; an unknown calibration is the identity."""
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
         self._T_lidar_imu = T_lidar_imu
