@@ -272,14 +272,14 @@ def test_reversed_time_gives_the_reversed_motion(rng):
     assert np.linalg.norm(log(inverse(state.T_world_lidar) @ true)[3:]) < 0.01
 
 
-def test_a_wrong_mounting_or_clock_is_noticed(rng):
+def test_a_wrong_mounting_or_clock_is_noticed(walked, rng):
     imu, turned = samples(walk, 7.0), T_LIDAR_IMU @ exp([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
     late = replace(imu, stamps=imu.stamps + 0.3)
-    for wrong, T in ((imu, T_LIDAR_IMU), (imu, turned), (late, T_LIDAR_IMU)):
+    assert not any("mounting or clock is wrong" in warning for warning in walked.warnings)
+    for wrong, T in ((imu, turned), (late, T_LIDAR_IMU)):
         inertial = Inertial(wrong, T)
         followed(inertial, 6.0, rng)
-        is_right = wrong is imu and T is T_LIDAR_IMU
-        assert any("the IMU's mounting or clock is wrong" in warning for warning in inertial.warnings) != is_right
+        assert any("the IMU's mounting or clock is wrong" in warning for warning in inertial.warnings)
 
 
 def test_scaled_accelerations_and_an_unknown_lever_arm_are_recovered(rng):
@@ -292,8 +292,7 @@ def test_scaled_accelerations_and_an_unknown_lever_arm_are_recovered(rng):
     np.testing.assert_allclose(inertial.lever, T_LIDAR_IMU[:3, 3], atol=0.01)
 
 
-@pytest.mark.parametrize("begin_s", [-0.1, 0.0])
-def test_the_velocity_of_a_sweep_in_a_curve(begin_s, rng):
+def test_the_velocity_of_a_sweep_in_a_curve():
     """Begin and end of the sweep, moved by the predicted velocity, lie where the sensor was."""
 
     def curve(times: FloatArray) -> FloatArray:
@@ -305,11 +304,12 @@ def test_the_velocity_of_a_sweep_in_a_curve(begin_s, rng):
     inertial = Inertial(samples(curve, 10.0), T_LIDAR_IMU)
     for stamp in np.arange(0.5, 9.0, PERIOD_S):
         take(inertial, stamp, inverse(curve(0.5)) @ curve(stamp))
-    offsets = begin_s + np.linspace(0.0, PERIOD_S, 50)
-    state = inertial.prior(Scan(np.zeros((50, 3)), 9.1, offsets), Prior()).inertial
-    for offset in offsets[[0, -1]]:
-        ahead, true = exp(offset * state.velocity), inverse(curve(9.1)) @ curve(9.1 + offset)
-        assert np.linalg.norm((ahead - true)[:3, 3]) < 0.006
+    for begin_s in (-PERIOD_S, -0.5 * PERIOD_S, 0.0):
+        offsets = begin_s + np.linspace(0.0, PERIOD_S, 50)
+        state = inertial.prior(Scan(np.zeros((50, 3)), 9.1, offsets), Prior()).inertial
+        for offset in offsets[[0, -1]]:
+            ahead, true = exp(offset * state.velocity), inverse(curve(9.1)) @ curve(9.1 + offset)
+            assert np.linalg.norm((ahead - true)[:3, 3]) < 0.006
 
 
 def test_a_pose_measured_by_correspondences_alone(rng):
