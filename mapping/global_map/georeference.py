@@ -60,6 +60,8 @@ def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArr
     of the world has a weak prior, as positions on a straight line do not determine the rotation about it. A
     TooFewPositionsError is raised where fewer than five are within the time of the trajectory.
     """
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     within = track.is_within(trajectory, projected)
     if within.sum() < _FEWEST:
         count = int(within.sum())
@@ -69,7 +71,9 @@ def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArr
     antenna = scale * (poses[:, :3, :3] @ track.lidar_antenna + poses[:, :3, 3])
     middle, centre = measured.mean(axis=0), antenna.mean(axis=0)
     y, x = measured - middle, antenna - centre
-    T = make_transform(_heading(x, y), np.zeros(3))
+    # The heading that aligns the centred positions best.
+    heading = np.arctan2((x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum(), (x[:, :2] * y[:, :2]).sum())
+    T = make_transform(Rotation.from_euler("z", heading).as_matrix(), np.zeros(3))
     sigma = track.sigma_m[within]
     stated = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 0.0
     for _ in range(_ITERATIONS):
@@ -90,15 +94,6 @@ def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArr
         median_m=float(np.median(errors)),
         heading_sigma_deg=float(np.rad2deg(np.arctan2(uncertain, spread))),
     )
-
-
-def _heading(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Rotation (3, 3) about z that aligns centred positions (N, 3) best."""
-    from scipy.spatial.transform import Rotation  # takes a while to load
-
-    sine = (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum()
-    cosine = (x[:, :2] * y[:, :2]).sum()
-    return np.asarray(Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix(), dtype=np.float64)
 
 
 def _step(T: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
