@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from lidarslam.compare.demo import format_demo, run_demo
 
 
+@pytest.mark.slow
 def test_the_map_survives_the_turns_that_lose_kiss_icp(tmp_path: Path) -> None:
     demo = run_demo(tmp_path, scans=110)
     (sequence,) = demo.outcome.comparison.sequences

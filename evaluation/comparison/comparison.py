@@ -228,6 +228,11 @@ class SequenceComparison:
     methods: Sequence[MethodResult]  # in the order asked for
     notes: Sequence[str] = ()  # remarks on this recording, such as why there is no reference
 
+    @property
+    def measured(self) -> list[tuple[MethodResult, TrajectoryMetrics]]:
+        """The methods that were compared with the reference."""
+        return [(method, method.metrics) for method in self.methods if method.metrics is not None]
+
     def to_json(self) -> dict[str, object]:
         """The content of comparison.json for one recording."""
         return {

@@ -72,7 +72,6 @@ class MapComparison:
     metrics: MapMetrics  # the errors in one number each
     map_errors: CloudErrors  # the map's points and their distances to the reference
     reference_errors: CloudErrors  # the reference's points and their distances to the map
-    spacing_m: float  # edge of the cells that both were thinned to
     # median distance between neighbouring points of the thinned map; None for fewer than two points
     map_gap_m: float | None
 
@@ -102,7 +101,7 @@ def compare_maps(
     map_errors = CloudErrors(mapped + origin, _distances(mapped, reference), _in_box(mapped, reference))
     reference_errors = CloudErrors(reference + origin, _distances(reference, mapped), in_range)
     metrics = _metrics(map_errors, reference_errors)
-    return MapComparison(metrics, map_errors, reference_errors, spacing_m, _median_gap(mapped))
+    return MapComparison(metrics, map_errors, reference_errors, _median_gap(mapped))
 
 
 def _metrics(mapped: CloudErrors, reference: CloudErrors) -> MapMetrics:

@@ -53,7 +53,8 @@ def trajectory_figure(sequence: SequenceComparison, styles: Styles) -> Figure | 
         return None
     reference = _matched_reference(sequence)
     low, high = _view(list(paths.values()), reference)
-    extent = np.maximum(high - low, 1.0)
+    extent, margin = np.maximum(high - low, 1.0), 0.05 * (high - low)
+    ranges = np.stack([low - margin, high + margin], axis=1).tolist()
     views = [(0, 1)] + [(axis, 2) for axis in (0, 1) if extent[axis] >= _LEAST_SIDE * extent[:2].max()]
     panels = []
     for across, up in views:
@@ -62,8 +63,8 @@ def trajectory_figure(sequence: SequenceComparison, styles: Styles) -> Figure | 
         given = EQUAL_AXES if up == 1 else {"xaxis": {}, "yaxis": {}}
         layout = {
             **given,
-            "xaxis": {**given["xaxis"], "title": {"text": f"{'xyz'[across]} [m]"}, "range": _range(low, high, across)},
-            "yaxis": {**given["yaxis"], "range": _range(low, high, up)},
+            "xaxis": {**given["xaxis"], "title": {"text": f"{'xyz'[across]} [m]"}, "range": ranges[across]},
+            "yaxis": {**given["yaxis"], "range": ranges[up]},
             "hovermode": "closest",
         }
         panels.append(Panel(title, traces, layout, _height_from_above(extent) if up == 1 else _SIDE_HEIGHT))
@@ -143,15 +144,10 @@ def _view(paths: Sequence[FloatArray], reference: FloatArray | None) -> tuple[Fl
     return low - short - beyond, high + short + beyond
 
 
-def _range(low: FloatArray, high: FloatArray, axis: int) -> list[float]:
-    margin = 0.05 * (high[axis] - low[axis])
-    return [float(low[axis] - margin), float(high[axis] + margin)]
-
-
 def _trajectory_caption(
     sequence: SequenceComparison, paths: dict[str, FloatArray], low: FloatArray, high: FloatArray
 ) -> str:
-    measured = measured_methods(sequence)
+    measured = sequence.measured
     unmeasured = [m.name for m in sequence.methods if m.trajectory is not None and m.metrics is None]
     if sequence.reference is None:
         frame = f"{'each ' if len(paths) > 1 else ''}in the frame of its first pose, as there is no reference"
@@ -172,7 +168,7 @@ def _trajectory_caption(
 
 def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """Position and orientation error over the distance travelled; None without a reference."""
-    measured = measured_methods(sequence)
+    measured = sequence.measured
     errors = [metrics.absolute_errors() for _, metrics in measured]
     curves = {
         "Position error [m]": [metres for metres, _ in errors],
@@ -188,7 +184,7 @@ def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
 
 def deviation_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     """Components of the error along and about the axes of the reference's LiDAR; None without a reference."""
-    measured = measured_methods(sequence)
+    measured = sequence.measured
     found = [np.hstack(metrics.deviations()) for _, metrics in measured]
     curves = {title: [components[:, axis] for components in found] for axis, title in enumerate(_COMPONENTS)}
     caption = (
@@ -212,11 +208,6 @@ def _over_distance(
     panels = [_error_panel(title, measured, of, styles, signed) for title, of in curves.items()]
     names = [method.name for method, _ in measured]
     return Figure(title, caption + _leaving(measured, curves, signed), panels, names, columns=3 if signed else 2)
-
-
-def measured_methods(sequence: SequenceComparison) -> list[tuple[MethodResult, TrajectoryMetrics]]:
-    """The methods that were compared with the reference."""
-    return [(method, method.metrics) for method in sequence.methods if method.metrics is not None]
 
 
 def aligned_how(measured: Measured) -> str:

@@ -59,7 +59,7 @@ class DriftSeries:
 
 def drift_series(sequence: SequenceComparison) -> list[DriftSeries]:
     """Over short segments, over KITTI's, and of these by speed; a series without any drift has no place."""
-    measured = {method.name: method.metrics for method in sequence.methods if method.metrics is not None}
+    measured = {method.name: metrics for method, metrics in sequence.measured}
     kitti = {name: metrics.kitti for name, metrics in measured.items() if metrics.kitti is not None}
     short = {name: metrics.segments for name, metrics in measured.items()}
     lengths = {name: drift.by_length for name, drift in kitti.items()}

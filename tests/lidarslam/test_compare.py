@@ -209,7 +209,7 @@ def test_without_any_reference_there_is_still_a_table(
 def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tmp_path: Path, told: Told) -> None:
     prior = recording / "ground_truth.tum"
     entries = (
-        RecordingEntry(recording, prior=prior),
+        RecordingEntry(recording, prior=prior, start=2),
         RecordingEntry(recording, prior=prior, start=1),
         RecordingEntry(tmp_path / "nowhere", name="gone", prior=prior),
     )
@@ -217,7 +217,7 @@ def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tm
     compare(request, told.narrator)
     content = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert [sequence["sequence"] for sequence in content["sequences"]] == ["room", "room-2"]
-    assert [sequence["methods"]["prior"]["scans"] for sequence in content["sequences"]] == [5, 4]
+    assert [sequence["methods"]["prior"]["scans"] for sequence in content["sequences"]] == [3, 4]
     assert content["missing"][0]["sequence"] == "gone"
     assert "no such file or folder" in content["missing"][0]["reason"]
     for sequence in content["sequences"]:

@@ -139,7 +139,11 @@ def test_a_resumed_run_guesses_the_same(recordings, upright, tmp_path):
 
 @pytest.mark.parametrize(
     ("method", "turn"),
-    [("imu", "rolled"), ("imu", "camera"), pytest.param("learned+imu", "rolled", marks=pytest.mark.slow)],
+    [
+        ("imu", "rolled"),
+        pytest.param("imu", "camera", marks=pytest.mark.slow),
+        pytest.param("learned+imu", "rolled", marks=pytest.mark.slow),
+    ],
 )
 def test_with_the_imu(recordings, tmp_path, method, turn):
     odometry = ["--odometry", method]

@@ -106,6 +106,7 @@ def test_side_by_side_is_the_same_as_one_after_another(
     assert _contents(tmp_path / "out") == serial
 
 
+@pytest.mark.slow
 def test_a_node_that_dies_costs_only_its_tasks(
     small_recording: Path, tmp_path: Path, serial: dict[str, Any], counted: tuple[str, ...]
 ) -> None:

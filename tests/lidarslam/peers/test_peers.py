@@ -22,6 +22,7 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from ...conftest import lidarslam
 
 SWEEP_S = 0.1
+SLOWEST = pytest.param("ct-icp", marks=pytest.mark.slow)
 
 
 def _at(seconds: float) -> FloatArray:
@@ -109,7 +110,7 @@ def _swaying(time: FloatArray) -> FloatArray:
 
 
 # Feature-based pipelines want rings, which the room does not have.
-@pytest.mark.parametrize("name", ["kiss-icp-evalio", "genz-icp", "mad-icp", "ct-icp", "kiss-slam", "small-gicp"])
+@pytest.mark.parametrize("name", ["kiss-icp-evalio", "genz-icp", "mad-icp", SLOWEST, "kiss-slam", "small-gicp"])
 def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: Any) -> None:
     pytest.importorskip(PEERS[name].library, reason="needs the extra peers")
     stamps = SWEEP_S * np.arange(1, 26)
@@ -163,6 +164,7 @@ def test_the_range_of_a_scene_is_twice_that_of_nearly_all_points_of_the_first_sc
     assert scene_range_m(_Ranges(1.0), range(0)) == 100.0
 
 
+@pytest.mark.slow
 def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: Path, tmp_path: Path) -> None:
     pytest.importorskip("small_gicp", reason="needs the extra peers")
     out = tmp_path / "compared"
@@ -184,7 +186,10 @@ def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: 
     assert again.output.count("in an earlier comparison") == 3
 
 
-@pytest.mark.parametrize("name", [name for name, peer in PEERS.items() if peer.has_voxels and not peer.needs_imu])
+@pytest.mark.parametrize(
+    "name",
+    [SLOWEST if name == "ct-icp" else name for name, peer in PEERS.items() if peer.has_voxels and not peer.needs_imu],
+)
 def test_every_peer_with_voxels_registers_a_small_scene_with_fine_ones(name: str, room: Any) -> None:
     pytest.importorskip(PEERS[name].library, reason="needs the extra peers")
     sweeps = [room.sweep(_swaying, SWEEP_S * number) for number in range(1, 7)]
