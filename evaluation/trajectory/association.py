@@ -88,34 +88,30 @@ def _reference_at(reference: Trajectory, stamps: FloatArray) -> FloatArray:
     return T_world_lidar
 
 
-def _explain(estimate: Trajectory, reference: Trajectory, matched: int, tolerance_s: float, max_gap_s: float) -> str:
-    return (
-        f"expected {_FEWEST_MATCHES} or more poses with a reference pose at the same instant, found {matched}:"
-        f" the estimate has {_range(estimate)}, the reference {_range(reference)};"
-        f" {_likely_cause(estimate, reference, tolerance_s, max_gap_s)}"
-    )
-
-
 def _range(trajectory: Trajectory) -> str:
     if not len(trajectory):
         return "no pose"
     return f"{count(len(trajectory), 'pose')} from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
 
 
-def _likely_cause(estimate: Trajectory, reference: Trajectory, tolerance_s: float, max_gap_s: float) -> str:
-    if len(estimate) < _FEWEST_MATCHES or len(reference) < 2:
-        return "one of them is too short; check that both files are complete"
+def _explain(estimate: Trajectory, reference: Trajectory, matched: int, tolerance_s: float, max_gap_s: float) -> str:
     a, b = estimate.stamps, reference.stamps
-    if max(a[0], b[0]) <= min(a[-1], b[-1]) + tolerance_s:
-        step_s = float(np.median(np.diff(b)))
-        return (
-            f"reference poses more than {max_gap_s:g} s apart are not bridged (typically {step_s:.3g} s apart);"
-            " use a denser reference or allow a larger gap"
+    magnitudes = sorted(float(np.abs(stamps).max(initial=1.0)) for stamps in (a, b))
+    if len(a) < _FEWEST_MATCHES or len(b) < 2:
+        cause = "one of them is too short; check that both files are complete"
+    elif max(a[0], b[0]) <= min(a[-1], b[-1]) + tolerance_s:
+        cause = (
+            f"reference poses more than {max_gap_s:g} s apart are not bridged (typically"
+            f" {np.median(np.diff(b)):.3g} s apart); use a denser reference or allow a larger gap"
         )
-    magnitudes = sorted([max(np.abs(a).max(), 1.0), max(np.abs(b).max(), 1.0)])
-    if magnitudes[1] > _OTHER_UNIT * magnitudes[0]:
-        return "one of them may count nanoseconds, scans, or seconds since its start; convert its stamps"
+    elif magnitudes[1] > _OTHER_UNIT * magnitudes[0]:
+        cause = "one of them may count nanoseconds, scans, or seconds since its start; convert its stamps"
+    else:
+        cause = (
+            f"the times do not overlap, the clocks may differ by {b[0] - a[0]:.3f} s;"
+            " correct the offset, or check that the reference belongs to this recording"
+        )
     return (
-        f"the times do not overlap, the clocks may differ by {b[0] - a[0]:.3f} s;"
-        " correct the offset, or check that the reference belongs to this recording"
+        f"expected {_FEWEST_MATCHES} or more poses with a reference pose at the same instant, found {matched}:"
+        f" the estimate has {_range(estimate)}, the reference {_range(reference)}; {cause}"
     )

@@ -157,18 +157,9 @@ class _Turns:
             self._done[run.request.out] = result
             self.narrator.tell(format_result(planned.name, result))
 
-        command = None if self.command == COMMAND else self.command
-        tasks = [
-            MethodTask(
-                run,
-                self.request.limits,
-                command,
-                str(Path.cwd()),
-                url_of(run.request.source),
-                where.cluster is not None,
-            )
-            for _, run in wanted
-        ]
+        command, is_remote = None if self.command == COMMAND else self.command, where.cluster is not None
+        limits, here = self.request.limits, str(Path.cwd())
+        tasks = [MethodTask(r, limits, command, here, url_of(r.request.source), is_remote) for _, r in wanted]
         with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
             try:
                 with open_tasks(where) as executor:

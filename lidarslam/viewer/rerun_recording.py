@@ -44,7 +44,6 @@ _PIECE = 1 << 20
 # Okabe and Ito's palette, distinguishable under every common colour blindness.
 STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
 REFERENCE_COLOUR = (0, 158, 115)
-_LOOP_COLOUR = (204, 121, 167)
 # Ours are chosen for a dark ground; the viewer's own may be light.
 BACKGROUND = (13, 16, 17)
 _DARK_TO_BRIGHT = (0.3, 1.0)
@@ -195,11 +194,6 @@ def log_map(
         shades = np.interp(height, [0.0, 1.0], _DARK_TO_BRIGHT)[:, None] * np.array(colour)
         colours = shades.astype(np.uint8)
     recording.log(entity, rr.Points3D(points, colors=colours, radii=MAP_RADIUS), static=static)
-
-
-def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3D:
-    """A line between the scans of each of the loops (L, 2)."""
-    return rr.LineStrips3D(list(positions[loops]), colors=[_LOOP_COLOUR], radii=PATH_RADIUS)
 
 
 def true_path(truth: Trajectory) -> rr.LineStrips3D:

@@ -46,6 +46,9 @@ from lidarslam.viewer.rerun_recording import (
 # The rest of Okabe and Ito's palette, without those of the reference and of lost scans.
 _COLOURS = ((86, 180, 233), (230, 159, 0), (204, 121, 167), (240, 228, 66), (0, 114, 178))
 _ERRORS = "errors"
+_LIDAR = "world/lidar"
+# Where the eye begins to follow the sensor, metres.
+_BEHIND = (-40.0, 0.0, 25.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +162,6 @@ def _layout_of_runs(shown: Sequence[_Shown]) -> rrb.Blueprint:
         rrb.TimePanel(timeline=TIME, play_state="following", state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
     )
-
-
-_LIDAR = "world/lidar"
-# Where the eye begins to follow the sensor, metres.
-_BEHIND = (-40.0, 0.0, 25.0)
 
 
 def show_scans(

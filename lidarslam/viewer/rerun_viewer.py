@@ -22,7 +22,6 @@ from lidarslam.viewer.rerun_recording import (
     STATUS_COLOURS,
     every_nth,
     log_map,
-    loop_lines,
     rerun_recording,
     set_stamp,
     true_path,
@@ -31,7 +30,7 @@ from lidarslam.viewer.rerun_recording import (
 from lidarslam.viewer.viewer import Viewer
 from lidarslam.viewer.web_page import WebPage
 
-_SCAN_COLOUR, _CLOSED_COLOUR = (240, 228, 66), (86, 180, 233)
+_SCAN_COLOUR, _CLOSED_COLOUR, _LOOP_COLOUR = (240, 228, 66), (86, 180, 233), (204, 121, 167)
 # The growing map is shown this far around the sensor.
 _NEAR_M = 60.0
 # Entity, title, and the names of its series.
@@ -90,7 +89,10 @@ class RerunViewer(Viewer):
         """The corrected path next to the one before, and the loops."""
         path = rr.LineStrips3D([positions], colors=[_CLOSED_COLOUR], radii=PATH_RADIUS, labels=["loops closed"])
         self._recording.log("world/closed/trajectory", path)
-        self._recording.log("world/closed/loops", loop_lines(positions, np.array(loops, dtype=np.intp).reshape(-1, 2)))
+        pairs = positions[np.array(loops, dtype=np.intp).reshape(-1, 2)]
+        self._recording.log(
+            "world/closed/loops", rr.LineStrips3D(list(pairs), colors=[_LOOP_COLOUR], radii=PATH_RADIUS)
+        )
 
     def _log_path(self, position: FloatArray, status: Status) -> None:
         """Only the newest piece: the view shows all pieces up to the present, so the recording grows linearly."""

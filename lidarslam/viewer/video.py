@@ -4,7 +4,6 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -66,20 +65,11 @@ def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
 
 
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
-    frames = (frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames)  # the codec wants even sides
-    first = next(frames)
-    size, rate = f"{first.shape[1]}x{first.shape[0]}", str(_PER_SECOND)
+    even = [frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # the codec wants even sides
+    size, rate = f"{even[0].shape[1]}x{even[0].shape[0]}", str(_PER_SECOND)
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
     command = ["ffmpeg", "-loglevel", "error", "-y", *given, "-pix_fmt", "yuv420p", "-f", "mp4", str(path.resolve())]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None
-        assert process.stderr is not None
-        try:
-            for frame in chain([first], frames):
-                process.stdin.write(frame.tobytes())
-            process.stdin.close()
-        except BrokenPipeError:
-            pass  # ffmpeg says why
-        said = process.stderr.read().decode(errors="replace").strip()
-    if process.returncode:
-        raise OutputError(f"ffmpeg ended with status {process.returncode}: {said}")
+    done = subprocess.run(command, input=b"".join(frame.tobytes() for frame in even), capture_output=True, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip()
+        raise OutputError(f"ffmpeg ended with status {done.returncode}: {said}")
