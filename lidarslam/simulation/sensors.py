@@ -44,7 +44,6 @@ class Spinning:
     firing: FloatArray  # (L,) of the column's time slot when each laser fires, in [0, 1); the column turns on meanwhile
     columns: int  # in a turn
     start_azimuth_deg: float = 180.0  # where the turn starts, counter-clockwise from x
-    clockwise: bool = True  # the sense of rotation, seen from above
 
     @property
     def lasers(self) -> int:
@@ -60,7 +59,7 @@ class Spinning:
     def _rays(self) -> Rays:
         order = np.argsort(self.firing, kind="stable")
         fractions = (np.arange(self.columns)[:, None] + self.firing[order]) / self.columns
-        turned = (-2.0 if self.clockwise else 2.0) * np.pi * fractions
+        turned = -2.0 * np.pi * fractions  # clockwise, seen from above
         azimuth = np.deg2rad(self.start_azimuth_deg + self.azimuth_offsets_deg[order]) + turned
         return _rays(azimuth, np.deg2rad(self.elevations_deg[order]), fractions, order)
 
