@@ -53,14 +53,12 @@ def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Gene
 
 
 def _furnish(room: Room, height: float, put: Furnisher) -> None:
+    pillar = Pieces(interior.crate, 1, (0.5, 0.5, height), tries=60, is_on_floor=True)
+    table = Pieces(interior.round_table, 1, (0.9, 0.9, 0.8), tries=60, is_on_floor=True)
     for pieces in (
         Pieces(interior.pilaster, 10, (0.4, (0.15, 0.3), height)),
         Pieces(interior.counter, 1, (4.0, 0.7, 2.2)),
-        *4
-        * (
-            Pieces(interior.crate, 1, (0.5, 0.5, height), tries=60, is_on_floor=True),
-            Pieces(interior.round_table, 1, (0.9, 0.9, 0.8), tries=60, is_on_floor=True),
-        ),
+        *[pillar, table] * 4,
         Pieces(interior.sofa, (3, 6), ((1.3, 2.3), 0.9, 0.9)),
         Pieces(interior.cabinet, (4, 8), ((0.6, 1.8), (0.3, 0.5), (0.8, 2.0))),
         Pieces(interior.plant, (4, 8), (0.75, 0.75, (0.8, 1.6))),

@@ -63,24 +63,29 @@ def draw_hall(rng: np.random.Generator) -> HallPlan:
         *(*ramp_a, (deck_turn_x, next_lane, rise), (deck_turn_x, far, rise)),
         *(*ramp_b, (near, far, 2.0 * rise), *ramp_c[::-1], (near, near, rise), *ramp_d[::-1]),
     ]
-    # Railings wherever no ramp joins and no wall is, with a gap for the stairs to deck 1.
-    corners = ((deck_1_x, front), (_DECK_2_WIDTH_M, front), (_LANDING_WIDTH_M, landing_y))
-    stairs_x = width - 2.5
-    railings = (
-        [_edge(corners[0], (deck_1_x, depth), next_lane, far), _edge(corners[0], (width, front), stairs_x, half=0.7)],
-        [_edge(corners[1], (_DECK_2_WIDTH_M, depth), far), _edge((0.0, front), corners[1], near)],
-        [_edge((0.0, landing_y), corners[2], near), _edge((_LANDING_WIDTH_M, 0.0), corners[2], near)],
-    )
-    floors = (
-        Room(np.array(corners[0]), np.array([width, depth])),
-        Room(np.array([0.0, front]), np.array([_DECK_2_WIDTH_M, depth])),
-        Room(np.zeros(2), np.array(corners[2])),
-    )
-    levels = (rise, 2.0 * rise, rise)
-    decks = tuple(Deck(*one) for one in zip(floors, levels, map(np.concatenate, railings), strict=True))
     route = Route(np.array(waypoints), 0.8, 0.9, 2.2, 2.0)
     ramps = np.array([ramp_a, ramp_b, ramp_c, ramp_d])
+    decks = _decks(width, depth, deck_1_x, landing_y, rise)
     return HallPlan(Room(np.zeros(2), np.array([width, depth])), height, aisles, turn_x, ramps, decks, route)
+
+
+def _decks(width: float, depth: float, deck_1_x: float, landing_y: float, rise: float) -> tuple[Deck, ...]:
+    """Deck 1, deck 2 and the landing, with railings wherever no ramp joins and no wall is, a gap for the stairs."""
+    near, next_lane, far = _LANE_AT_M, depth - _NEXT_LANE_AT_M, depth - _LANE_AT_M
+    one, two = (deck_1_x, depth - _STRIP_M), (_DECK_2_WIDTH_M, depth - _STRIP_M)  # the decks' corners in the hall
+    landing = (_LANDING_WIDTH_M, landing_y)
+    railings = (
+        [_edge(one, (deck_1_x, depth), next_lane, far), _edge(one, (width, one[1]), width - 2.5, half=0.7)],
+        [_edge(two, (_DECK_2_WIDTH_M, depth), far), _edge((0.0, two[1]), two, near)],
+        [_edge((0.0, landing_y), landing, near), _edge((_LANDING_WIDTH_M, 0.0), landing, near)],
+    )
+    floors = (
+        Room(np.array(one), np.array([width, depth])),
+        Room(np.array([0.0, two[1]]), np.array([two[0], depth])),
+        Room(np.zeros(2), np.array(landing)),
+    )
+    levels = (rise, 2.0 * rise, rise)
+    return tuple(Deck(*deck) for deck in zip(floors, levels, map(np.concatenate, railings), strict=True))
 
 
 def _edge(a: tuple[float, float], b: tuple[float, float], *gaps: float, half: float = 0.5 * _LANE_M) -> FloatArray:
