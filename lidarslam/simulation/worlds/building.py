@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -16,12 +17,29 @@ HAIR_M = 0.002  # by which neighbouring faces are offset from one plane
 
 Limits = tuple[float, float] | Sequence[float]  # lower and upper bound along an axis
 Vector = Sequence[float] | FloatArray
+Spans = Limits | Sequence[Limits] | FloatArray  # limits or several (N, 2)
 
 
 def rotation_z(yaw: float) -> FloatArray:
     """(3, 3) rotation about the vertical, radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def around(middles: Vector, half: float) -> FloatArray:
+    """Limits (N, 2) that far to either side of each middle (N,)."""
+    return np.asarray(np.add.outer(np.asarray(middles, float), [-half, half]))
+
+
+def ends(half: float, wide: float) -> FloatArray:
+    """Limits (2, 2) of that width at both ends of an axis, within that distance from 0."""
+    return np.array([[-half, wide - half], [half - wide, half]])
+
+
+def row(start: float, stop: float, count: int, gap: float) -> FloatArray:
+    """Limits (N, 2) side by side, with that gap at either side of each."""
+    edges = np.linspace(start, stop, count + 1)
+    return np.stack([edges[:-1] + gap, edges[1:] - gap], axis=1)
 
 
 def heading(direction: FloatArray) -> float:
@@ -71,10 +89,11 @@ class Builder:
         turn = rotation_z(yaw) if R is None else R
         self._boxes.append((self.point(*centre), 0.5 * np.asarray(size, float), self.R @ turn))
 
-    def block(self, x: Limits, y: Limits, z: Limits) -> None:
-        """A box along the axes, between limits in any order."""
-        low, high = np.array([x, y, z], dtype=np.float64).T
-        self.box(0.5 * (low + high), np.abs(high - low))
+    def block(self, x: Spans, y: Spans, z: Spans) -> None:
+        """Boxes along the axes between limits in any order, one for each combination of the axes' limits, x slowest."""
+        for limits in product(*(np.array(spans, dtype=np.float64).reshape(-1, 2) for spans in (x, y, z))):
+            low, high = np.array(limits).T
+            self.box(0.5 * (low + high), np.abs(high - low))
 
     def wall(self, a_xy: FloatArray, b_xy: FloatArray, z: Limits, thickness: float) -> None:
         """A wall with its middle line from a to b (2,), from height z[0] to z[1]."""

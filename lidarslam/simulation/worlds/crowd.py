@@ -41,8 +41,7 @@ def build(seed: int) -> World:
 def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:
     """Floor, ceiling with lamps, and walls with windows on two sides."""
     low, high = room.low - OUTER_WALL_M, room.high + OUTER_WALL_M
-    for z in (-0.2, height):
-        builder.block((low[0], high[0]), (low[1], high[1]), (z, z + 0.2))
+    builder.block((low[0], high[0]), (low[1], high[1]), [(-0.2, 0.0), (height, height + 0.2)])
     draw_room_ceiling(room, height, builder, rng)
     for side in range(4):
         wall, length = room.at_wall(side, builder)

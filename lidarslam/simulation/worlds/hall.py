@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Boxes, Cylinders, Mover, Route, World
 from lidarslam.simulation.worlds import hall_equipment as equipment
-from lidarslam.simulation.worlds.building import UP, Builder, Opening, Room
+from lidarslam.simulation.worlds.building import UP, Builder, Opening, Room, around
 from lidarslam.simulation.worlds.interior import Furnisher, Measures, Piece, Size, crate, draw_railing
 from lidarslam.simulation.worlds.paths import Clearance
 
@@ -294,12 +294,10 @@ def _draw_wall(
     wall.shifted(0.0, 0.0, upper).pierced_wall(reach, (-_WALL_M, 0.0), height - upper, lowered)
     for window in windows:
         wall.block(window.x, (-_WALL_M, -_WALL_M + 0.05), window.z)
-        for x in np.linspace(*window.x, 4)[1:-1]:
-            wall.block((x - 0.03, x + 0.03), (-_WALL_M, -_WALL_M + 0.12), window.z)
+        wall.block(around(np.linspace(*window.x, 4)[1:-1], 0.03), (-_WALL_M, -_WALL_M + 0.12), window.z)
     for gate in gates:
         _draw_gate(wall, gate)
-    for k in range(bays + 1):
-        wall.block((k * bay - 0.2, k * bay + 0.2), (0.0, 0.3), (0.0, height))
+    wall.block(around(np.linspace(0.0, along, bays + 1), 0.2), (0.0, 0.3), (0.0, height))
 
 
 def _draw_gate(wall: Builder, gate: Opening) -> None:
@@ -308,8 +306,7 @@ def _draw_gate(wall: Builder, gate: Opening) -> None:
     for z in np.arange(0.0, top, 0.4):
         wall.block(gate.x, (-_WALL_M, -_WALL_M + 0.08), (z, min(z + 0.34, top)))
     wall.block(gate.x, (-_WALL_M, -_WALL_M + 0.05), (0.0, top))
-    for x in gate.x:
-        wall.block((x - 0.12, x + 0.12), (-0.02, 0.1), (0.0, top))
+    wall.block(around(gate.x, 0.12), (-0.02, 0.1), (0.0, top))
     wall.block((gate.x[0] - 0.2, gate.x[1] + 0.2), (0.0, 0.45), (top, top + 0.5))
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.simulation.world import Boxes
-from lidarslam.simulation.worlds.building import Builder
+from lidarslam.simulation.worlds.building import Builder, around, ends
 from lidarslam.simulation.worlds.interior import Piece, Size
 
 RACK_DEPTH_M, BAY_M = 1.1, 2.8
@@ -16,8 +16,7 @@ def press(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     x, y, z = size
     a, b = 0.5 * x, 0.5 * y
     spot.block((-a, a), (-b, b), (0.0, 0.9))
-    for sign in (-1.0, 1.0):
-        spot.block((sign * a, sign * 0.6 * a), (-0.7 * b, 0.7 * b), (0.9, z - 0.9))
+    spot.block(ends(a, 0.4 * a), (-0.7 * b, 0.7 * b), (0.9, z - 0.9))
     spot.block((-a, a), (-0.8 * b, 0.8 * b), (z - 0.9, z - 0.3))
     spot.pole((0.0, 0.0), (z - 0.3, z), 0.3 * min(a, b))
     ram = rng.uniform(1.3, z - 1.5)
@@ -52,8 +51,7 @@ def tank(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     for angle in np.arange(4) * 0.5 * np.pi + 0.25 * np.pi:
         spot.pole((0.8 * radius * np.cos(angle), 0.8 * radius * np.sin(angle)), (0.0, legs), 0.07)
     spot.pole((0.0, radius + 0.06), (0.0, z - 0.5), 0.05)
-    for height in np.arange(0.4, z - 0.4, 0.35):
-        spot.block((radius, radius + 0.12), (-0.2, 0.2), (height, height + 0.03))
+    spot.block((radius, radius + 0.12), (-0.2, 0.2), np.arange(0.4, z - 0.4, 0.35)[:, None] + [0.0, 0.03])
 
 
 def conveyor(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -61,8 +59,7 @@ def conveyor(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     x, y, z = size
     a, b, belt = 0.5 * x, min(0.5 * y, 0.5), min(0.9, z)
     spot.block((-a, a), (-b, b), (belt - 0.15, belt))
-    for sign in (-1.0, 1.0):
-        spot.block((-a, a), (sign * b, sign * (b - 0.04)), (belt, belt + 0.12))
+    spot.block((-a, a), ends(b, 0.04), (belt, belt + 0.12))
     for leg in np.linspace(-a + 0.2, a - 0.2, max(2, int(x / 1.5))):
         for sign in (-1.0, 1.0):
             spot.cylinder((leg, sign * (b - 0.08), 0.0), (leg, sign * (b - 0.08), belt - 0.1), 0.035)
@@ -79,8 +76,8 @@ def robot_cell(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     x, y, z = size
     a, b, fence = 0.5 * x, 0.5 * y, min(2.0, z)
     for sign in (-1.0, 1.0):
-        for post in np.linspace(-a, a, max(2, round(x / 1.2))):
-            spot.block((post - 0.03, post + 0.03), (sign * b - 0.03, sign * b + 0.03), (0.0, fence))
+        posts = np.linspace(-a, a, max(2, round(x / 1.2)))
+        spot.block(around(posts, 0.03), (sign * b - 0.03, sign * b + 0.03), (0.0, fence))
         for bar in (0.2, 1.1, fence - 0.05):
             spot.block((-a, a), (sign * b - 0.015, sign * b + 0.015), (bar, bar + 0.05))
             spot.block((sign * a - 0.015, sign * a + 0.015), (-b, b), (bar, bar + 0.05))
@@ -140,14 +137,13 @@ def rack(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     a, b, rise = 0.5 * bays * BAY_M, 0.5 * RACK_DEPTH_M, rng.uniform(1.3, 1.6)
     top = levels * rise
     for x in -a + np.arange(bays + 1) * BAY_M:
-        for y in (-b, b):
-            spot.block((x - 0.05, x + 0.05), (y - 0.04, y + 0.04), (0.0, top))
+        spot.block((x - 0.05, x + 0.05), around((-b, b), 0.04), (0.0, top))
         for z in np.arange(0.3, top - 0.6, 1.2):
             spot.cylinder((x, -b, z), (x, b, z + 0.6), 0.02)
     for level in range(levels):
         z = level * rise
-        for y in (-b, b) if level else ():
-            spot.block((-a, a), (y - 0.03, y + 0.03), (z - 0.06, z + 0.06))
+        if level:
+            spot.block((-a, a), around((-b, b), 0.03), (z - 0.06, z + 0.06))
         for x in np.arange(-a + 0.72, a, 0.5 * BAY_M):
             if rng.random() < 0.75:
                 pallet(spot.shifted(x, 0.0, z + (0.06 if level else 0.0)), rise - 0.35, rng)
@@ -184,9 +180,7 @@ def cabin(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa:
     spot.block((-a + 0.08, a - 0.08), (-b + 0.08, b - 0.08), (0.0, 2.4))
     spot.block((-a, a), (-b, b), (0.0, 1.0))
     spot.block((-a, a), (-b, b), (2.1, 2.4))
-    for x in (-a, a - 0.15):
-        for y in (-b, b - 0.15):
-            spot.block((x, x + 0.15), (y, y + 0.15), (1.0, 2.1))
+    spot.block(ends(a, 0.15), ends(b, 0.15), (1.0, 2.1))
     spot.block((-0.45, 0.45), (-b - 0.03, -b + 0.05), (0.0, 2.05))
     spot.block((-a - 0.2, a + 0.2), (-b - 0.2, b + 0.2), (2.4, 2.5))
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room
+from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room, around, ends, row
 from lidarslam.simulation.worlds.paths import Clearance
 
 Size = tuple[float, float, float]  # width, depth, height
@@ -26,8 +26,7 @@ def desk(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A desk with legs, a drawer unit, and a screen or two."""
     top, half, depth = rng.uniform(0.70, 0.76), 0.5 * size[0], size[1]
     spot.block((-half, half), (0.0, depth), (top, top + 0.035))
-    for x in (-half + 0.04, half - 0.04):
-        spot.block((x - 0.025, x + 0.025), (0.06, depth - 0.06), (0.0, top))
+    spot.block(around((-half + 0.04, half - 0.04), 0.025), (0.06, depth - 0.06), (0.0, top))
     side = rng.choice([-1.0, 1.0])
     spot.block((side * (half - 0.5), side * (half - 0.08)), (0.08, depth - 0.1), (0.0, 0.58))
     for k in range(int(rng.integers(1, 3))):
@@ -54,8 +53,7 @@ def shelf(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """An open shelf with a back, boards, and rows of books and boxes."""
     half, depth, height = 0.5 * size[0], size[1], size[2]
     spot.block((-half, half), (0.0, 0.02), (0.0, height))
-    for x in (-half, half - 0.03):
-        spot.block((x, x + 0.03), (0.02, depth), (0.0, height))
+    spot.block(ends(half, 0.03), (0.02, depth), (0.0, height))
     boards = np.linspace(0.06, height - 0.03, max(2, round(height / 0.38) + 1))
     for z, above in pairwise(boards):
         spot.block((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (z, z + 0.025))
@@ -80,9 +78,7 @@ def cabinet(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     spot.block((-half, half), (0.0, depth - 0.02), (0.08, height))
     columns = max(1, round(width / 0.45))
     rows = 1 if rng.random() < 0.5 else max(2, round(height / 0.4))
-    for x0, x1 in pairwise(np.linspace(-half, half, columns + 1)):
-        for z0, z1 in pairwise(np.linspace(0.08, height, rows + 1)):
-            spot.block((x0 + 0.01, x1 - 0.01), (depth - 0.02, depth), (z0 + 0.01, z1 - 0.01))
+    spot.block(row(-half, half, columns, 0.01), (depth - 0.02, depth), row(0.08, height, rows, 0.01))
 
 
 def counter(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -102,11 +98,9 @@ def sofa(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     half, seat = 0.5 * size[0], rng.uniform(0.38, 0.44)
     spot.block((-half, half), (0.04, 0.85), (0.06, seat - 0.1))
     spot.block((-half, half), (0.0, 0.22), (0.06, seat + 0.4))
-    for x in (-half, half - 0.16):
-        spot.block((x, x + 0.16), (0.1, 0.83), (0.06, seat + 0.18))
+    spot.block(ends(half, 0.16), (0.1, 0.83), (0.06, seat + 0.18))
     cushions = max(1, round((size[0] - 0.32) / 0.65))
-    for x0, x1 in pairwise(np.linspace(-half + 0.16, half - 0.16, cushions + 1)):
-        spot.block((x0 + 0.01, x1 - 0.01), (0.2, 0.84), (seat - 0.1, seat))
+    spot.block(row(-half + 0.16, half - 0.16, cushions, 0.01), (0.2, 0.84), (seat - 0.1, seat))
 
 
 def plant(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -130,8 +124,7 @@ def board(spot: Builder, size: Size, rng: np.random.Generator, low: float = 0.1)
     """A white board, notice board or picture with a frame, 0.2 m less high than its space."""
     half, high = 0.5 * size[0], low + size[2] - 0.2
     spot.block((-half, half), (0.0, 0.02), (low, high))
-    for z in (low, high - 0.03):
-        spot.block((-half, half), (0.02, 0.035), (z, z + 0.03))
+    spot.block((-half, half), (0.02, 0.035), [(low, low + 0.03), (high - 0.03, high)])
 
 
 def pilaster(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
@@ -147,8 +140,8 @@ def extinguisher(spot: Builder, size: Size, rng: np.random.Generator) -> None:  
 
 def radiator(spot: Builder, width: float) -> None:
     """A ribbed radiator a hand's breadth above the floor, 0.12 m deep."""
-    for x in np.arange(-0.5 * width, 0.5 * width - 0.05, 0.12):
-        spot.block((x, x + 0.09), (0.04, 0.12), (0.12, 0.68))
+    ribs = np.arange(-0.5 * width, 0.5 * width - 0.05, 0.12)[:, None] + [0.0, 0.09]
+    spot.block(ribs, (0.04, 0.12), (0.12, 0.68))
     for z in (0.17, 0.62):
         spot.cylinder((-0.5 * width, 0.07, z), (0.5 * width, 0.07, z), 0.02)
 
@@ -175,8 +168,7 @@ def table(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A long table on two trestles, with a few things on it."""
     a, b = 0.5 * size[0], 0.5 * size[1]
     spot.block((-a, a), (-b, b), (0.72, 0.76))
-    for x in (-a + 0.3, a - 0.3):
-        spot.block((x - 0.04, x + 0.04), (-b + 0.15, b - 0.15), (0.0, 0.72))
+    spot.block(around((-a + 0.3, a - 0.3), 0.04), (-b + 0.15, b - 0.15), (0.0, 0.72))
     for _ in range(int(rng.integers(0, 4))):
         x, y = rng.uniform(-a + 0.2, a - 0.2), rng.uniform(-b + 0.2, b - 0.2)
         thing = spot.shifted(x, y, 0.76, yaw=rng.uniform(0.0, 3.0))
@@ -214,8 +206,7 @@ def screened_workplace(spot: Builder, size: Size, rng: np.random.Generator) -> N
     """A workplace behind a free-standing screen with feet."""
     screen, height = spot.shifted(0.0, -0.77), rng.uniform(1.2, 1.5)
     screen.block((-0.75, 0.75), (-0.025, 0.025), (0.04, height))
-    for x in (-0.6, 0.6):
-        screen.block((x - 0.03, x + 0.03), (-0.2, 0.2), (0.0, 0.04))
+    screen.block(around((-0.6, 0.6), 0.03), (-0.2, 0.2), (0.0, 0.04))
     workplace(spot.shifted(0.0, -0.72), (1.4, 1.5, 1.3), rng)
 
 

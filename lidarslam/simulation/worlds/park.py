@@ -5,7 +5,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import Builder, smooth_noise
+from lidarslam.simulation.worlds.building import Builder, around, smooth_noise
 from lidarslam.simulation.worlds.outdoor import Grounds, beside
 
 _CELL_M = 0.5
@@ -76,8 +76,7 @@ def _pavilion(grounds: Grounds) -> FloatArray:
     part.block((-half + 0.3, half - 0.3), (half - 0.6, half - 0.1), (0.1, 0.6))
     for y in (-half - 0.6, half + 0.6):
         part.beam((0.0, y, high - 0.15), (0.0, 0.0, high + 0.3 * size), size + 1.0, 0.12)
-    for x in (-half, half):
-        part.block((x - 0.08, x + 0.08), (-0.12, 0.12), (high, high + 0.28 * size))
+    part.block(around((-half, half), 0.08), (-0.12, 0.12), (high, high + 0.28 * size))
     part.block((-half - 0.2, half + 0.2), (-half - 0.2, half + 0.2), (high - 0.2, high))
     grounds.put(part, where, yaw)
     return np.append(where, 0.75 * size)
