@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
@@ -31,9 +32,9 @@ def around(middles: Vector, half: float) -> FloatArray:
     return np.asarray(np.add.outer(np.asarray(middles, float), [-half, half]))
 
 
-def ends(half: float, wide: float) -> FloatArray:
-    """Limits (2, 2) of that width at both ends of an axis, within that distance from 0."""
-    return np.array([[-half, wide - half], [half - wide, half]])
+def starting(places: Vector, wide: float) -> FloatArray:
+    """Limits (N, 2) of that width, beginning at each place (N,)."""
+    return np.asarray(np.add.outer(np.asarray(places, float), [0.0, wide]))
 
 
 def row(start: float, stop: float, count: int, gap: float) -> FloatArray:
@@ -67,17 +68,21 @@ class Builder:
     """
 
     origin: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) in the world
-    R: FloatArray = field(default_factory=lambda: np.eye(3))  # R_world_frame
+    yaw: float = 0.0
     _boxes: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
     _cylinders: list[tuple[FloatArray, FloatArray, float]] = field(default_factory=list)
 
+    @cached_property
+    def _R(self) -> FloatArray:
+        return rotation_z(self.yaw)
+
     def point(self, x: float, y: float, z: float = 0.0) -> FloatArray:
         """A point (3,) of the frame, in the world."""
-        return np.asarray(self.origin + self.R @ np.array([x, y, z]))
+        return np.asarray(self.origin + self._R @ np.array([x, y, z]))
 
     def shifted(self, *xyz: float, yaw: float = 0.0) -> "Builder":
         """A frame at a point of this one, z may be left out, turned about the vertical."""
-        return replace(self, origin=self.point(*xyz), R=self.R @ rotation_z(yaw))
+        return replace(self, origin=self.point(*xyz), yaw=self.yaw + yaw)
 
     def bounds(self, x: Limits, y: Limits, z: Limits) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest corner (3,) in the world of a block, for a frame along the axes."""
@@ -86,8 +91,8 @@ class Builder:
 
     def box(self, centre: Vector, size: Vector, yaw: float = 0.0, R: FloatArray | None = None) -> None:
         """A box by its centre and full size, turned by `yaw` about the vertical, or by any rotation `R`."""
-        turn = rotation_z(yaw) if R is None else R
-        self._boxes.append((self.point(*centre), 0.5 * np.asarray(size, float), self.R @ turn))
+        turn = rotation_z(self.yaw + yaw) if R is None else self._R @ R
+        self._boxes.append((self.point(*centre), 0.5 * np.asarray(size, float), turn))
 
     def block(self, x: Spans, y: Spans, z: Spans) -> None:
         """Boxes along the axes between limits in any order, one for each combination of the axes' limits, x slowest."""
@@ -142,7 +147,7 @@ class Builder:
 
     def place(self, part: "Builder", T_frame_part: FloatArray) -> None:
         """Add all primitives of `part`, which was drawn in its own frame."""
-        R, t = self.R @ T_frame_part[:3, :3], self.point(*T_frame_part[:3, 3])
+        R, t = self._R @ T_frame_part[:3, :3], self.point(*T_frame_part[:3, 3])
         self._boxes.extend((R @ centre + t, half_size, R @ R_part) for centre, half_size, R_part in part._boxes)
         self._cylinders.extend((R @ start + t, R @ end + t, radius) for start, end, radius in part._cylinders)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import HAIR_M, OUTER_WALL_M, Builder, Opening, Room, ends, smooth_noise
+from lidarslam.simulation.worlds.building import HAIR_M, OUTER_WALL_M, Builder, Opening, Room, smooth_noise, starting
 from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds
 from lidarslam.simulation.worlds.paths import Clearance
@@ -59,7 +59,7 @@ def _ground(length: float, yard: Room, rng: np.random.Generator) -> HeightField:
 def _draw_corridor(length: float, solid: Builder, rng: np.random.Generator) -> None:
     """Walls, ceiling and the closed end; boxes against the walls at uneven distances, all different."""
     half, top = 0.5 * _WIDTH_M, _HEIGHT_M + OUTER_WALL_M
-    solid.block((-length, 0.0), ends(half + OUTER_WALL_M, OUTER_WALL_M), (-0.3, top))
+    solid.block((-length, 0.0), starting((-half - OUTER_WALL_M, half), OUTER_WALL_M), (-0.3, top))
     solid.block((-length, 0.0), (-half, half), (_HEIGHT_M, top))
     solid.block((-length - OUTER_WALL_M, -length), (-half - OUTER_WALL_M, half + OUTER_WALL_M), (-0.3, top))
     for k in range(_BOXES):

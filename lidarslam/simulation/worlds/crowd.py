@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Mover, Route, World
 from lidarslam.simulation.worlds import interior, outdoor, paths
-from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Room, left_of, rotation_z
+from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Room, left_of, rotation_z, starting
 from lidarslam.simulation.worlds.interior import Furnisher, Pieces
 from lidarslam.simulation.worlds.office import draw_room_ceiling
 from lidarslam.simulation.worlds.paths import Clearance
@@ -41,7 +41,7 @@ def build(seed: int) -> World:
 def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:
     """Floor, ceiling with lamps, and walls with windows on two sides."""
     low, high = room.low - OUTER_WALL_M, room.high + OUTER_WALL_M
-    builder.block((low[0], high[0]), (low[1], high[1]), [(-0.2, 0.0), (height, height + 0.2)])
+    builder.block((low[0], high[0]), (low[1], high[1]), starting((-0.2, height), 0.2))
     draw_room_ceiling(room, height, builder, rng)
     for side in range(4):
         wall, length = room.at_wall(side, builder)

@@ -282,8 +282,8 @@ def _draw_wall(
 ) -> None:
     """A wall with a roller gate or none, a band of windows high up, and pilasters."""
     bays = round(along / 6.0)
-    bay, upper = along / bays, 0.5 * height
-    windows = [Opening(((k + 0.15) * bay, (k + 0.85) * bay), (height - 3.4, height - 1.9)) for k in range(bays)]
+    bay, upper, top = along / bays, 0.5 * height, height - 1.9
+    windows = [Opening(((k + 0.15) * bay, (k + 0.85) * bay), (top - 1.5, top)) for k in range(bays)]
     gates = []
     if gate_x is not None:
         at, wide = rng.uniform(gate_x[0], gate_x[1] - 4.5), rng.uniform(3.6, 4.4)
@@ -297,7 +297,7 @@ def _draw_wall(
         wall.block(around(np.linspace(*window.x, 4)[1:-1], 0.03), (-_WALL_M, -_WALL_M + 0.12), window.z)
     for gate in gates:
         _draw_gate(wall, gate)
-    wall.block(around(np.linspace(0.0, along, bays + 1), 0.2), (0.0, 0.3), (0.0, height))
+    wall.block(around([k * bay for k in range(bays + 1)], 0.2), (0.0, 0.3), (0.0, height))
 
 
 def _draw_gate(wall: Builder, gate: Opening) -> None:

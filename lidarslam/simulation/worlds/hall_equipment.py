@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.simulation.world import Boxes
-from lidarslam.simulation.worlds.building import Builder, around, ends
+from lidarslam.simulation.worlds.building import Builder, around, starting
 from lidarslam.simulation.worlds.interior import Piece, Size
 
 RACK_DEPTH_M, BAY_M = 1.1, 2.8
@@ -16,7 +16,7 @@ def press(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     x, y, z = size
     a, b = 0.5 * x, 0.5 * y
     spot.block((-a, a), (-b, b), (0.0, 0.9))
-    spot.block(ends(a, 0.4 * a), (-0.7 * b, 0.7 * b), (0.9, z - 0.9))
+    spot.block([(-a, -0.6 * a), (0.6 * a, a)], (-0.7 * b, 0.7 * b), (0.9, z - 0.9))
     spot.block((-a, a), (-0.8 * b, 0.8 * b), (z - 0.9, z - 0.3))
     spot.pole((0.0, 0.0), (z - 0.3, z), 0.3 * min(a, b))
     ram = rng.uniform(1.3, z - 1.5)
@@ -51,7 +51,7 @@ def tank(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     for angle in np.arange(4) * 0.5 * np.pi + 0.25 * np.pi:
         spot.pole((0.8 * radius * np.cos(angle), 0.8 * radius * np.sin(angle)), (0.0, legs), 0.07)
     spot.pole((0.0, radius + 0.06), (0.0, z - 0.5), 0.05)
-    spot.block((radius, radius + 0.12), (-0.2, 0.2), np.arange(0.4, z - 0.4, 0.35)[:, None] + [0.0, 0.03])
+    spot.block((radius, radius + 0.12), (-0.2, 0.2), starting(np.arange(0.4, z - 0.4, 0.35), 0.03))
 
 
 def conveyor(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -59,7 +59,7 @@ def conveyor(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     x, y, z = size
     a, b, belt = 0.5 * x, min(0.5 * y, 0.5), min(0.9, z)
     spot.block((-a, a), (-b, b), (belt - 0.15, belt))
-    spot.block((-a, a), ends(b, 0.04), (belt, belt + 0.12))
+    spot.block((-a, a), [(-b, 0.04 - b), (b - 0.04, b)], (belt, belt + 0.12))
     for leg in np.linspace(-a + 0.2, a - 0.2, max(2, int(x / 1.5))):
         for sign in (-1.0, 1.0):
             spot.cylinder((leg, sign * (b - 0.08), 0.0), (leg, sign * (b - 0.08), belt - 0.1), 0.035)
@@ -76,8 +76,8 @@ def robot_cell(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     x, y, z = size
     a, b, fence = 0.5 * x, 0.5 * y, min(2.0, z)
     for sign in (-1.0, 1.0):
-        posts = np.linspace(-a, a, max(2, round(x / 1.2)))
-        spot.block(around(posts, 0.03), (sign * b - 0.03, sign * b + 0.03), (0.0, fence))
+        posts = around(np.linspace(-a, a, max(2, round(x / 1.2))), 0.03)
+        spot.block(posts, (sign * b - 0.03, sign * b + 0.03), (0.0, fence))
         for bar in (0.2, 1.1, fence - 0.05):
             spot.block((-a, a), (sign * b - 0.015, sign * b + 0.015), (bar, bar + 0.05))
             spot.block((sign * a - 0.015, sign * a + 0.015), (-b, b), (bar, bar + 0.05))
@@ -180,7 +180,7 @@ def cabin(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa:
     spot.block((-a + 0.08, a - 0.08), (-b + 0.08, b - 0.08), (0.0, 2.4))
     spot.block((-a, a), (-b, b), (0.0, 1.0))
     spot.block((-a, a), (-b, b), (2.1, 2.4))
-    spot.block(ends(a, 0.15), ends(b, 0.15), (1.0, 2.1))
+    spot.block(starting((-a, a - 0.15), 0.15), starting((-b, b - 0.15), 0.15), (1.0, 2.1))
     spot.block((-0.45, 0.45), (-b - 0.03, -b + 0.05), (0.0, 2.05))
     spot.block((-a - 0.2, a + 0.2), (-b - 0.2, b + 0.2), (2.4, 2.5))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import Builder
+from lidarslam.simulation.worlds.building import Builder, starting
 
 # Walls go this far down: houses stand level on streets that slope.
 _FOUNDATION_M = 2.0
@@ -129,7 +129,7 @@ def _bay(part: Builder, style: _Style, opening: FloatArray, reach: float) -> Non
     x0, x1 = opening[0] - 0.25, opening[1] + 0.25
     low, high = style.storey_m - 0.05, style.top_m - 0.4
     part.block((x0 + 0.1, x1 - 0.1), (-reach + 0.12, 0.1), (low, high))
-    part.block([(x0, x0 + 0.16), (x1 - 0.16, x1)], (-reach, -reach + 0.2), (low, high))
+    part.block(starting((x0, x1 - 0.16), 0.16), (-reach, -reach + 0.2), (low, high))
     for k in range(1, style.storeys + 1):
         z0 = low if k == 1 else (k - 1) * style.storey_m + style.lintel_m
         z1 = high if k == style.storeys else k * style.storey_m + style.sill_m
@@ -141,8 +141,8 @@ def _balcony(part: Builder, opening: FloatArray, floor: float, reach: float) -> 
     x0, x1 = opening[0] - 0.3, opening[1] + 0.3
     part.block((x0, x1), (-reach, 0.1), (floor - 0.16, floor))
     part.block((x0, x1), (-reach, -reach + 0.05), (floor + 0.95, floor + 1.0))
-    part.block([(x0, x0 + 0.04), (x1 - 0.05, x1 - 0.01)], (-reach + 0.06, 0.05), (floor + 0.1, floor + 1.0))
-    bars = np.linspace(x0, x1 - 0.04, max(3, round((x1 - x0) / 0.5)))[:, None] + [0.0, 0.04]
+    part.block(starting((x0, x1 - 0.05), 0.04), (-reach + 0.06, 0.05), (floor + 0.1, floor + 1.0))
+    bars = starting(np.linspace(x0, x1 - 0.04, max(3, round((x1 - x0) / 0.5))), 0.04)
     part.block(bars, (-reach + 0.01, -reach + 0.04), (floor - 0.02, floor + 0.96))
 
 
@@ -151,7 +151,7 @@ def _roof(part: Builder, rng: np.random.Generator, width: float, depth: float, t
     part.block((-0.01, width + 0.01), (-0.22, 0.3), (top - 0.05, top + 0.18))
     if rng.random() < 0.45:
         high = top + rng.uniform(0.5, 0.9)
-        part.block((0.0, width), [(0.0, 0.28), (depth - 0.3, depth - 0.02)], (top, high))
+        part.block((0.0, width), starting((0.0, depth - 0.3), 0.28), (top, high))
         x = rng.uniform(0.2, 0.6) * width
         part.block((x, x + 2.4), (0.4 * depth, 0.4 * depth + 3.0), (top, top + 2.4))
     else:

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room, around, ends, row
+from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room, around, row, starting
 from lidarslam.simulation.worlds.paths import Clearance
 
 Size = tuple[float, float, float]  # width, depth, height
@@ -53,7 +53,7 @@ def shelf(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """An open shelf with a back, boards, and rows of books and boxes."""
     half, depth, height = 0.5 * size[0], size[1], size[2]
     spot.block((-half, half), (0.0, 0.02), (0.0, height))
-    spot.block(ends(half, 0.03), (0.02, depth), (0.0, height))
+    spot.block(starting((-half, half - 0.03), 0.03), (0.02, depth), (0.0, height))
     boards = np.linspace(0.06, height - 0.03, max(2, round(height / 0.38) + 1))
     for z, above in pairwise(boards):
         spot.block((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (z, z + 0.025))
@@ -98,7 +98,7 @@ def sofa(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     half, seat = 0.5 * size[0], rng.uniform(0.38, 0.44)
     spot.block((-half, half), (0.04, 0.85), (0.06, seat - 0.1))
     spot.block((-half, half), (0.0, 0.22), (0.06, seat + 0.4))
-    spot.block(ends(half, 0.16), (0.1, 0.83), (0.06, seat + 0.18))
+    spot.block(starting((-half, half - 0.16), 0.16), (0.1, 0.83), (0.06, seat + 0.18))
     cushions = max(1, round((size[0] - 0.32) / 0.65))
     spot.block(row(-half + 0.16, half - 0.16, cushions, 0.01), (0.2, 0.84), (seat - 0.1, seat))
 
@@ -124,7 +124,7 @@ def board(spot: Builder, size: Size, rng: np.random.Generator, low: float = 0.1)
     """A white board, notice board or picture with a frame, 0.2 m less high than its space."""
     half, high = 0.5 * size[0], low + size[2] - 0.2
     spot.block((-half, half), (0.0, 0.02), (low, high))
-    spot.block((-half, half), (0.02, 0.035), [(low, low + 0.03), (high - 0.03, high)])
+    spot.block((-half, half), (0.02, 0.035), starting((low, high - 0.03), 0.03))
 
 
 def pilaster(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
@@ -140,7 +140,7 @@ def extinguisher(spot: Builder, size: Size, rng: np.random.Generator) -> None:  
 
 def radiator(spot: Builder, width: float) -> None:
     """A ribbed radiator a hand's breadth above the floor, 0.12 m deep."""
-    ribs = np.arange(-0.5 * width, 0.5 * width - 0.05, 0.12)[:, None] + [0.0, 0.09]
+    ribs = starting(np.arange(-0.5 * width, 0.5 * width - 0.05, 0.12), 0.09)
     spot.block(ribs, (0.04, 0.12), (0.12, 0.68))
     for z in (0.17, 0.62):
         spot.cylinder((-0.5 * width, 0.07, z), (0.5 * width, 0.07, z), 0.02)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Grass, HeightField, Route
 from lidarslam.simulation.worlds import paths
-from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise
+from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise, starting
 
 # Feet extend this far down, so that nothing hovers on a slope.
 SUNK_M = 0.3
@@ -135,8 +135,8 @@ def bench(rng: np.random.Generator) -> Builder:
     """A bench that looks towards x: three slats to sit on, two to lean on, two feet."""
     part = Builder()
     half = 0.5 * rng.uniform(1.5, 2.0)
-    part.block([(-0.2, -0.07), (-0.02, 0.11), (0.16, 0.29)], (-half, half), (0.43, 0.47))
-    part.block((-0.3, -0.26), (-half, half), [(0.6, 0.72), (0.76, 0.88)])
+    part.block(starting((-0.2, -0.02, 0.16), 0.13), (-half, half), (0.43, 0.47))
+    part.block((-0.3, -0.26), (-half, half), starting((0.6, 0.76), 0.12))
     for y in (-half + 0.2, half - 0.2):
         part.block((-0.22, 0.26), (y - 0.05, y + 0.05), (-SUNK_M, 0.43))
         part.block((-0.27, -0.2), (y - 0.04, y + 0.04), (0.35, 0.86))

@@ -65,9 +65,9 @@ def build(seed: int) -> World:
     plan = StairPlan(storeys, steps, width, shaft, landing, rng.uniform(4.0, 6.0))
     builder, route = Builder(), _route(plan)
     for number in range(2 * plan.storeys):
-        _draw_flight(plan.flight(builder, number), plan)
-    left, right = np.array([[0.0, -0.5 * plan.width, 0.0], [0.0, 0.5 * plan.width + plan.shaft, 0.0]])
-    draw_railing(left, right, plan.flight(builder, 2 * plan.storeys))
+        _draw_flight(plan, number, builder)
+    top = plan.flight(builder, 2 * plan.storeys)
+    draw_railing(top.point(0.0, -0.5 * plan.width), top.point(0.0, 0.5 * plan.width + plan.shaft), builder)
     _draw_shell(plan, builder, Clearance(route), rng)
     return World("stairs", seed, route, *builder.solids)
 
@@ -89,14 +89,14 @@ def _route(plan: StairPlan) -> Route:
     return Route(waypoints, 0.3, _FREE_SIDE_M, _FREE_HEIGHT_M, _SPEED_LIMIT_MPS)
 
 
-def _draw_flight(flight: Builder, plan: StairPlan) -> None:
-    half = 0.5 * plan.width
+def _draw_flight(plan: StairPlan, number: int, builder: Builder) -> None:
+    flight, half = plan.flight(builder, number), 0.5 * plan.width
     for k in range(1, plan.steps):
         flight.block(((k - 1) * TREAD_M, k * TREAD_M), (-half, half), ((k - 1) * RISE_M - 0.1, k * RISE_M))
     slab = (plan.climb - _SLAB_M, plan.climb)
     flight.block((plan.run, plan.run + plan.landing), (-half, plan.across - half), slab)
     aside = half - _RAIL_ASIDE_M
-    draw_railing(np.array([0.0, aside, RISE_M]), np.array([plan.run, aside, plan.climb]), flight)
+    draw_railing(flight.point(0.0, aside, RISE_M), flight.point(plan.run, aside, plan.climb), builder)
 
 
 def _draw_shell(plan: StairPlan, builder: Builder, clearance: Clearance, rng: np.random.Generator) -> None:
