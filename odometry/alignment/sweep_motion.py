@@ -18,11 +18,7 @@ class SweepMotion:
 
     velocity: Twist  # (6,) mean, rotation first, in radians and metres a second
     velocity_change: Twist  # (6,) velocity in the later middle above the mean, and in the earlier one below
-    interval_s: float  # from one middle to the other
-
-    def __post_init__(self) -> None:
-        if not self.interval_s > 0.0:
-            raise ValueError(f"a motion takes {self.interval_s:g} s")
+    interval_s: float  # from one middle to the other, positive
 
     def pose_after(self, seconds: float) -> FloatArray:
         """(4, 4) in the frame of the earlier middle, `seconds` after it."""

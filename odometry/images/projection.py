@@ -42,22 +42,13 @@ _P0, _P1, _P2, _P3 = (
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """The pixels of a range image: rows by elevation from the lowest up, columns by azimuth, without a seam.
-
-    ValueError where there are no pixels, or the elevations do not ascend.
-    """
+    """The pixels of a range image: rows by elevation from the lowest up, columns by azimuth, without a seam."""
 
     rows: int  # H, 2 or more
     columns: int  # W; column c covers azimuths from c to c + 1 times 2 pi / W
-    # elevation_low, elevation_high: elevations of the centres of rows 0 and H - 1, rad
+    # elevation_low, elevation_high: elevations of the centres of rows 0 and H - 1, rad, ascending
     elevation_low: float
     elevation_high: float
-
-    def __post_init__(self) -> None:
-        if self.rows < 2 or self.columns < 1:
-            raise ValueError(f"an ImageGrid needs pixels, got {self.rows} x {self.columns}")
-        if not self.elevation_low < self.elevation_high:
-            raise ValueError(f"elevations must ascend, got {self.elevation_low:g} to {self.elevation_high:g}")
 
     @classmethod
     def around(cls, points: Points, rows: int, columns: int) -> "ImageGrid":

@@ -43,14 +43,6 @@ class SweepImages:
     low: float
     high: float
 
-    def __post_init__(self) -> None:
-        if self.points.shape != self.normals.shape or self.points.shape[1:] != self.offsets.shape:
-            raise ValueError(
-                f"images of one sweep differ: {self.points.shape}, {self.normals.shape}, {self.offsets.shape}"
-            )
-        if not self.low < self.high:
-            raise ValueError(f"elevations must ascend, got {self.low:g} to {self.high:g}")
-
     def median_range_m(self) -> float:
         """Of the points of every fourth column, the lower of the two in the middle; 0 when there are none."""
         x, y, z = self.points[:, :, ::_MEDIAN_STEP]
