@@ -243,12 +243,6 @@ def test_prepared_recordings_that_do_not_fit_are_made_anew(kept, name):
     assert_as_kept(kept)
 
 
-def test_long_recordings_become_pieces():
-    pieces = list(Stretch("long", {}, lambda: pytest.fail("opened"), 100, 1301).pieces())
-    assert [len(piece) for piece in pieces] == [400, 400, 401]
-    assert (pieces[0].first, pieces[-1].stop) == (100, 1301)
-
-
 def test_whole_recordings_are_held_out_and_the_end_of_a_single_one():
     many = [Stretch(str(number), {}, lambda: pytest.fail("opened"), 0, 50) for number in range(10)]
     learned, held_out = hold_out(many, 0.2, seed=0)

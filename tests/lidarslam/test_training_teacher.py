@@ -63,17 +63,17 @@ def stretch(scans: int, simulated: bool) -> Stretch:
     return Stretch("some", identity, lambda: pytest.fail("opened"), 0, scans)
 
 
-def test_recordings_have_their_share_of_the_pairs_by_their_lengths():
-    given = [stretch(100, False), stretch(300, False), stretch(40, True), stretch(40, True), stretch(40, True)]
-    weights = draw_weights(given)
-    assert weights == pytest.approx([0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3])
-
-
-def test_long_recordings_are_drawn_in_pieces():
-    weights = draw_weights([stretch(1200, False), stretch(40, True)])
-    assert weights == pytest.approx([0.1, 0.1, 0.1, 0.7])
-
-
-@pytest.mark.parametrize("simulated", [True, False])
-def test_recordings_of_one_kind_are_drawn_equally_often(simulated):
-    assert draw_weights([stretch(10, simulated), stretch(400, simulated)]) == [1.0, 1.0]
+@pytest.mark.parametrize(
+    ("recorded", "simulated", "weights"),
+    [
+        ([100, 300], [40, 40, 40], [0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3]),
+        ([1200], [40], [0.1, 0.1, 0.1, 0.7]),
+        ([10, 400], [], [1.0, 1.0]),
+        ([], [10, 400], [1.0, 1.0]),
+    ],
+)
+def test_recordings_have_their_share_of_the_pairs_by_their_lengths_and_long_ones_are_drawn_in_pieces(
+    recorded, simulated, weights
+):
+    given = [*(stretch(scans, False) for scans in recorded), *(stretch(scans, True) for scans in simulated)]
+    assert draw_weights(given) == pytest.approx(weights)
