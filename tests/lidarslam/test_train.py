@@ -148,7 +148,7 @@ def test_a_killed_training_goes_on_to_the_same_weights(room_folder, tmp_path, re
         assert execute(request(room_folder, parts, ready, resume=True), print)
     killed = sorted(copies.iterdir())
     assert len(killed) > 9
-    for left in [*killed[1:8:3], *killed[-3:]]:
+    for left in [*killed[1:8:4], *killed[-3::2]]:
         assert execute(request(room_folder, left, ready, resume=True), print)
         assert_same(left, whole[0])
         assert not list(left.glob(".partial*"))
@@ -299,7 +299,6 @@ def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     for words in ("training on 1 recording: 7 scans to learn from, 3 more", "step 3/3  loss", "validation after 0"):
         assert words in result.output
     assert f"lidarslam run SOURCE --weights {out / 'weights.safetensors'}" in result.output
-    first = losses(out)
     result = train(room_folder, *options, *OPTIONS)
     assert result.exit_code == 1
     assert "holds a training already" in result.output
@@ -311,9 +310,6 @@ def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     assert result.exit_code == 0, result.output
     assert [row["step"] for row in losses(out)] == ["2"]
     assert load_checkpoint(out / "weights.safetensors").images.columns == 96
-    result = train(room_folder, *options, "--overwrite", "--steps", 3, "--set", "training.seed=1", *OPTIONS)
-    assert result.exit_code == 0, result.output
-    assert losses(out) != first
 
 
 @pytest.mark.parametrize(
