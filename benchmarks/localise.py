@@ -40,7 +40,7 @@ from lidarslam.odometry.config import OdometryConfig
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.run.session import open_odometry
+from lidarslam.run.run import open_odometry
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.storage.finished_run import load_map

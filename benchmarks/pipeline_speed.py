@@ -42,7 +42,7 @@ from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import in_order, prefetch
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
-from lidarslam.run.session import open_odometry
+from lidarslam.run.run import open_odometry
 
 _KISS = "KISS-ICP's own loop"
 _FEW = 8

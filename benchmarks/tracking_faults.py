@@ -47,7 +47,7 @@ from lidarslam.mapping.global_map.moved_points import seen_through
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.run.session import open_odometry
+from lidarslam.run.run import open_odometry
 from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor

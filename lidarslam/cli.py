@@ -17,12 +17,9 @@ from lidarslam.commands.compare import compare, demo
 from lidarslam.commands.config import config
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports import edit, export_bag, export_geo, export_grid, export_mesh
-from lidarslam.commands.live import live
-from lidarslam.commands.localise import localise
-from lidarslam.commands.merge import merge
 from lidarslam.commands.network import export, train
 from lidarslam.commands.recordings import datasets, info, simulate
-from lidarslam.commands.run import run
+from lidarslam.commands.runs import live, localise, merge, run
 from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
@@ -48,9 +45,7 @@ class _Group(click.Group):
         _prepare_streams()
         keep_rerun_to_itself()
         try:
-            if not _has_current_folder():
-                raise InputError("the current folder was removed; change to another")
-            _require_address_space()
+            _require_surroundings()
             with ended_like_interrupted(), _usage_in_one_line():
                 return super().invoke(ctx)
         except LidarSlamError as error:
@@ -108,26 +103,18 @@ def _drop_unwritable_output() -> None:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
 
 
-def _require_address_space() -> None:
-    """Refuse to begin where libraries cannot be loaded: OpenBLAS then waits for memory forever.
-
-    Raises:
-        InputError: the address space is limited to less than they take.
-    """
+def _require_surroundings() -> None:
+    """Refuse to begin without a current folder, or where OpenBLAS would wait for memory forever as it is loaded."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise InputError("the current folder was removed; change to another") from None
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESSES:
         raise InputError(
             f"the address space is limited to {limit >> 20} MB (ulimit -v), which loaded libraries fill;"
             f" allow {_LEAST_ADDRESSES >> 20} MB at least, and twice as much for a run"
         )
-
-
-def _has_current_folder() -> bool:
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        return False
-    return True
 
 
 @click.group(

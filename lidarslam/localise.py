@@ -12,20 +12,17 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.text import as_typed, command_line, count, joined
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import format_tum
-from lidarslam.datasets.intake import choose_scans
-from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED
 from lidarslam.pipeline.estimates import ScanEstimate
-from lidarslam.run.request import RunRequest, describe_run, log_choices
+from lidarslam.run.request import RunRequest, describe_run, log_choices, require_possible
 from lidarslam.run.results import RunOutcome, Tracked
+from lidarslam.run.run import Progress, RunSession, open_session, track
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.session import RunSession, open_session, require_apart
 from lidarslam.run.summary import WrittenMap, summarise
 from lidarslam.run.summary_text import format_end, format_times
-from lidarslam.run.tracking import Progress, track
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.finished_run import load_map
@@ -51,12 +48,7 @@ class LocaliseRequest:
 
 
 def read_map(request: LocaliseRequest) -> tuple[PointCloud, FixedMap]:
-    """The points of the map, and the map to register to.
-
-    Raises:
-        InputError: there is no map, or it is too small or without normals.
-        ConfigError: another registration than that to surfels is configured.
-    """
+    """The points of the map, and the map to register to; InputError where it is too small, or without normals."""
     if request.run.config.mapping.method != "surfels":
         raise ConfigError("mapping.method: scans are localised by registration to surfels; leave the setting out")
     cloud = load_map(request.map)
@@ -68,11 +60,7 @@ def read_map(request: LocaliseRequest) -> tuple[PointCloud, FixedMap]:
 
 
 class PlacedViewer(Viewer):
-    """Forwards scans once one is localised in the map: before, poses are in a frame of their own.
-
-    Args:
-        shown: the viewer that shows them.
-    """
+    """Forwards scans once one is localised in the map: before, poses are in a frame of their own."""
 
     def __init__(self, shown: Viewer) -> None:
         self._shown = shown
@@ -93,14 +81,14 @@ _REVOKED = "a place was found here, but later scans did not confirm it"
 class Localisation:
     """When and how a recording was found; scans are numbered from 0."""
 
-    found: int | None  # the scan that was found first; None: never
-    confirmed: int | None  # the scan that confirmed it
-    after_s: float | None  # time from the first scan to that
-    inlier_ratio: float | None  # mean of the scans that it was found with
-    tracked: int  # scans that were registered to the map
-    placed_afterwards: int  # scans before the first place that follow from it
-    times_found: int  # more than once where it was lost in between
     refused: tuple[tuple[int, str], ...]  # scan and reason of every search without a place
+    found: int | None = None  # the scan that was found first; None: never
+    confirmed: int | None = None  # the scan that confirmed it
+    after_s: float | None = None  # time from the first scan to that
+    inlier_ratio: float | None = None  # mean of the scans that it was found with
+    tracked: int = 0  # scans that were registered to the map
+    placed_afterwards: int = 0  # scans before the first place that follow from it
+    times_found: int = 0  # more than once where it was lost in between
 
     def to_json(self) -> dict[str, Any]:
         """The section of summary.json, without the map."""
@@ -132,24 +120,12 @@ def execute(
     phase: Callable[[str], None] = lambda _: None,
     page: WebPage | None = None,
 ) -> LocaliseOutcome:
-    """Localise, and write the run directory; the map is only read.
-
-    Args:
-        request: the recording, and the map to localise it in.
-        progress: called after every scan.
-        phase: called with a short text on the progress before the first scan and after the last.
-        page: shows it in browsers, with `rerun="web"`.
-
-    Raises:
-        LidarSlamError: the source, the map, the configuration or the output directory is not usable.
-    """
+    """Localise, and write the run directory; the map is only read. Arguments as of `lidarslam.run.run.execute`."""
     run = request.run
-    require_apart(run.out, run.source)
-    require_apart(run.out, request.map)
+    require_possible(run, run.source, request.map)
     phase("reading the map")
     cloud, fixed_map = read_map(request)
-    recording = open_recording(run.source, run.config.reader)
-    chosen = choose_scans(recording, run.source, run.start, run.stop, run.step)
+    recording, chosen = run.open()
     log_choices(run, chosen, len(recording))
     guess = None if request.guess is None else (*request.guess[:2], float(np.deg2rad(request.guess[2])))
     localiser = MapLocaliser(run.config.mapping, fixed_map, guess)
@@ -160,13 +136,15 @@ def execute(
         session.viewer = PlacedViewer(shown)
         session.wait_for_loops(for_first_scan=True)
         phase("searching for the place")
-        tracked = track(session, run, recording, chosen, progress, mapper=localiser)
+        tracked = track(session, recording, chosen, progress, mapper=localiser)
         session.end_scans()
         session.close_viewer()
         return _write(request, session, tracked, localiser)
 
 
-def _write(request: LocaliseRequest, session: RunSession, tracked: Tracked, localiser: MapLocaliser) -> LocaliseOutcome:
+def _write(
+    request: LocaliseRequest, session: RunSession[RunRequest], tracked: Tracked, localiser: MapLocaliser
+) -> LocaliseOutcome:
     """Write the results so far; a recording that was never found has no trajectory in the map."""
     log, directory, config, described = session.log, session.directory, request.run.config, request.describe()
     _correct(log, localiser)
@@ -203,10 +181,11 @@ def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
 def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
     refused = tuple(localiser.refusals)
     if not localiser.found:
-        return Localisation(None, None, None, None, 0, 0, 0, refused)
+        return Localisation(refused)
     first = localiser.found[0]
     lost, afterwards = log.statuses.count(Status.LOST), len(localiser.placed_afterwards)
     return Localisation(
+        refused,
         found=first.scan,
         confirmed=first.confirmed,
         after_s=float(log.stamps[first.confirmed] - log.stamps[0]),
@@ -214,20 +193,12 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
         tracked=len(log) - lost - afterwards,
         placed_afterwards=afterwards,
         times_found=len(localiser.found),
-        refused=refused,
     )
 
 
 def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
     """A localisation in a few lines: where it was found, tracked and lost scans, and where the files are."""
     return joined(_lines(request, outcome))
-
-
-def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
-    """A line about a recording that was not found."""
-    refused, scans = outcome.localisation.refused, count(outcome.run.summary.scans, "scan")
-    last = f"; the last search: {refused[-1][1]}" if refused else ""
-    return f"{request.run.source}: not found in {request.map} with {scans}{last}; {SUMMARY} has all reasons"
 
 
 def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
@@ -239,3 +210,10 @@ def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     yield from format_times(summary)
     yield from format_end(out, summary)
     yield f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}"
+
+
+def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
+    """A line about a recording that was not found."""
+    refused, scans = outcome.localisation.refused, count(outcome.run.summary.scans, "scan")
+    last = f"; the last search: {refused[-1][1]}" if refused else ""
+    return f"{request.run.source}: not found in {request.map} with {scans}{last}; {SUMMARY} has all reasons"

@@ -5,9 +5,8 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from lidarslam.core.limits import require_lost_worse, require_range_left
 from lidarslam.core.plugins import PlugPoint
-from lidarslam.core.settings import Settings
+from lidarslam.core.settings import Settings, require_lost_worse, require_range_left
 
 MappingName = Literal["surfels", "loam", "off"]
 MAPPINGS = PlugPoint("mapping", get_args(MappingName))

@@ -6,9 +6,8 @@ from typing import Annotated, Literal, Self, get_args
 from pydantic import BeforeValidator, Field, model_validator
 
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.core.limits import require_range_left
 from lidarslam.core.plugins import PlugPoint
-from lidarslam.core.settings import Settings
+from lidarslam.core.settings import Settings, require_range_left
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
 ODOMETRIES = PlugPoint("odometry", get_args(OdometryName))

@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -148,6 +148,26 @@ class Room:
         T = T_room_lidar_at(times)
         ranges = self.cast(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], directions))
         return directions * ranges[:, None]
+
+
+def write_recording(
+    folder: Path, scans: Iterable[Scan], truth: Trajectory | None = None, is_timed: bool = False
+) -> Path:
+    """Scans as .npy files, on request with times and rings of their points; their stamps, and the ground truth."""
+    folder.mkdir()
+    stamps = []
+    for index, scan in enumerate(scans):
+        columns = dict(zip("xyz", scan.points.T, strict=True)) | {"time": scan.time_offsets, "ring": scan.rings}
+        columns = {name: values for name, values in columns.items() if values is not None}
+        table = np.empty(len(scan), dtype=[(name, values.dtype) for name, values in columns.items()])
+        for name, values in columns.items():
+            table[name] = values
+        np.save(folder / f"{index:06d}.npy", table if is_timed else scan.points)
+        stamps.append(scan.stamp)
+    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
+    if truth is not None:
+        truth.save(folder / "ground_truth.tum")
+    return folder
 
 
 @pytest.fixture(scope="session")

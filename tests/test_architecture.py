@@ -28,7 +28,7 @@ MAY_IMPORT = {
 }
 # The way down is cli -> commands -> run -> pipeline -> libraries: nobody looks up it.
 RUN = (
-    *(f"lidarslam.run.{part}" for part in ("run", "session", "request", "results", "tracking")),
+    *(f"lidarslam.run.{part}" for part in ("run", "request", "results")),
     "lidarslam.run.checkpoints",
 )
 MAY_NOT_IMPORT = {

@@ -1,15 +1,12 @@
 """The configuration: closed, typed, and clear about what is wrong; YAML gives plain values or an error in a line."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
 import pytest
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
-from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml
+from lidarslam.config.yaml_text import YamlError, parse_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.mapping.config import MappingConfig, MappingName
 from lidarslam.train.settings import TrainConfig, load_train_config
@@ -92,6 +89,8 @@ def test_the_readers_options_stay_text(text: str) -> None:
         ),
         (["mapping.tracking.lost_below=0.8"], r"tracking: lost_below=0\.8 must not exceed degraded_below=0\.6,"),
         (["mapping.method=icp"], r"mapping\.method: no mapping is called 'icp'; there are: surfels, loam, off"),
+        (["checkpoints.interval_s=.inf"], "finite number"),
+        (["global_map.voxel_size_m=.nan"], "finite number"),
         (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),
     ],
 )
@@ -106,6 +105,7 @@ def test_mistakes_are_named(settings: list[str], message: str) -> None:
         ("a: [1, 2", "not YAML"),
         ("- 1\n- 2\n", "expected keys and values, got a list"),
         (b"\xff\xfe\x00", "cannot be read"),
+        (b"#" * (5 << 20), "longer than 4 MB"),
     ],
 )
 def test_broken_files_are_named(tmp_path: Path, text: str | bytes, message: str) -> None:
@@ -127,45 +127,12 @@ def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
     assert str(error.value).startswith(f"configuration ({file} or --set): ")
 
 
-@pytest.mark.parametrize("value", [".inf", "-.inf", ".nan"])
-@pytest.mark.parametrize(
-    "key",
-    [
-        "reader.rate_hz",
-        "odometry.kiss_icp.max_range_m",
-        "global_map.voxel_size_m",
-        "checkpoints.interval_s",
-    ],
-)
-def test_every_number_is_finite(key: str, value: str) -> None:
-    with pytest.raises(ConfigError, match="finite number"):
-        load_config(None, [f"{key}={value}"])
-
-
 def test_the_printed_configuration_has_a_comment_for_every_setting_and_loads_again(tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(dump_yaml(Config()))
     assert load_config(file) == Config()
     printed = file.read_text()
     assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed
-
-
-def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    for name, field in model.model_fields.items():
-        section = next((one for one in (field.annotation, *get_args(field.annotation)) if is_model(one)), None)
-        if section is None:
-            yield f"{prefix}{name}", field
-        else:
-            yield from leaves(section, f"{prefix}{name}.")
-
-
-def is_model(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def test_there_are_few_settings_and_each_is_described() -> None:
-    assert len(list(leaves(Config))) <= 60
-    assert [name for name, field in leaves(Config) if not field.description] == []
 
 
 def test_plain_values() -> None:
@@ -199,14 +166,3 @@ def test_anything_else_is_an_error_in_one_line(text: str, message: str) -> None:
     with pytest.raises(YamlError, match=message) as raised:
         parse_yaml(text)
     assert "\n" not in str(raised.value)
-
-
-def test_a_file_that_is_no_text_or_far_too_long(tmp_path: Path) -> None:
-    (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_yaml(tmp_path / "a.yaml")
-    (tmp_path / "b.yaml").write_bytes(b"#" * (5 << 20))
-    with pytest.raises(ConfigError, match="longer than 4 MB"):
-        read_yaml(tmp_path / "b.yaml")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_yaml(tmp_path / "none.yaml")

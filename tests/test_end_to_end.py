@@ -4,7 +4,6 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses, read_tum, write_tum
 from lidarslam.pipeline.estimates import ScanEstimate
-from lidarslam.pipeline.threads import in_order
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.storage.directory import FILES, MAPS
 from lidarslam.storage.finished_run import load_run
+
+from .conftest import write_recording
 
 KISS_ICP = [
     "odometry.method=kiss-icp",
@@ -43,17 +43,7 @@ def quiet(number: int, total: int, result: ScanEstimate) -> None:
 @pytest.fixture
 def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
     """The drive through the room as a folder of .npy scans with their times, stamps and ground truth."""
-    folder = tmp_path / "room scans"
-    folder.mkdir()
-    fields = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
-    for index, scan in enumerate(room_scans):
-        table = np.empty(len(scan), dtype=fields)
-        table["x"], table["y"], table["z"] = scan.points.T
-        table["time"] = scan.time_offsets
-        np.save(folder / f"{index:06d}.npy", table)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps, fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
-    return folder
+    return write_recording(tmp_path / "room scans", room_scans, room_truth, is_timed=True)
 
 
 def test_a_run_writes_what_the_contract_names(
@@ -195,38 +185,6 @@ def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -
     assert any("18,000 invalid points" in warning for warning in summary["warnings"])
 
 
-def test_scans_that_go_back_in_time_are_left_out() -> None:
-    scans = [Scan(np.ones((1, 3)), stamp) for stamp in (0.0, 0.1, 0.1, 0.05, 0.2)]
-    assert [scan.stamp for scan in in_order(scans)] == [0.0, 0.1, 0.2]
-
-
-def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
-
-    read = ScanFolderRecording.scans
-
-    def stuttering(self: Any, *chosen: Any, **options: Any) -> Any:
-        for index, scan in enumerate(read(self, *chosen, **options)):
-            yield replace(scan, stamp=scan.stamp - 0.2) if index in (4, 5) else scan
-
-    monkeypatch.setattr(ScanFolderRecording, "scans", stuttering)
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP), stop=9), quiet)
-    assert outcome.summary.scans == 7
-    assert any(warning.startswith("2 scans were left out") for warning in outcome.summary.warnings)
-
-
-def test_a_damaged_scan_is_left_out_and_counted(recording: Path, tmp_path: Path) -> None:
-    (recording / "000012.npy").write_bytes(b"not an array")
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
-    assert outcome.stopped is None
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["scans"] == 19
-    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
-    (warning,) = (warning for warning in summary["warnings"] if "left out" in warning)
-    assert warning.startswith("1 scan was left out: it could not be read")
-    assert "000012.npy" in warning
-
-
 def test_damage_that_no_scan_can_be_left_out_for_ends_the_run_with_what_there_is(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,16 +204,6 @@ def test_damage_that_no_scan_can_be_left_out_for_ends_the_run_with_what_there_is
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
     assert (tmp_path / "run" / "map.ply").exists()
     assert "stopped after 12 scans: the disk broke" in summary["warnings"]
-
-
-def test_an_interruption_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:
-    def interrupt(number: int, total: int, result: ScanEstimate) -> None:
-        if number == 7:
-            raise KeyboardInterrupt
-
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), interrupt)
-    assert outcome.stopped == "interrupted"
-    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 7
 
 
 def test_a_damaged_truth_costs_the_metrics_not_the_run(recording: Path, tmp_path: Path) -> None:
@@ -279,12 +227,6 @@ def test_a_run_that_cannot_start_leaves_nothing_behind(recording: Path, tmp_path
     with pytest.raises(InputError, match=r"\.npy"):
         execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
     assert not (tmp_path / "run").exists()
-
-
-def test_points_beyond_the_maps_range_still_tell_whether_it_is_lost(recording: Path, tmp_path: Path) -> None:
-    config = load_config(None, [*KISS_ICP, "global_map.max_range_m=1.0"])
-    outcome = execute(RunRequest(recording, tmp_path / "run", config), quiet)
-    assert outcome.summary.lost_scans == 0
 
 
 def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> None:

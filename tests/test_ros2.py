@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from lidarslam.commands.live import live
+from lidarslam.commands.runs import live
 
 PACKAGE = Path(__file__).parents[1] / "ros2"
 NAMES = {

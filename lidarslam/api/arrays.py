@@ -75,11 +75,7 @@ def check_stamp(stamp: float, last: float | None) -> float:
 
 
 def check_sweep(scan: Scan, interval_s: float) -> None:
-    """The duration of a sweep, against the longest time between two stamps so far.
-
-    Raises:
-        InputError: it is much longer.
-    """
+    """Refuse a sweep that is much longer than the longest time between two stamps so far."""
     if scan.time_offsets is None or not len(scan):
         return
     sweep_s = float(np.ptp(scan.time_offsets))

@@ -20,7 +20,6 @@ from lidarslam.api.slam import Slam
 from lidarslam.config.settings import load_config
 from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.mounting import transform_of
 
 logger = logging.getLogger(__name__)
@@ -38,8 +37,7 @@ class LidarSlam(Pipeline):
     def __init__(self) -> None:
         super().__init__()
         self._parameters = dict(_DEFAULTS)
-        self._T_lidar_imu: FloatArray = np.eye(4)
-        self._T_upright_recorded: FloatArray = np.eye(4)
+        self._T_lidar_imu = self._T_upright_recorded = np.eye(4)
         self._slam: Slam | None = None
 
     @staticmethod

@@ -30,10 +30,10 @@ from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline, map_error
 from lidarslam.run.inertial import make_imu_stream
-from lidarslam.run.loop_closing import GraphOutcome, begin_graph, loops_so_far
+from lidarslam.run.loop_closing import GraphOutcome, begin_graph, correct
 from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
+from lidarslam.run.run import draw_report, open_odometry, require_no_trajectory
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.session import draw_report, open_odometry, require_no_trajectory
 from lidarslam.storage.directory import RunDirectory
 
 logger = logging.getLogger(__name__)
@@ -182,7 +182,7 @@ class Slam:
         """
         with self._entered():
             self._settle()
-            if not self._log.points_read:
+            if not self._log.table["points"].any():
                 raise InputError("there is nothing to save: no scan with points was registered")
             for warning in self._imu.warnings if self._imu is not None else ():
                 self._log.warn(warning)
@@ -235,8 +235,9 @@ class Slam:
 
     def _corrected(self) -> tuple[Tracked, GraphOutcome | None]:
         """The results so far, corrected by the closed loops, once the background is done."""
-        log, built = copy.deepcopy(self._log), self._pipeline.map
-        closed = loops_so_far(self._graph if self._has_whole_graph() else None, built.global_map, log)
+        log, built, closed = copy.deepcopy(self._log), self._pipeline.map, None
+        if self._graph is not None and self._has_whole_graph() and built.global_map is not None:
+            closed = correct(log, self._graph, self._graph.present(), built.global_map)
         return Tracked(TrackedScans.of(log, copy.copy(self._faults), built), built.global_map), closed
 
     def _has_whole_graph(self) -> bool:

@@ -31,11 +31,7 @@ _DEPTH, _MOST_ENTRIES = 3, 1000
 
 
 def choose(arguments: Sequence[str]) -> tuple[list[DataSet], list[Path]]:
-    """The data sets and the folders among the arguments of the command.
-
-    Raises:
-        InputError: an argument is neither.
-    """
+    """The data sets and the folders among the arguments of the command; InputError where one is neither."""
     known = {one.name: one for one in CATALOGUE}
     chosen, folders = [], []
     for argument in arguments:

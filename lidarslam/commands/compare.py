@@ -7,26 +7,12 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.options import (
-    FILE,
-    PATH,
-    POSITIVE,
-    ShippedFile,
-    command,
-    config_options,
-    default_out,
-    gate_options,
-    jobs_options,
-    out_option,
-    reader_options,
-    scan_options,
-    take_where,
-)
+from lidarslam.commands import options as opt
 from lidarslam.commands.terminal import EXIT_GATE, EXIT_MENDABLE, note, say
 from lidarslam.core.errors import ConfigError
 
 
-@command(
+@opt.command(
     """lidarslam compare office.mcap
     lidarslam compare KITTI --sequence 04 -o compared/04 --methods learned,learned+map,kiss-icp
     lidarslam compare office.mcap --methods learned+map,learned+loam
@@ -37,8 +23,8 @@ from lidarslam.core.errors import ConfigError
     lidarslam compare --benchmark kitti --data KITTI
     lidarslam compare --benchmark simulated --jobs 4"""
 )
-@click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
-@out_option("Folder for runs and report.", "compared/SOURCE_TIME, after the first, or the benchmark")
+@click.argument("sources", type=opt.PATH, nargs=-1, metavar="[SOURCE]...")
+@opt.out_option("Folder for runs and report.", "compared/SOURCE_TIME, after the first, or the benchmark")
 @click.option(
     "--methods",
     metavar="NAME,...",
@@ -48,22 +34,24 @@ from lidarslam.core.errors import ConfigError
 )
 @click.option(
     "--benchmark",
-    type=ShippedFile("benchmark", "BENCHMARKS"),
+    type=opt.ShippedFile("benchmark", "BENCHMARKS"),
     help="Recordings and methods: a name of lidarslam config --list, or a YAML file.",
 )
-@click.option("--data", type=PATH, metavar="DIR", help="Root of the benchmark's paths.  [default: the current folder]")
-@click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory of prior, prior+map and prior+loam.")
+@click.option(
+    "--data", type=opt.PATH, metavar="DIR", help="Root of the benchmark's paths.  [default: the current folder]"
+)
+@click.option("--prior", type=opt.FILE, metavar="TUM_FILE", help="Trajectory of prior, prior+map and prior+loam.")
 @click.option("--reference", metavar="METHOD|FILE", help="Reference.  [default: the ground truth]")
-@click.option("--reference-map", type=FILE, metavar="FILE", help="Point cloud to compare the maps with.")
-@click.option("--memory-limit-mb", type=POSITIVE, help="Memory limit of a method.")
-@click.option("--timeout-s", type=POSITIVE, help="Time limit of a method.")
-@scan_options
-@gate_options(with_method=True)
-@jobs_options
+@click.option("--reference-map", type=opt.FILE, metavar="FILE", help="Point cloud to compare the maps with.")
+@click.option("--memory-limit-mb", type=opt.POSITIVE, help="Memory limit of a method.")
+@click.option("--timeout-s", type=opt.POSITIVE, help="Time limit of a method.")
+@opt.scan_options
+@opt.gate_options(with_method=True)
+@opt.jobs_options
 @click.option("--reuse", is_flag=True, help="Keep finished runs in DIR with the same settings.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier comparison in DIR.")
-@reader_options
-@config_options
+@opt.reader_options
+@opt.config_options
 @click.pass_context
 def compare(
     ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, out: Path | None, **options: Any
@@ -96,7 +84,7 @@ def compare(
             raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
     if out is None:
         name = source_name(sources[0], options["sequence"]) if benchmark is None else benchmark.stem
-        out = default_out("compared", name)
+        out = opt.default_out("compared", name)
     of_entry = {name: options[name] for name in ("start", "stop", "step", "prior", "reference", "reference_map")}
     methods = options["methods"] or (DEFAULT_METHODS if benchmark is None else None)
     of_reader = {"name": options["reader"], "topic": options["topic"], "sequence": options["sequence"]}
@@ -107,7 +95,7 @@ def compare(
         config_file=options["config_file"],
         settings=(*options["settings"], *reader_settings(**of_reader)),
         limits=Limits(options["memory_limit_mb"], options["timeout_s"]),
-        where=take_where(options),
+        where=opt.take_where(options),
         overwrite=options["overwrite"],
         reuse=options["reuse"],
         command=command_line("lidarslam", *sys.argv[1:]),
@@ -122,9 +110,9 @@ def compare(
         ctx.exit(EXIT_GATE)
 
 
-@command("lidarslam demo -o demo")
+@opt.command("lidarslam demo -o demo")
 @click.option(
-    "-o", "--out", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
+    "-o", "--out", type=opt.PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
 )
 @click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:

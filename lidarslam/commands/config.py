@@ -5,17 +5,17 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import command, config_options
+from lidarslam.commands import options as opt
 from lidarslam.commands.terminal import say
 from lidarslam.core.text import printable
 
 
-@command(
+@opt.command(
     """lidarslam config --list
     lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5"""
 )
 @click.option("--list", "listing", is_flag=True, help="List the configurations and benchmarks that come along.")
-@config_options
+@opt.config_options
 def config(listing: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
     """Print the resolved configuration as YAML."""
     from lidarslam.config.settings import dump_yaml, load_config

@@ -6,27 +6,18 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import (
-    PATH,
-    command,
-    config_options,
-    default_out,
-    jobs_options,
-    out_option,
-    reader_options,
-    take_where,
-)
+from lidarslam.commands import options as opt
 from lidarslam.commands.terminal import EXIT_MENDABLE, say
 
 
-@command(
+@opt.command(
     """lidarslam train office.mcap street.mcap
     lidarslam train KITTI --sequence 00 -o trained --from shipped --steps 2000
     lidarslam train --set simulated.recordings=100
     lidarslam train -o trained --resume"""
 )
-@click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
-@out_option("Directory of the training.", "trained/SOURCE_TIME, after the first")
+@click.argument("sources", type=opt.PATH, nargs=-1, metavar="[SOURCE]...")
+@opt.out_option("Directory of the training.", "trained/SOURCE_TIME, after the first")
 @click.option("--resume", is_flag=True, help="Continue the training in DIR, on the same recordings.")
 @click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
 @click.option(
@@ -46,11 +37,11 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say
 )
 @click.option("--from", "start_from", metavar="WEIGHTS", help="Initial weights; shipped: the included ones.")
 @click.option(
-    "--prepared", type=PATH, metavar="DIR", help="Cache of preprocessed recordings.  [default: prepared in --out]"
+    "--prepared", type=opt.PATH, metavar="DIR", help="Cache of preprocessed recordings.  [default: prepared in --out]"
 )
-@jobs_options
-@reader_options
-@config_options
+@opt.jobs_options
+@opt.reader_options
+@opt.config_options
 @click.pass_context
 def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Train the learned odometry on recordings without labels.
@@ -66,18 +57,18 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
             raise click.UsageError("--resume continues the training in --out; name it")
         if "WORLD_SIZE" in os.environ:
             raise click.UsageError("the processes of torchrun share a directory; name it with --out")
-        out = default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
+        out = opt.default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
     require_train_extra("training")
-    where = take_where(options)
+    where = opt.take_where(options)
     from lidarslam.train.train import run_train
 
     if not run_train(sources, say, out=out, where=where, **options):
         ctx.exit(EXIT_MENDABLE)
 
 
-@command("lidarslam export --weights trained/weights.safetensors -o exported")
-@click.option("--weights", type=PATH, metavar="FILE", help="Trained weights.  [default: included]")
-@out_option("Folder for the ONNX graphs.", "exported/WEIGHTS_TIME")
+@opt.command("lidarslam export --weights trained/weights.safetensors -o exported")
+@click.option("--weights", type=opt.PATH, metavar="FILE", help="Trained weights.  [default: included]")
+@opt.out_option("Folder for the ONNX graphs.", "exported/WEIGHTS_TIME")
 def export(weights: Path | None, out: Path | None) -> None:
     """Export a trained network as ONNX.
 
@@ -93,5 +84,5 @@ def export(weights: Path | None, out: Path | None) -> None:
 
     weights = weights or default_weights()
     checkpoint = load_checkpoint(weights)
-    for path in export_onnx(checkpoint, out or default_out("exported", weights.stem)):
+    for path in export_onnx(checkpoint, out or opt.default_out("exported", weights.stem)):
         say(f"written to {path}")

@@ -9,34 +9,17 @@ import click
 from click.shell_completion import CompletionItem
 
 from lidarslam.commands.terminal import note, verbose_option
+from lidarslam.core.errors import ConfigError
 from lidarslam.core.plugins import PlugPoint
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
     from lidarslam.core.tasks import Where
-    from lidarslam.mapping.config import MapFormat
-    from lidarslam.mapping.loops.closure import GivenLoops
+    from lidarslam.evaluation.comparison.gates import Gate
 
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
-# Of the commands that leave a run directory.
-POSE_GRAPH = click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
-GNSS = click.option(
-    "--gnss/--no-gnss",
-    default=None,
-    help="Hold the pose graph by GNSS positions, and write map and trajectory in UTM, too.  [default: no-gnss]",
-)
-_SCANS = (click.IntRange(min=0), click.IntRange(min=0))
-RERUN = click.option(
-    "--rerun",
-    type=click.Choice(["off", "save", "web", "spawn"]),
-    default="off",
-    show_default=True,
-    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
-)
-REPORT = click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
-OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 
 
 class Registered(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
@@ -137,7 +120,7 @@ class _Path(click.Path):
 PATH = _Path(path_type=Path)
 
 
-def _together(*decorators: _Decorator) -> _Decorator:
+def together(*decorators: _Decorator) -> _Decorator:
     """Several options as one decorator, in the order of the help."""
 
     def apply(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -148,27 +131,9 @@ def _together(*decorators: _Decorator) -> _Decorator:
     return apply
 
 
-LOOPS = _together(
-    click.option(
-        "--loop",
-        "loops",
-        type=_SCANS,
-        multiple=True,
-        metavar="I J",
-        help="Close a loop between scans I and J, by their indices in the run, from 0; may be repeated.",
-    ),
-    click.option(
-        "--no-loop",
-        "no_loops",
-        type=_SCANS,
-        multiple=True,
-        metavar="I J",
-        help="Find no loop between scans within 50 of I and of J; may be repeated.",
-    ),
-)
 SOURCE = click.argument("source", type=PATH)
 
-config_options = _together(
+config_options = together(
     click.option(
         "-c",
         "--config",
@@ -178,7 +143,7 @@ config_options = _together(
     ),
     click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One setting; may be repeated."),
 )
-reader_options = _together(
+reader_options = together(
     click.option(
         "--reader",
         type=Registered("lidarslam.datasets.registry", "ALL_READERS"),
@@ -187,45 +152,12 @@ reader_options = _together(
     click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag with several."),
     click.option("--sequence", metavar="NAME", help="Sequence of a data set's root, such as 04 of KITTI odometry."),
 )
-scan_options = _together(
+scan_options = together(
     click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan."),
     click.option("--stop", type=click.IntRange(min=0), help="Scan to stop before."),
     click.option("--step", type=click.IntRange(min=1), default=1, show_default=True, help="Take every n-th scan."),
 )
-odometry_options = _together(
-    click.option(
-        "--odometry",
-        type=Registered("lidarslam.odometry.config", "ODOMETRIES", without="external"),
-        help="Motion from scan to scan; imu and learned+imu use the recording's IMU.  [default: learned]",
-    ),
-    click.option(
-        "--weights",
-        type=click.Path(path_type=Path, exists=True),
-        metavar="FILE",
-        help="Weights of the learned odometry, or the folder of an exported network.  [default: included]",
-    ),
-)
-mapping_options = _together(
-    # With a value or without, which is surfels.
-    click.option(
-        "--mapping",
-        type=Registered("lidarslam.mapping.config", "MAPPINGS"),
-        is_flag=False,
-        flag_value="surfels",
-        help="Register scans to a map of surfels or as LOAM's mapping does.  [default: surfels]",
-    ),
-    click.option("--no-mapping", is_flag=True, help="The odometry alone, as --mapping off."),
-)
-map_options = _together(
-    click.option(
-        "--map-format",
-        type=Registered("lidarslam.mapping.config", "MapFormat"),
-        multiple=True,
-        help="Write the map as map.pcd, map.laz or map.e57 too; may be repeated.",
-    ),
-    click.option("--pcd", is_flag=True, help="As --map-format pcd."),
-)
-jobs_options = _together(
+jobs_options = together(
     click.option(
         "--jobs",
         type=click.IntRange(min=1),
@@ -236,37 +168,6 @@ jobs_options = _together(
     ),
     click.option("--ray", metavar="ADDRESS", help="Compute on a Ray cluster: auto, or HOST:6379 of its head."),
 )
-
-
-def take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":
-    """The formats of the map besides .ply; the options they are made of are removed.
-
-    Raises:
-        OutputError: a library for one is not installed.
-    """
-    from lidarslam.mapping.global_map.point_cloud import require_format
-
-    formats = (*options.pop("map_format"), *(["pcd"] if options.pop("pcd") else []))
-    for one in formats:
-        require_format(one)
-    return tuple(dict.fromkeys(formats))
-
-
-def take_loops(options: dict[str, Any]) -> "GivenLoops":
-    """The loop closures that are given and forbidden; the options they are made of are removed.
-
-    Raises:
-        UsageError: a pair is one scan, or is both.
-    """
-    from lidarslam.mapping.loops.closure import GivenLoops
-
-    closed, forbidden = (dict.fromkeys((min(p), max(p)) for p in options.pop(name)) for name in ("loops", "no_loops"))
-    for first, second in (*closed, *forbidden):
-        if first == second:
-            raise click.UsageError(f"--loop and --no-loop take two scans, not {first} twice")
-    for first, second in closed.keys() & forbidden.keys():
-        raise click.UsageError(f"--loop {first} {second} and --no-loop {first} {second} exclude one another")
-    return GivenLoops(tuple(closed), tuple(forbidden))
 
 
 def out_option(what: str, default: str) -> _Decorator:
@@ -284,11 +185,7 @@ def default_out(folder: str, name: str) -> Path:
 
 
 def latest_run() -> Path:
-    """The latest run in `runs`, which is noted.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """The latest run in `runs`, which is noted; UsageError where there is none."""
     from lidarslam.storage import default_places
 
     run = default_places.latest_run()
@@ -302,10 +199,6 @@ def take_config(options: dict[str, Any], *sources: Path) -> "Config":
     """The configuration for these sources; the options it is made of are removed, all but the prior.
 
     Options that a source does not use are noted.
-
-    Raises:
-        UsageError: options exclude each other.
-        ConfigError, InputError: a file or a setting is invalid, or no reader recognises a source.
     """
     from lidarslam.config.settings import load_config, reader_settings
 
@@ -363,42 +256,29 @@ def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: 
         note(f"--sequence {sequence} is ignored: {source} is one recording ({chosen})")
 
 
-class _Gate(click.ParamType):  # type: ignore[type-arg]
-    """A bound of a figure, named by the parameter: of `--max` or of `--min`; of a comparison, of one method too."""
+def gate_options(with_method: bool) -> _Decorator:
+    """The options `--max` and `--min`, in a comparison also of one method; their values are `maxima` and `minima`."""
 
-    name = "gate"
-
-    def __init__(self, with_method: bool) -> None:
-        self._with_method = with_method
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        from lidarslam.core.errors import ConfigError
+    def parse(_ctx: click.Context, param: click.Parameter, bounds: tuple[str, ...]) -> tuple["Gate", ...]:
         from lidarslam.evaluation.comparison.gates import parse_gate
 
+        kind: Literal["max", "min"] = "max" if param.name == "maxima" else "min"
         try:
-            kind: Literal["max", "min"] = "max" if param is not None and param.name == "maxima" else "min"
-            return parse_gate(kind, value, self._with_method)
+            return tuple(parse_gate(kind, bound, with_method) for bound in bounds)
         except ConfigError as error:
-            self.fail(str(error), param, ctx)
+            raise click.BadParameter(str(error)) from None
 
-
-def gate_options(with_method: bool) -> _Decorator:
-    """The options `--max` and `--min`; their values are `maxima` and `minima`."""
-    gate, form = _Gate(with_method), f"{'[METHOD:]' if with_method else ''}NAME=VALUE"
     texts = (
         ("--max", "maxima", "Upper bound of a figure, such as ate=0.1; may be repeated."),
         ("--min", "minima", "Lower bound of a figure, such as f_score_0.1=90; may be repeated."),
     )
-    given: dict[str, Any] = {"type": gate, "multiple": True, "metavar": form}
-    return _together(*(click.option(*names, help=text, **given) for *names, text in texts))
+    form = f"{'[METHOD:]' if with_method else ''}NAME=VALUE"
+    given: dict[str, Any] = {"callback": parse, "multiple": True, "metavar": form}
+    return together(*(click.option(*names, help=text, **given) for *names, text in texts))
 
 
 def take_where(options: dict[str, Any]) -> "Where":
-    """Where independent tasks are carried out; the options it is made of are removed.
-
-    Raises:
-        UsageError: the options exclude each other.
-    """
+    """Where independent tasks are carried out; the options it is made of are removed."""
     from lidarslam.core.tasks import Where
 
     jobs, cluster = options.pop("jobs"), options.pop("ray")

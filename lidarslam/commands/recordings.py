@@ -5,29 +5,17 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import (
-    FILE,
-    SOURCE,
-    Registered,
-    command,
-    config_options,
-    default_out,
-    jobs_options,
-    out_option,
-    reader_options,
-    take_config,
-    take_where,
-)
+from lidarslam.commands import options as opt
 from lidarslam.commands.terminal import say
 
-_WORLD = Registered("lidarslam.simulation.world", "WORLDS")
-_SENSOR = Registered("lidarslam.simulation.sensors", "SENSORS")
-_CARRIER = Registered("lidarslam.simulation.motion", "CARRIERS")
-_MOUNT = Registered("lidarslam.simulation.motion", "MOUNTS")
-_FORMAT = Registered("lidarslam.simulation.writers", "FORMATS")
+_WORLD = opt.Registered("lidarslam.simulation.world", "WORLDS")
+_SENSOR = opt.Registered("lidarslam.simulation.sensors", "SENSORS")
+_CARRIER = opt.Registered("lidarslam.simulation.motion", "CARRIERS")
+_MOUNT = opt.Registered("lidarslam.simulation.motion", "MOUNTS")
+_FORMAT = opt.Registered("lidarslam.simulation.writers", "FORMATS")
 
 
-@command(
+@opt.command(
     """lidarslam datasets
     lidarslam datasets hilti_2022
     lidarslam datasets /data --json"""
@@ -48,29 +36,29 @@ def datasets(arguments: tuple[str, ...], as_json: bool) -> None:
         say(text.list_data_sets(on_disk))
 
 
-@command(
+@opt.command(
     """lidarslam info recordings/2011_09_26_drive_0005_sync
     lidarslam info office.mcap --json"""
 )
-@SOURCE
+@opt.SOURCE
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; docs/command_line.md describes the keys.")
-@reader_options
-@config_options
+@opt.reader_options
+@opt.config_options
 def info(source: Path, as_json: bool, **options: Any) -> None:
     """Print what a recording holds, and what was inferred about it."""
     from lidarslam.datasets.info_text import describe_as_json, describe_source
 
-    config = take_config(options, source).reader
+    config = opt.take_config(options, source).reader
     say((describe_as_json if as_json else describe_source)(source, config))
 
 
-@command(
+@opt.command(
     """lidarslam simulate
     lidarslam simulate -o recordings/street --world street --sensor hdl-64e --motion car --format kitti
     lidarslam simulate -o recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
     lidarslam simulate -o recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000"""
 )
-@out_option("Folder of the recording.", "recordings/WORLD_TIME")
+@opt.out_option("Folder of the recording.", "recordings/WORLD_TIME")
 @click.option("--world", type=_WORLD, default="office", show_default=True, help="Scene.")
 @click.option("--sensor", type=_SENSOR, default="vlp-16", show_default=True, help="LiDAR model.")
 @click.option(
@@ -87,7 +75,7 @@ def info(source: Path, as_json: bool, **options: Any) -> None:
 )
 @click.option(
     "--trajectory",
-    type=FILE,
+    type=opt.FILE,
     metavar="FILE",
     help="TUM or KITTI file to follow, KITTI's smoothed over 0.25 s. The street is built around it; in other worlds it"
     " must keep clear of obstacles.",
@@ -97,7 +85,7 @@ def info(source: Path, as_json: bool, **options: Any) -> None:
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
 @click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
 @click.option("--imu/--no-imu", default=False, show_default=True, help="Record an IMU of 200 Hz on the LiDAR too.")
-@jobs_options
+@opt.jobs_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Simulate a recording, with exact trajectory and map."""
@@ -105,8 +93,8 @@ def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **op
     from lidarslam.simulation.record import RecordRequest, format_summary, record
 
     motion = motion or ("handheld" if trajectory is None else "car")
-    out = out or default_out("recordings", options["world"])
-    where = take_where(options)
+    out = out or opt.default_out("recordings", options["world"])
+    where = opt.take_where(options)
     request = RecordRequest(out, where=where, motion=motion, trajectory=trajectory, **options)
     with show_count(out.name) as progress:
         summary = record(request, progress)

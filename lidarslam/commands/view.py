@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.options import (
-    PATH,
-    command,
-    config_options,
-    latest_run,
-    reader_options,
-    scan_options,
-    take_config,
-)
+from lidarslam.commands import options as opt
 from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
 from lidarslam.core.errors import InputError
 
@@ -26,7 +18,7 @@ if TYPE_CHECKING:
 _RRD = ".rrd"
 
 
-@command(
+@opt.command(
     """lidarslam view
     lidarslam view runs/04 runs/wheels --web
     lidarslam view office.mcap --web
@@ -36,17 +28,17 @@ _RRD = ".rrd"
     lidarslam view compared/04 --picture maps.png
     lidarslam view runs/04 --video map.gif"""
 )
-@click.argument("places", type=PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
+@click.argument("places", type=opt.PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
-@click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
+@click.option("--save", type=opt.PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
 @click.option(
     "--picture",
-    type=PATH,
+    type=opt.PATH,
     metavar="FILE.png",
     help="Draw runs, or .ply files, in one picture instead; into a folder, each in one of its own, in the same frame.",
 )
 @click.option(
-    "--video", type=PATH, metavar="FILE.gif", help="Turn what --picture draws once, as .gif, or .mp4 by ffmpeg."
+    "--video", type=opt.PATH, metavar="FILE.gif", help="Turn what --picture draws once, as .gif, or .mp4 by ffmpeg."
 )
 @click.option(
     "--colour",
@@ -55,21 +47,12 @@ _RRD = ".rrd"
     " map that evaluate --errors wrote by that to the reference map.  [default: height]",
 )
 @click.option("--oblique", is_flag=True, help="Draw the picture obliquely instead of from above.")
-@scan_options
-@reader_options
-@config_options
+@opt.scan_options
+@opt.reader_options
+@opt.config_options
 @click.pass_context
 def view(
-    ctx: click.Context,
-    /,
-    places: tuple[Path, ...],
-    web: bool,
-    save: Path | None,
-    picture: Path | None,
-    video: Path | None,
-    colour: Any,
-    oblique: bool,
-    **options: Any,
+    ctx: click.Context, /, places: tuple[Path, ...], web: bool, colour: Any, oblique: bool, **options: Any
 ) -> None:
     """Show runs, the scans of a recording, or a Rerun recording.
 
@@ -77,11 +60,12 @@ def view(
     ground truth if there is one.  [default: the latest run in runs]  SOURCE is a recording; --start, --stop and --step
     choose its scans. With --picture, RUN may also be a cloud (.ply or .pcd).
     """
+    save, picture, video = (options.pop(name) for name in ("save", "picture", "video"))
     if sum([web, *(place is not None for place in (save, picture, video))]) > 1:
         raise click.UsageError("--web, --save, --picture and --video exclude one another; choose one")
     if (colour is not None and picture is None and video is None) or (oblique and picture is None):
         raise click.UsageError("--colour belongs to --picture and --video, and --oblique to --picture")
-    places = places or (latest_run(),)
+    places = places or (opt.latest_run(),)
     if picture is not None:
         _draw(_drawn(places, colour, apart=not picture.suffix), picture, colour or "height", oblique)
     elif video is not None:
@@ -150,7 +134,7 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
     from lidarslam.run.progress import show_count
     from lidarslam.viewer.rerun_scenes import show_scans
 
-    config = take_config(options, source)
+    config = opt.take_config(options, source)
     recording = open_recording(source, config.reader)
     chosen = choose_scans(recording, source, options["start"], options["stop"], options["step"])
     return show_scans(recording, source, chosen, config.viewer, show_count, note)

@@ -8,7 +8,7 @@ import reprlib
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeGuard, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError
@@ -70,18 +70,13 @@ class Config(Settings):
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """The defaults, changed by a YAML file and then by settings such as `odometry.kiss_icp.voxel_size_m=0.5`.
 
-    Raises:
-        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    ConfigError where the file is not readable YAML, a key does not exist, or a value does not fit.
     """
     return load_model(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
 
 
 def make_config(given: Config | PathLike[str] | str | Mapping[str, Any] | None) -> Config:
-    """A configuration; the path or name of one in YAML; or settings: sections as dictionaries, keys with dots, or both.
-
-    Raises:
-        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
-    """
+    """A configuration; the path or name of one in YAML; or settings, by sections, keys with dots, or both."""
     if given is None or isinstance(given, Config):
         return given or Config()
     if not isinstance(given, Mapping):
@@ -96,9 +91,6 @@ def load_model(model: type[M], path: Path | None, settings: Sequence[str], examp
     """Any configuration: its defaults, changed by a YAML file and then by settings like the example.
 
     The section of a run's or training's config.yaml about its source is ignored.
-
-    Raises:
-        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
     """
     tree = {} if path is None else read_yaml(path)
     for section in _DESCRIPTIONS:
@@ -120,8 +112,7 @@ def _validated(model: type[M], tree: dict[str, Any], origin: str) -> M:
 def _switched_number(model: type[BaseModel], tree: Mapping[str, Any]) -> str | None:
     """The first number that is given as true or false, which Pydantic takes for 1 and 0; None without any."""
     for key, field in model.model_fields.items():
-        value, kinds = tree.get(key), {field.annotation, *get_args(field.annotation)}
-        section = next(filter(_is_section, kinds), None)
+        value, kinds, section = tree.get(key), {field.annotation, *get_args(field.annotation)}, _section_of(field)
         if section is not None and isinstance(value, Mapping):
             if (within := _switched_number(section, value)) is not None:
                 return f"{key}.{within}"
@@ -222,12 +213,14 @@ def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, Fie
         if key not in section.model_fields:
             return depth, field
         field = section.model_fields[key]
-        section = next(filter(_is_section, (field.annotation, *get_args(field.annotation))), BaseModel)
+        section = _section_of(field) or BaseModel
     return len(location), field
 
 
-def _is_section(kind: object) -> TypeGuard[type[BaseModel]]:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
+def _section_of(field: FieldInfo) -> type[BaseModel] | None:
+    """The type of a section, which may be null; None of a value."""
+    kinds = (field.annotation, *get_args(field.annotation))
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
 
 
 def _short(value: object) -> str:
@@ -236,11 +229,8 @@ def _short(value: object) -> str:
 
 
 def _suggest(location: Sequence[str], model: type[BaseModel]) -> str:
-    section: Any = model
+    section = model
     for key in location[:-1]:
-        annotation = section.model_fields[key].annotation
-        # A section that may be null is a union of itself and None.
-        section = next((part for part in get_args(annotation) if part is not type(None)), annotation)
-    known = list(section.model_fields)
-    close = difflib.get_close_matches(location[-1], known, n=1)
-    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(known)}"
+        section = _section_of(section.model_fields[key]) or BaseModel
+    close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
+    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(section.model_fields)}"

@@ -69,8 +69,7 @@ class _StrictLoader(yaml.SafeLoader):
 def parse_yaml(text: str) -> Any:
     """The values of a text: dictionaries, lists, texts, numbers, dates, null.
 
-    Raises:
-        YamlError: it is not YAML, asks for other objects, or a key occurs twice.
+    YamlError where it is not YAML, asks for other objects, or a key occurs twice.
     """
     try:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 # a SafeLoader that refuses more
@@ -85,8 +84,7 @@ def parse_yaml(text: str) -> Any:
 def read_yaml(path: Path) -> dict[str, Any]:
     """The keys and values of a file in UTF-8.
 
-    Raises:
-        ConfigError: it cannot be read, is too long, is not YAML, or has no keys and values.
+    ConfigError where it cannot be read, is too long, is not YAML, or has no keys and values.
     """
     try:
         with path.open("rb") as file:

@@ -15,8 +15,7 @@ _WATCH = 'read -r _; kill -s KILL -- "-$1"'
 def bound(process: "subprocess.Popen[Any]") -> Iterator[None]:
     """End a process and its descendants with the context, or with this process, whichever comes first.
 
-    Args:
-        process: started with `start_new_session=True`; descendants with a session of their own are not covered.
+    It was started with `start_new_session=True`; descendants with a session of their own are not covered.
     """
     quiet = subprocess.DEVNULL
     watch = subprocess.Popen(

@@ -36,12 +36,8 @@ _MARK = b"\xef\xbb\xbf"  # of byte order
 def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
     """Write a file atomically: a temporary path next to it, renamed to it when the block ends without an error.
 
-    Args:
-        path: the file; an earlier one stays until then.
-        durable: flush content and name to the disk, so that a power failure leaves the earlier file or the new one.
-
-    Raises:
-        OutputError: the path is a folder or a device, or the temporary file cannot take its name.
+    With `durable`, content and name are flushed to the disk, so that a power failure leaves the earlier file or the new
+    one. OutputError where the path is a folder or a device, or the temporary file cannot take its name.
     """
     if path.exists() and not path.is_file():  # a device would be replaced by a file of its name
         raise OutputError(f"{path}: is {'a folder' if path.is_dir() else 'no ordinary file'}; name another file")
@@ -83,8 +79,7 @@ def remove_partial_files(directory: Path) -> None:
 def make_directory(path: Path) -> None:
     """Make a directory with its parents, unless it exists, and check that files can be written to it.
 
-    Raises:
-        OutputError: they cannot.
+    OutputError where they cannot.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -97,15 +92,10 @@ def make_directory(path: Path) -> None:
 
 
 def open_own(path: Path, anew: bool = False) -> BinaryIO:
-    """Open a file of this program for reading and writing, or make it; the target of a link is never written.
+    """Open a file of this program for reading and writing, or make it; `anew`, an existing one is replaced.
 
-    Args:
-        path: the file, in a folder of this program.
-        anew: whether an existing file is replaced by an empty one.
-
-    Raises:
-        OutputError: it is a link, has a second name elsewhere (a hard link), or is no ordinary file.
-        OSError: it cannot be made.
+    The target of a link is never written: OutputError where it is one, has a second name elsewhere (a hard link), or is
+    no ordinary file.
     """
     if anew:
         path.unlink(missing_ok=True)
@@ -124,22 +114,14 @@ def open_own(path: Path, anew: bool = False) -> BinaryIO:
 
 
 def make_own_folder(path: Path) -> None:
-    """Make a folder in a directory of results, unless it exists; a link there is replaced, not followed.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """Make a folder in a directory of results, unless it exists; a link there is replaced, not followed."""
     if path.is_symlink():
         path.unlink()
     path.mkdir(exist_ok=True)
 
 
 def require_no_link(places: Iterable[Path]) -> None:
-    """Refuse to write where a link in a directory of results leads.
-
-    Raises:
-        OutputError: one of the places is a link.
-    """
+    """Refuse to write where a link in a directory of results leads; OutputError where one of the places is a link."""
     link = next((place for place in places if place.is_symlink()), None)
     if link is not None:
         raise OutputError(f"{link}: is a link to another place, where nothing is written; remove it")
@@ -153,10 +135,8 @@ def _linked(path: Path) -> OutputError:
 def only_writer(directory: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold an advisory lock on an existing directory; it ends with the process, however that ends.
 
-    Where the file system has no locks, nothing is locked.
-
-    Raises:
-        OutputError: another process holds it, and does so for longer than `patience_s`.
+    Where the file system has no locks, nothing is locked. OutputError where another process holds it, for longer than
+    `patience_s`.
     """
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -197,8 +177,7 @@ def _sync(path: Path) -> None:
 def read_array(file: IO[bytes]) -> NDArray[Any]:
     """Read one array in NumPy's format; never a pickle.
 
-    Raises:
-        Exception: of nearly any kind, where the file is damaged.
+    Exception where of nearly any kind, where the file is damaged.
     """
     with ONE_READER:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
@@ -207,8 +186,7 @@ def read_array(file: IO[bytes]) -> NDArray[Any]:
 def bounded_lines(path: Path) -> Iterator[str]:
     """The lines of a file in UTF-8, without their ends.
 
-    Raises:
-        InputError: the file is missing, is not text, or it or a line is too long.
+    InputError where the file is missing, is not text, or it or a line is too long.
     """
     read = 0
     try:

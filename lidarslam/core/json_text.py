@@ -25,9 +25,7 @@ _LARGEST_INTEGER = 1 << 63
 def read_json(path: Path, shape: TypeAdapter[T], any_path: bool = False) -> T:
     """The content of a file in UTF-8; arguments as of `parse_json`.
 
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is too long, as `parse_json`.
+    OSError where it cannot be read; ValueError where it is too long, as `parse_json`.
     """
     with path.open("rb") as file:
         content = file.read(_LONGEST_BYTES + 1)
@@ -37,11 +35,10 @@ def read_json(path: Path, shape: TypeAdapter[T], any_path: bool = False) -> T:
 
 
 def parse_json(text: str | bytes, shape: TypeAdapter[T], any_number: bool = False, any_path: bool = False) -> T:
-    """The values of a text.
+    """The values of a text in UTF-8.
 
     Args:
-        text: in UTF-8.
-        shape: of the values.
+        text, shape: to be parsed, and of the values.
         any_number: whether numbers may be infinite, NaN, or of any length.
         any_path: whether texts may be paths that are not UTF-8, as Python has them: each such byte as half of a pair.
 

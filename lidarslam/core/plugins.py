@@ -1,6 +1,7 @@
 """Plug points: entry points of other packages in the groups `lidarslam.odometry`, `lidarslam.mapping` etc."""
 
 import logging
+import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -42,14 +43,13 @@ class PlugPoint:
     def check(self, name: Any) -> Any:
         """The name, where it is one of them; else a ValueError with all of them."""
         if name not in self.built_in and name not in self.names:
-            raise ValueError(f"no {self.group} is called {name!r}; there are: {', '.join(self.names)}")
+            raise ValueError(f"no {self.group} is called {reprlib.repr(name)}; there are: {', '.join(self.names)}")
         return name
 
     def load(self, name: str, kind: Any) -> Any:
         """The object of another package's entry point.
 
-        Raises:
-            ConfigError: it cannot be imported, or is of another kind.
+        ConfigError where it cannot be imported, or is of another kind.
         """
         try:
             loaded = self.added[name].load()

@@ -124,10 +124,10 @@ class Scan:
             raise ValueError(f"points must be (..., 3), got {raw.shape}")
         xyz = raw.reshape(-1, 3)
         offsets = _column("time_offsets", time_offsets, len(xyz), np.float64)
-        lasers = _column("rings", rings, len(xyz), None)
         with np.errstate(over="ignore", invalid="ignore"):
             brightness = _column("intensities", intensities, len(xyz), np.float32)
         rgb = None if colours is None else _colours(colours, len(xyz))
+        columns: list[Any] = [offsets, _column("rings", rings, len(xyz), None), brightness, rgb]
         xyz, valid = np.ascontiguousarray(xyz), np.empty(len(xyz), dtype=np.bool_)
         dropped = _find_valid(xyz, valid)
         untimed = 0
@@ -135,16 +135,14 @@ class Scan:
             timed = valid & np.isfinite(offsets)
             untimed = int(np.count_nonzero(valid) - np.count_nonzero(timed))
             if untimed > np.count_nonzero(timed):
-                offsets, untimed = None, 0
+                columns[0], untimed = None, 0
             elif untimed:
-                offsets = _interpolated(offsets, timed, valid & ~timed)
+                columns[0] = _interpolated(offsets, timed, valid & ~timed)
         if dropped:
             kept = np.flatnonzero(valid)
             xyz = xyz.take(kept, axis=0)  # four times as fast as indexing with the mask
-            offsets = None if offsets is None else offsets[kept]
-            lasers = None if lasers is None else lasers[kept]
-            brightness = None if brightness is None else brightness[kept]
-            rgb = None if rgb is None else rgb.take(kept, axis=0)
+            columns = [None if values is None else values.take(kept, axis=0) for values in columns]
+        offsets, lasers, brightness, rgb = columns
         # Invalid points may carry NaN for a ring, which no integer can hold: judge and cast the others.
         if lasers is not None and not ((lasers >= 0) & (lasers < _MOST_RINGS)).all():
             lasers = None

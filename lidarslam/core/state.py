@@ -44,13 +44,7 @@ TRANSFORM = Shape(4, 4)
 
 
 class Saved:
-    """A tree read back from a file.
-
-    Args:
-        values: the tree.
-        place: the file, and where in it, for errors.
-        remedy: the remedy where it cannot be used, for errors.
-    """
+    """A tree read back from a file; the place in it, and the remedy where it cannot be used, are for errors."""
 
     def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:
         self._values = values
@@ -92,9 +86,14 @@ class Saved:
 
 
 @typing.runtime_checkable
-class _Restorable(typing.Protocol):
-    def state(self) -> State | None: ...
-    def restore(self, saved: Saved) -> None: ...
+class Restorable(typing.Protocol):
+    """Carries a state from scan to scan."""
+
+    def state(self) -> State | None:
+        """The state it carries; None where it cannot be saved, nor a run resumed."""
+
+    def restore(self, saved: Saved) -> None:
+        """Resume from a state, before the first scan."""
 
 
 class Stateful:
@@ -110,14 +109,10 @@ class Stateful:
         return {name: encode(kind, getattr(self, name)) for name, kind in _hints(type(self)).items()}
 
     def restore(self, saved: Saved) -> None:
-        """Take over a state.
-
-        Raises:
-            InputError: it lacks an attribute, or a value does not fit its hint.
-        """
+        """Take over a state; InputError where it lacks an attribute, or a value does not fit its hint."""
         for name, kind in _hints(type(self)).items():
             present, tree = getattr(self, name, None), saved.value(name)
-            if tree is not None and isinstance(present, _Restorable):
+            if tree is not None and isinstance(present, Restorable):
                 present.restore(saved.part(name))
             else:
                 setattr(self, name, decode(kind, tree, saved.at(name)))
@@ -143,7 +138,7 @@ def encode(kind: Any, value: Any) -> Any:
 
 
 def _encode_plain(kind: Any, value: Any) -> Any:
-    if isinstance(value, _Restorable):
+    if isinstance(value, Restorable):
         return value.state()
     if dataclasses.is_dataclass(kind):
         return {name: encode(hint, getattr(value, name)) for name, hint in _hints(kind).items()}
@@ -153,16 +148,7 @@ def _encode_plain(kind: Any, value: Any) -> Any:
 
 
 def decode(kind: Any, tree: Any, saved: Saved) -> Any:
-    """The value of that type that a tree stands for.
-
-    Args:
-        kind: the type hint.
-        tree: made by `encode` with the same hint.
-        saved: where it stands, for errors.
-
-    Raises:
-        InputError: the tree is another one.
-    """
+    """The value of that type that a tree of `encode` stands for; InputError where the tree is another one."""
     kind, shape = _bare(kind)
     if (inner := _optional(kind)) is not None:
         return None if tree is None else decode(inner, tree, saved)
@@ -291,9 +277,8 @@ def _optional(kind: Any) -> Any:
 class BlockFile(Stateful):
     """Blocks of bytes in an append-only file, made with the first; a saved state has those written before it.
 
-    Args:
-        directory: where a file without a name is kept while it is needed; None: the system's temporary directory.
-        file: a file that outlives the program instead, for `restore`.
+    A file without a name is kept in the directory, or the system's temporary one, while it is needed; one with a name
+    outlives the program, for `restore`.
     """
 
     _ends: list[int]  # bytes
@@ -305,22 +290,14 @@ class BlockFile(Stateful):
         self._ends, self._checksums = [0], []
 
     def state(self) -> State:
-        """Where blocks end; they are on the disk by now.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Where blocks end; they are on the disk by now; OSError where the disk is full."""
         if self._open:
             self._file.flush()
             os.fsync(self._file.fileno())
         return super().state()
 
     def restore(self, saved: Saved) -> None:
-        """Resume from a state.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Resume from a state; InputError where the file is damaged."""
         super().restore(saved)
         self._opened()
         is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
@@ -339,8 +316,7 @@ class BlockFile(Stateful):
     def write(self, block: bytes) -> None:
         """Append one; any data after the last block was written after the restored state.
 
-        Raises:
-            OSError: the disk is full.
+        OSError where the disk is full.
         """
         self._opened()
         self._file.truncate(self._ends[-1])

@@ -1,7 +1,4 @@
-"""Independent tasks, one after another in this process, or side by side as tasks of Ray; the only file that knows ray.
-
-Ray takes a while to load, and is loaded only where it is used.
-"""
+"""Independent tasks, one after another, or side by side by Ray, which is loaded where it is used, and only here."""
 
 import contextlib
 import logging
@@ -13,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError, OutputError
 
@@ -24,34 +21,10 @@ _RETRIES = 3
 # Results are small; larger ones are written to disk.
 _OBJECT_STORE_BYTES = 128 * 2**20
 _ANSWER_S = 5.0
-_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 OnDone = Callable[[int, Any], None]
 """Called with the index of a task and its result, in the order in which tasks end."""
-
-
-class Tasks(Protocol):
-    """Carries out independent tasks."""
-
-    @property
-    def slots(self) -> int:
-        """Number of tasks that are carried out at the same time."""
-
-    def run(
-        self, function: Callable[[T], R], items: Sequence[T], on_done: OnDone | None = None, ahead: int | None = None
-    ) -> Iterator[R]:
-        """The results of `function(item)` in the order of the items.
-
-        Args:
-            function, items: of a module that can be imported, and to be pickled; the same item always has the same
-                result, as a task whose process or machine died is carried out again.
-            on_done: called for each task; after Ctrl-C too, for tasks that still have a result.
-            ahead: number of tasks begun before the result of the first of them is taken; None: all.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C; no task is running any more.
-            LidarSlamError: a task raised it, or its process died repeatedly.
-        """
 
 
 @dataclass(frozen=True)
@@ -70,8 +43,12 @@ class Where:
 SERIAL = Where()
 
 
-class InOrder:
-    """One task after another in this process."""
+class Tasks:
+    """Carries out independent tasks, one after another in this process.
+
+    Attributes:
+        slots: number of tasks that are carried out at the same time.
+    """
 
     slots = 1
 
@@ -82,7 +59,18 @@ class InOrder:
         on_done: OnDone | None = None,
         ahead: int | None = None,  # noqa: ARG002
     ) -> Iterator[R]:
-        """As `Tasks.run`; each task is carried out when its result is asked for."""
+        """The results of `function(item)` in the order of the items; each task begins when its result is asked for.
+
+        Args:
+            function, items: of a module that can be imported, and to be pickled; the same item always has the same
+                result, as a task whose process or machine died is carried out again.
+            on_done: called for each task; after Ctrl-C too, for tasks that still have a result.
+            ahead: number of tasks begun before the result of the first of them is taken; None: all.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C; no task is running any more.
+            LidarSlamError: a task raised it, or its process died repeatedly.
+        """
         for index, item in enumerate(items):
             result = function(item)
             if on_done is not None:
@@ -91,13 +79,9 @@ class InOrder:
 
 
 def open_tasks(where: Where) -> contextlib.AbstractContextManager[Tasks]:
-    """The executor of the tasks, for the duration of the context.
-
-    Raises:
-        ConfigError: Ray is not installed, or no cluster has that address.
-    """
+    """The executor of the tasks, for the duration of the context; ConfigError where Ray or the cluster is not there."""
     if where.is_serial:
-        return contextlib.nullcontext(InOrder())
+        return contextlib.nullcontext(Tasks())
     try:
         import ray  # noqa: F401
     except ModuleNotFoundError as error:
@@ -109,11 +93,7 @@ def open_tasks(where: Where) -> contextlib.AbstractContextManager[Tasks]:
 
 @contextlib.contextmanager
 def _ray_tasks(where: Where) -> Iterator[Tasks]:
-    """A Ray of our own on this machine, which ends with the context, or the connection to a cluster.
-
-    Raises:
-        ConfigError: there is no such cluster, or Ray does not start.
-    """
+    """A Ray of our own on this machine, which ends with the context, or the connection to a cluster."""
     import ray
 
     logging.getLogger("ray").setLevel(logging.CRITICAL)
@@ -145,8 +125,8 @@ def _connect(where: Where, place: str) -> None:
     ray.init(address="local", num_cpus=where.jobs, **own, **quiet)
 
 
-class _RayTasks:
-    """The tasks of one connection."""
+class _RayTasks(Tasks):
+    """Side by side, by one connection to Ray."""
 
     def __init__(self, slots: int) -> None:
         self.slots = slots
@@ -154,7 +134,6 @@ class _RayTasks:
     def run(
         self, function: Callable[[T], R], items: Sequence[T], on_done: OnDone | None = None, ahead: int | None = None
     ) -> Iterator[R]:
-        """As `Tasks.run`."""
         import ray
 
         remote: Any = ray.remote(num_cpus=1, max_retries=_RETRIES)(_carry_out)
@@ -226,7 +205,7 @@ def _carry_out(shared: tuple[Callable[[T], R], str], item: T) -> R | LidarSlamEr
     function, expected = shared
     if version("lidarslam") != expected:
         return ConfigError(f"a node of the cluster has lidarslam {version('lidarslam')} and not {expected}; update it")
-    for name in _THREADS:
+    for name in THREADS:
         os.environ.setdefault(name, os.environ.get("OMP_NUM_THREADS", "1"))
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # inherited of nohup; Ray interrupts a task by this signal
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -245,8 +224,7 @@ def _environment(where: Where) -> Iterator[None]:
     """
     wanted = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_memory_monitor_refresh_ms": "0"}
     if where.cluster is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        wanted |= dict.fromkeys(_THREADS, str(max(1, cores // where.jobs)))
+        wanted |= dict.fromkeys(THREADS, str(max(1, usable_cores() // where.jobs)))
     added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)
     try:
@@ -254,6 +232,11 @@ def _environment(where: Where) -> Iterator[None]:
     finally:
         for name in added:
             os.environ.pop(name, None)
+
+
+def usable_cores() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # not on macOS
 
 
 @contextlib.contextmanager

@@ -96,13 +96,7 @@ def _spelt(match: re.Match[str]) -> str:
 def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
     """The name, if it is a safe component of a path: no separator, no control character, not hidden, not too long.
 
-    Args:
-        name: of unknown origin.
-        what: the kind of thing with this name, for the error.
-        reserved: names of other files in the same folder.
-
-    Raises:
-        ConfigError: it is none.
+    Else a ConfigError, which says `what` has this name; `reserved` are names of other files in the same folder.
     """
     fault = _name_fault(name, reserved)
     if fault is not None:
@@ -112,11 +106,11 @@ def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
     return name
 
 
-def safe_name(text: str, default: str = "recording") -> str:
+def safe_name(text: str) -> str:
     """A safe component of a path for something that has a name already, such as a topic or a sequence."""
     name = one_line(_SEPARATORS.sub("_", text)).replace("\\", "_").lstrip(".")
     name = name.encode()[:_LONGEST_NAME].decode(errors="ignore")
-    return name if name.strip() else default
+    return name if name.strip() else "recording"
 
 
 def stays_below(path: str) -> bool:

@@ -21,13 +21,9 @@ _room = threading.local()
 
 
 def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
-    """Indices, ascending, of one point in nearly every occupied cell of a grid.
+    """Indices, ascending, of one of the points (N, 3) in nearly every occupied cell of a grid.
 
     The last point of a cell is kept: several times faster than sorting, and deterministic.
-
-    Args:
-        points: (N, 3).
-        cell_m: edge of a cell.
     """
     kept = np.empty(len(points), dtype=np.intp)
     slots = _slots_of(np.ascontiguousarray(points), cell_m)
@@ -35,13 +31,9 @@ def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
 
 
 def central_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
-    """Indices, ascending, of one point in nearly every occupied cell of a grid: the nearest to the mean of the cell.
+    """Indices, ascending, of one of the points (N, 3) in nearly every cell of a grid: the nearest to the cell's mean.
 
     It does not depend on the order of the points, unlike the last point. Cells that share a slot count as one.
-
-    Args:
-        points: (N, 3), finite.
-        cell_m: edge of a cell.
     """
     points = np.ascontiguousarray(points)
     kept = np.empty(len(points), dtype=np.intp)

@@ -102,15 +102,7 @@ class Trajectory:
         return cls(times, poses if T_cam_lidar is None else inverse(T_cam_lidar) @ poses @ T_cam_lidar)
 
     def save(self, path: str | PathLike[str], format: TextFormat | None = None) -> None:
-        """Write a text file; one that is there is replaced.
-
-        Args:
-            path: of the file.
-            format: as of `load`; KITTI's has no stamps.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write a text file, in a format as of `load`, where KITTI's has no stamps; one that is there is replaced."""
         is_kitti = _format_of(path, format) == "kitti"
         text = format_kitti(self.T_world_lidar) if is_kitti else format_tum(self)
         try:
@@ -162,8 +154,7 @@ class Trajectory:
 
         Stamps up to `extrapolation_s` outside the trajectory are extrapolated with its first or last motion.
 
-        Raises:
-            ValueError: a stamp lies farther outside, or there are fewer than two poses.
+        ValueError where a stamp lies farther outside, or there are fewer than two poses.
         """
         if len(self) < 2:
             raise ValueError(f"interpolation needs two poses or more, the trajectory has {len(self)}")
@@ -193,8 +184,7 @@ def chain(T_world_first: FloatArray, relative_motions: FloatArray) -> FloatArray
 def parse_numbers(path: Path, columns: int) -> FloatArray:
     """The (N, columns) numbers of a text file; commas count as blanks.
 
-    Raises:
-        InputError: the file is missing, is not text, or a line does not hold that many numbers.
+    InputError where the file is missing, is not text, or a line does not hold that many numbers.
     """
     numbers = array("d")
     for number, line in enumerate(bounded_lines(path), start=1):
@@ -217,8 +207,7 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
 def read_tum(path: Path) -> Trajectory:
     """Read a TUM file; lines may be in any order, of equal stamps the first is kept.
 
-    Raises:
-        InputError: the file is missing or a line is not a pose.
+    InputError where the file is missing or a line is not a pose.
     """
     table = parse_numbers(path, columns=8)
     if not len(table):
@@ -248,8 +237,7 @@ def format_tum(trajectory: Trajectory) -> str:
 def read_kitti_poses(path: Path) -> FloatArray:
     """Read the poses (N, 4, 4) of a KITTI file, in whatever frame it holds them.
 
-    Raises:
-        InputError: the file is missing or a line is not a pose.
+    InputError where the file is missing or a line is not a pose.
     """
     rows = parse_numbers(path, columns=12).reshape(-1, 3, 4)
     if not len(rows):
@@ -264,8 +252,7 @@ def read_kitti_poses(path: Path) -> FloatArray:
 def read_transform(path: Path) -> FloatArray:
     """A rigid transform (4, 4) from a text file of four rows of four numbers.
 
-    Raises:
-        InputError: the file holds anything else.
+    InputError where the file holds anything else.
     """
     T = parse_numbers(path, columns=4)
     if T.shape != (4, 4) or not is_rigid(T, tolerance=1e-3):

@@ -7,7 +7,6 @@ of a cloud, which takes ten times as long as all our own decoding.
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, cast
 
@@ -22,8 +21,8 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
 from lidarslam.core.errors import InputError
-from lidarslam.live.messages import message_types
-from lidarslam.live.receiving import Received
+from lidarslam.live.messages import Publish, message_types
+from lidarslam.live.receiving import PublishedTopic, Received
 
 # A cloud of 3 MB arrives as a burst of datagrams that the default buffer, 1 MB, does not hold; the kernel grants up to
 # net.core.rmem_max.
@@ -39,15 +38,6 @@ _BASE_TYPES = {
     **{name: getattr(types, name) for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32")},
     **{name: getattr(types, name) for name in ("int64", "uint64", "float32", "float64")},
 }
-
-
-@dataclass(frozen=True, order=True)
-class PublishedTopic:
-    """A published topic of ROS."""
-
-    name: str  # as in ROS, such as /points
-    message_type: str  # as in ROS, such as sensor_msgs/msg/PointCloud2
-    is_reliable: bool  # whether all its publishers send lost messages again
 
 
 class DdsNode:
@@ -80,10 +70,11 @@ class DdsNode:
         qos = _qos(topic.is_reliable, is_kept, depth)
         return Subscription(self._participant, DataReader(self._participant, self._topic(topic), qos), depth)
 
-    def publisher(self, name: str, message_type: str, is_kept: bool = False) -> "Publisher":
-        """Publish a topic, reliably, as ROS does odometry and /tf; a latched one also to later subscribers."""
-        topic = self._topic(PublishedTopic(name, message_type, True))
-        return Publisher(DataWriter(self._participant, topic, _qos(True, is_kept)))
+    def publisher(self, name: str, message_type: str, is_kept: bool = False) -> Publish:
+        """Publish serialised messages of a topic, reliably, as ROS does; of a latched one also to later subscribers."""
+        topic = self._topic(PublishedTopic(name, message_type))
+        writer: Any = DataWriter(self._participant, topic, _qos(True, is_kept))
+        return lambda raw: writer.write(writer.data_type.deserialize(raw))
 
     def _topic(self, topic: PublishedTopic) -> Any:
         return Topic(self._participant, f"rt{topic.name}", _struct(topic.message_type))
@@ -106,22 +97,10 @@ class Subscription:
                 yield Received(message.raw, message.sample_info.source_timestamp)
 
 
-class Publisher:
-    """Publishes serialised messages of a topic."""
-
-    def __init__(self, writer: Any) -> None:
-        self._writer = writer
-
-    def publish(self, raw: bytes) -> None:
-        """Send one message."""
-        self._writer.write(self._writer.data_type.deserialize(raw))
-
-
 def open_node(domain: int) -> DdsNode:
     """A participant in the domain.
 
-    Raises:
-        InputError: the library cannot join it, as with a missing interface in CYCLONEDDS_URI.
+    InputError where the library cannot join it, as with a missing interface in CYCLONEDDS_URI.
     """
     try:
         return DdsNode(domain)

@@ -3,8 +3,9 @@
 import logging
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,13 +16,14 @@ from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
 from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
 from lidarslam.live.clouds import CloudDecoder, LiveScan
-from lidarslam.live.dds import DdsNode, PublishedTopic
 from lidarslam.live.messages import PosePublisher
-from lidarslam.live.receiving import Arrived, ImuReceiver, IncomingQueue
+from lidarslam.live.receiving import Arrived, ImuReceiver, IncomingQueue, PublishedTopic
 from lidarslam.live.statistics import LiveCounts, LiveStatistics
 from lidarslam.pipeline.estimates import ScanEstimate
-from lidarslam.pipeline.imu_stream import ImuStream
 from lidarslam.run.request import LiveRequest
+
+if TYPE_CHECKING:  # needs the extra `live`
+    from lidarslam.live.dds import DdsNode
 
 logger = logging.getLogger(__name__)
 
@@ -42,48 +44,38 @@ _STATIC_WITHIN_S = 5.0
 
 
 class Follower:
-    """Registers the clouds of a topic, and publishes their poses.
-
-    Args:
-        request: the topic to follow, and the end of the run.
-        node: where topics are subscribed to and published.
-        register: registers the scans.
-        decoder: makes scans of messages.
-        imu: receives the samples of the IMU, with the stream that they go to.
-    """
+    """Registers the clouds of a topic, and publishes their poses."""
 
     def __init__(
         self,
         request: LiveRequest,
-        node: DdsNode,
+        node: "DdsNode",
         register: Register,
         decoder: CloudDecoder,
-        imu: tuple[ImuReceiver, ImuStream] | None = None,
+        imu: ImuReceiver | None = None,
     ) -> None:
         self._request, self._register_scan, self._decoder, self._imu = request, register, decoder, imu
         self._statistics = LiveStatistics()
-        self._publish_odometry = node.publisher(ODOMETRY_TOPIC, ODOMETRY_TYPE).publish
-        self._publish_tf = node.publisher(TF_TOPIC, TRANSFORMS_TYPE).publish if request.publish_tf else None
+        self._publish_odometry = node.publisher(ODOMETRY_TOPIC, ODOMETRY_TYPE)
+        self._publish_tf = node.publisher(TF_TOPIC, TRANSFORMS_TYPE) if request.publish_tf else None
         self._static = None
         if request.base_frame is not None or imu is not None:
-            self._static = node.subscribe(PublishedTopic(TF_STATIC_TOPIC, TRANSFORMS_TYPE, True), is_kept=True)
+            self._static = node.subscribe(PublishedTopic(TF_STATIC_TOPIC, TRANSFORMS_TYPE), is_kept=True)
         self._edges: Edges = {}
         self._poses: PosePublisher | None = None
         self._received = self._silent = 0  # messages until the last report, and reports since without any
 
     def follow(self, incoming: IncomingQueue, show: Callable[[str], None]) -> tuple[LiveCounts, bool]:
-        """Register arriving clouds, until the request or Ctrl-C ends it; queued ones are still registered then.
+        """Register arriving clouds; the counts of the scans, and whether Ctrl-C ended it.
 
-        Registration has a thread of its own, so that Ctrl-C falls between two scans.
-
-        Returns:
-            The counts of the scans, and whether Ctrl-C ended it.
+        Queued ones are still registered at the end. Registration has a thread of its own, so that Ctrl-C falls between
+        two scans.
         """
         is_interrupted = False
         with incoming, ThreadPoolExecutor(1, thread_name_prefix="register") as worker:
             registering = worker.submit(self._register_all, incoming)
             try:
-                while not _is_done(registering):
+                while not wait([registering], timeout=_SHOWN_EVERY_S).done:
                     self._report(self._statistics.counts(incoming.dropped), show)
             except KeyboardInterrupt:
                 is_interrupted = True
@@ -132,18 +124,17 @@ class Follower:
         self._statistics.registered(live.scan.stamp, message.arrived_s)
         return True
 
-    def _wait_for_imu(self, imu: tuple[ImuReceiver, ImuStream], live: LiveScan) -> None:
+    def _wait_for_imu(self, imu: ImuReceiver, live: LiveScan) -> None:
         """Wait for the samples of the sweep; before the first one, for the place of the IMU."""
-        receiver, stream = imu
         offsets = live.scan.time_offsets
-        receiver.wait_for(live.scan.stamp + (0.0 if offsets is None or not len(offsets) else float(offsets.max())))
-        if not stream.is_placed and receiver.frame_id is not None:
+        imu.wait_for(live.scan.stamp + (0.0 if offsets is None or not len(offsets) else float(offsets.max())))
+        if not imu.stream.is_placed and imu.frame_id is not None:
             T_recorded_imu: FloatArray | None = np.eye(4)
-            if receiver.frame_id.lstrip("/") != live.frame_id.lstrip("/"):
-                T_recorded_imu = self._static_transform(live.frame_id, receiver.frame_id)
+            if imu.frame_id.lstrip("/") != live.frame_id.lstrip("/"):
+                T_recorded_imu = self._static_transform(live.frame_id, imu.frame_id)
                 if T_recorded_imu is None:
                     logger.info("%s does not hold the place of the IMU; its turns have to show it", TF_STATIC_TOPIC)
-            stream.place(None if T_recorded_imu is None else self._decoder.T_upright_recorded @ T_recorded_imu)
+            imu.stream.place(None if T_recorded_imu is None else self._decoder.T_upright_recorded @ T_recorded_imu)
 
     def _pose_publisher(self, lidar_frame: str) -> PosePublisher:
         """Once the frame of the LiDAR is known; InputError: no static transforms connect it with the base frame."""
@@ -166,10 +157,6 @@ class Follower:
             for message in self._static.take(_POLL_S):
                 add_edges(self._edges, message.raw, ros2=True)
         return chain(self._edges, target, source)
-
-
-def _is_done(future: "Future[None]") -> bool:
-    return bool(wait([future], timeout=_SHOWN_EVERY_S).done)
 
 
 def _is_over(limit_s: float | None, passed_s: float) -> bool:

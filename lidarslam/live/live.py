@@ -15,6 +15,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
 from lidarslam.live.clouds import CloudDecoder
+from lidarslam.live.following import Follower
 from lidarslam.live.receiving import IMU_DEPTH, ImuReceiver, IncomingQueue, find_imu, find_topic
 from lidarslam.live.statistics import LiveCounts
 from lidarslam.mapping.global_map.tile_store import TileStore
@@ -23,16 +24,14 @@ from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.inertial import make_imu_stream
-from lidarslam.run.request import LiveRequest
+from lidarslam.run.request import LiveRequest, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans
+from lidarslam.run.run import open_odometry, open_session, require_no_trajectory
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.session import open_odometry, open_session, require_no_trajectory
 from lidarslam.viewer.web_page import WebPage
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # needs the extra
     from lidarslam.live.dds import DdsNode
-    from lidarslam.live.following import Follower, Register
-    from lidarslam.pipeline.imu_stream import ImuStream
 
 
 @dataclass(frozen=True)
@@ -52,11 +51,8 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
         request: the topic to follow, and the end of the run; Ctrl-C ends it at any time, with all results.
         show: called with a short text on the progress, every second while scans arrive.
         page: shows the run in browsers, with `rerun="web"`.
-
-    Raises:
-        LidarSlamError: the extra `live` is not installed, no scan arrived, or topic, configuration or output directory
-            are not usable.
     """
+    require_possible(request)
     node = _open_node(request.domain)
     request = replace(request, config=bounded(request.config))
     config, faults = request.config, Faults()
@@ -72,27 +68,32 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
         imu = _receive_imu(config, node, log)
         show(f"{topic.name}: waiting for the first scan")
         session.show(topic.name, page)
-        localiser, store = make_localiser(config, imu and imu[1]), TileStore(request.out)
+        localiser = make_localiser(config, None if imu is None else imu.stream)
+        store = TileStore(request.out)
         pipeline = Pipeline(session.odometry, localiser, config.global_map, session.graph, store=store)
 
         def register(scan: Scan, started: float) -> ScanEstimate:
             scan = look_at(scan, faults)
             if imu is not None:
-                scan = imu[1].take_up(scan)
+                scan = imu.stream.take_up(scan)
             return pipeline.register(scan, started, lambda estimate, ms: session.take(estimate, ms, pipeline.map))
 
-        with threadpool_limits(1, "blas"), closing(pipeline), nullcontext() if imu is None else imu[0]:
+        with threadpool_limits(1, "blas"), closing(pipeline), imu or nullcontext():
             decoder = CloudDecoder(config.reader, topic.message_type, faults)
-            follower = _follower(request, node, register, decoder, imu)
+            follower = Follower(request, node, register, decoder, imu)
             incoming = IncomingQueue(node.subscribe(topic).take, request.queue, follower.on_arrival)
             counts, is_interrupted = follower.follow(incoming, show)
             session.end_scans()
             pipeline.finish()
-        _require_scans(topic.name, log, faults)
-        for warning in [*counts.warnings(), *(imu[1].warnings if imu is not None else ())]:
+        if not log.table["points"].any():
+            why = "; ".join(faults.warnings()) or ("its scans had no valid point" if len(log) else "none came")
+            raise InputError(f"{topic.name}: no scan could be used: {why}")
+        for warning in [*counts.warnings(), *(imu.stream.warnings if imu is not None else ())]:
             log.warn(warning)
         tracked = Tracked(TrackedScans.of(log, faults, pipeline.map), pipeline.map.global_map)
-        outcome = session.finish(tracked, _describe(request, topic.name))
+        described: dict[str, Any] = {"version": version("lidarslam"), "source": None, "topic": topic.name}
+        described |= {"domain": request.domain, "base_frame": request.base_frame}
+        outcome = session.finish(tracked, described)
     return LiveOutcome(outcome, topic.name, counts, is_interrupted)
 
 
@@ -117,58 +118,22 @@ def bounded(config: Config) -> Config:
     return config.model_copy(update={"mapping": mapping, "pose_graph": graph})
 
 
-def _follower(
-    request: LiveRequest,
-    node: "DdsNode",
-    register: "Register",
-    decoder: CloudDecoder,
-    imu: "tuple[ImuReceiver, ImuStream] | None",
-) -> "Follower":
-    from lidarslam.live.following import Follower  # loads cyclonedds
+def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> ImuReceiver | None:
+    """The receiver of the IMU's samples; None where the odometry uses none.
 
-    return Follower(request, node, register, decoder, imu)
-
-
-def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> "tuple[ImuReceiver, ImuStream] | None":
-    """The receiver of the IMU's samples and the stream they go to; None where the odometry uses none.
-
-    Raises:
-        InputError: no IMU is published, or several.
+    InputError where no IMU is published, or several.
     """
     stream = make_imu_stream(config, log.warn)
     if stream is None:
         return None
     topic = find_imu(node.published, config.reader.imu_topic)
-    return ImuReceiver(node.subscribe(topic, depth=IMU_DEPTH).take, stream), stream
+    return ImuReceiver(node.subscribe(topic, depth=IMU_DEPTH).take, stream)
 
 
 def _open_node(domain: int) -> "DdsNode":
-    """The participant in the domain.
-
-    Raises:
-        ConfigError: the extra is not installed.
-        InputError: the library cannot join the domain.
-    """
+    """The participant in the domain; ConfigError where the extra is not installed."""
     try:
         from lidarslam.live.dds import open_node
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
     return open_node(domain)
-
-
-def _require_scans(topic: str, log: ScanLog, faults: Faults) -> None:
-    """Check that there are scans to write; InputError: no usable scan arrived."""
-    if not log.points_read:
-        why = "; ".join(faults.warnings()) or ("its scans had no valid point" if len(log) else "none came")
-        raise InputError(f"{topic}: no scan could be used: {why}")
-
-
-def _describe(request: LiveRequest, topic: str) -> dict[str, Any]:
-    """The section of config.yaml that describes the run."""
-    return {
-        "version": version("lidarslam"),
-        "source": None,
-        "topic": topic,
-        "domain": request.domain,
-        "base_frame": request.base_frame,
-    }

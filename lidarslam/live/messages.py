@@ -13,6 +13,8 @@ from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.pipeline.estimates import ScanEstimate
 
+Publish = Callable[[bytes], None]
+
 
 @cache
 def message_types() -> Typestore:
@@ -25,29 +27,6 @@ def message_types() -> Typestore:
     return store
 
 
-def serialize_odometry(
-    stamp_ns: int,
-    frame_id: str,
-    child_frame_id: str,
-    T_frame_child: FloatArray,
-    covariance: FloatArray | None,
-    velocity: FloatArray | None,
-) -> bytes:
-    """A nav_msgs/Odometry.
-
-    Args:
-        stamp_ns: of the scan, nanoseconds.
-        frame_id, child_frame_id: the fixed frame and that of the moving body.
-        T_frame_child: (4, 4) the pose of the body.
-        covariance: (6, 6) of its error in the frame of the body, rotation first; None where it is unknown.
-        velocity: (6,) in the frame of the body, rotation first; None where it is unknown.
-    """
-    store = message_types()
-    fixed = made.header(store, stamp_ns, frame_id)
-    message = made.odometry(store, fixed, child_frame_id, T_frame_child, covariance, velocity)
-    return bytes(store.serialize_cdr(message, made.ODOMETRY_TYPE))
-
-
 def serialize_transform(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_child: FloatArray) -> bytes:
     """A tf2_msgs/TFMessage with one transform, the pose (4, 4) of the child."""
     store = message_types()
@@ -55,19 +34,11 @@ def serialize_transform(stamp_ns: int, frame_id: str, child_frame_id: str, T_fra
     return bytes(store.serialize_cdr(message, TRANSFORMS_TYPE))
 
 
-Publish = Callable[[bytes], None]
-
-
 class PosePublisher:
     """Publishes the pose of a body that carries the LiDAR, relative to the pose of the body at the first scan.
 
-    The pose of a lost scan is a prediction, and is not published.
-
-    Args:
-        odometry: publishes a nav_msgs/Odometry.
-        transforms: publishes a tf2_msgs/TFMessage; None: no transforms.
-        fixed_frame, body_frame: the names of the frames.
-        T_body_lidar: (4, 4) the pose of the LiDAR on the body.
+    The pose of a lost scan is a prediction, and is not published. Messages are nav_msgs/Odometry and, where there is a
+    publisher for them, tf2_msgs/TFMessage.
     """
 
     def __init__(
@@ -79,18 +50,20 @@ class PosePublisher:
         T_body_lidar: FloatArray,
     ) -> None:
         self._odometry, self._transforms = odometry, transforms
-        self._frames = (fixed_frame, body_frame)
+        self._fixed_frame, self._body_frame = fixed_frame, body_frame
         self._T_body_lidar = T_body_lidar
-        self._adjoint = adjoint(T_body_lidar)
 
     def publish(self, stamp_ns: int, estimate: ScanEstimate) -> None:
         """Publish the pose of a scan."""
         if estimate.status is Status.LOST:
             return
         # With A the adjoint of T_body_lidar, an error or velocity xi of the LiDAR is A xi of the body.
-        T, A = self._T_body_lidar @ estimate.T_world_lidar @ inverse(self._T_body_lidar), self._adjoint
+        T = self._T_body_lidar @ estimate.T_world_lidar @ inverse(self._T_body_lidar)
+        A, store = adjoint(self._T_body_lidar), message_types()
         covariance = None if estimate.covariance is None else A @ estimate.covariance @ A.T
         velocity = None if estimate.velocity is None else A @ estimate.velocity
-        self._odometry(serialize_odometry(stamp_ns, *self._frames, T, covariance, velocity))
+        header = made.header(store, stamp_ns, self._fixed_frame)
+        message = made.odometry(store, header, self._body_frame, T, covariance, velocity)
+        self._odometry(bytes(store.serialize_cdr(message, made.ODOMETRY_TYPE)))
         if self._transforms is not None:
-            self._transforms(serialize_transform(stamp_ns, *self._frames, T))
+            self._transforms(serialize_transform(stamp_ns, self._fixed_frame, self._body_frame, T))

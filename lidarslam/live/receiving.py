@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar
+from typing import Self
 
 import numpy as np
 
@@ -29,69 +29,59 @@ _SWEEP_PATIENCE_S, _STEP_S = 0.05, 0.002
 _FAR_S, _STRAYS = 5.0, 10
 
 
-class Published(Protocol):
-    """A topic that is published."""
+@dataclass(frozen=True, order=True)
+class PublishedTopic:
+    """A published topic of ROS."""
 
-    @property
-    def name(self) -> str:
-        """As in ROS."""
-
-    @property
-    def message_type(self) -> str:
-        """As in ROS."""
+    name: str  # as in ROS, such as /points
+    message_type: str  # as in ROS, such as sensor_msgs/msg/PointCloud2
+    is_reliable: bool = True  # whether all its publishers send lost messages again
 
 
-P = TypeVar("P", bound=Published)
+Published = Callable[[], Iterable[PublishedTopic]]
+"""The topics that are published now."""
 
 
-def find_topic(
-    published: Callable[[], Iterable[P]], wanted: str | None, domain: int, within_s: float | None = None
-) -> P:
+def find_topic(published: Published, wanted: str | None, domain: int, within_s: float | None = None) -> PublishedTopic:
     """Wait for the publisher of a topic of clouds, for a limited time; without a name, for the only one.
 
-    Raises:
-        InputError: there are several and none is named, the named one holds no clouds, or none appeared in time.
+    InputError where there are several and none is named, the named one holds no clouds, or none appeared in time.
     """
     begin = time.monotonic()
     is_told = False
     while True:
         topics = list(published())
         waited_s = time.monotonic() - begin
-        if wanted is not None and (found := [topic for topic in topics if topic.name == wanted]):
-            return _only_clouds(found[0])
         clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES]
+        for topic in topics:
+            if topic.name == wanted:
+                if topic not in clouds:
+                    kinds = ", ".join(CLOUD_TYPES)
+                    raise InputError(f"{topic.name}: holds {topic.message_type}, not one of {kinds}")
+                return topic
         if wanted is None and clouds and waited_s > _SETTLED_S:
-            return _only(clouds)
+            if len(clouds) > 1:
+                raise InputError(f"clouds are published on {_names(clouds)}; choose one with --topic")
+            return clouds[0]
+        seen = f"waiting for {wanted or 'clouds'} in domain {domain}; {_what_is_seen(clouds, len(topics))}"
         if waited_s > _PATIENCE_S and not is_told:
-            logger.warning(_what_is_seen(wanted, clouds, len(topics), domain))
+            logger.warning(seen)
             is_told = True
         if within_s is not None and waited_s > within_s:
-            raise InputError(f"{within_s:g} s are over, {_what_is_seen(wanted, clouds, len(topics), domain)}")
+            raise InputError(f"{within_s:g} s are over, {seen}")
         time.sleep(_POLL_S)
 
 
-def _only_clouds(topic: P) -> P:
-    if topic.message_type not in CLOUD_TYPES:
-        raise InputError(f"{topic.name}: holds {topic.message_type}, not one of {', '.join(CLOUD_TYPES)}")
-    return topic
+def _names(topics: Iterable[PublishedTopic]) -> str:
+    return ", ".join(topic.name for topic in topics)
 
 
-def _only(clouds: list[P]) -> P:
-    if len(clouds) > 1:
-        names = ", ".join(topic.name for topic in clouds)
-        raise InputError(f"clouds are published on {names}; choose one with --topic")
-    return clouds[0]
-
-
-def _what_is_seen(wanted: str | None, clouds: Iterable[Published], topics: int, domain: int) -> str:
-    names = ", ".join(topic.name for topic in clouds)
-    if names:
-        seen = f"clouds are published on {names}"
-    elif topics:
-        seen = f"{topics} topics are published, none of them with clouds"
-    else:
-        seen = "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
-    return f"waiting for {wanted or 'clouds'} in domain {domain}; {seen}"
+def _what_is_seen(clouds: Iterable[PublishedTopic], topics: int) -> str:
+    if names := _names(clouds):
+        return f"clouds are published on {names}"
+    if topics:
+        return f"{topics} topics are published, none of them with clouds"
+    return "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
 
 
 @dataclass(frozen=True)
@@ -113,16 +103,7 @@ class IncomingQueue:
     """Receives from its beginning to its end; where messages arrive faster than they are taken, some are dropped.
 
     The message that leaves the shortest gap is dropped: tracking tolerates half the rate better than a second without
-    scans.
-
-    Attributes:
-        dropped: number of messages that were dropped.
-        is_ended: whether nothing more is received; messages may still be queued.
-
-    Args:
-        receive: the next messages, after at most the given seconds.
-        longest: number of messages that may be queued.
-        on_arrival: called on the thread that receives, with each message.
+    scans. `on_arrival` is called on the thread that receives.
     """
 
     def __init__(
@@ -131,8 +112,8 @@ class IncomingQueue:
         longest: int,
         on_arrival: Callable[[Arrived], None] = lambda _: None,
     ) -> None:
-        self.dropped = 0
-        self.is_ended = False
+        self.dropped = 0  # messages
+        self.is_ended = False  # whether nothing more is received; messages may still be queued
         self._receive = receive
         self._on_arrival = on_arrival
         self._waiting: deque[Arrived] = deque()
@@ -196,11 +177,10 @@ class IncomingQueue:
         return min(range(len(gaps)), key=gaps.__getitem__, default=0)
 
 
-def find_imu(published: Callable[[], Iterable[P]], wanted: str | None) -> P:
+def find_imu(published: Published, wanted: str | None) -> PublishedTopic:
     """Wait briefly for the publisher of an IMU; without a name, for the only one.
 
-    Raises:
-        InputError: there is none, or there are several and none is named.
+    InputError where there is none, or there are several and none is named.
     """
     end = time.monotonic() + _PATIENCE_S
     while True:
@@ -208,25 +188,21 @@ def find_imu(published: Callable[[], Iterable[P]], wanted: str | None) -> P:
         found = imus if wanted is None else [topic for topic in imus if topic.name.lstrip("/") == wanted.lstrip("/")]
         if len(found) == 1:
             return found[0]
-        names = ", ".join(topic.name for topic in imus)
         if len(found) > 1:
-            raise InputError(f"IMUs are published on {names}; choose one with --set reader.imu_topic=NAME")
+            raise InputError(f"IMUs are published on {_names(imus)}; choose one with --set reader.imu_topic=NAME")
         if time.monotonic() > end:
             what = f"no {IMU_TYPE} is published{'' if wanted is None else f' on {wanted}'}"
-            raise InputError(f"{what}; published: {names or 'none'}. Choose --odometry learned, which needs none")
+            raise InputError(
+                f"{what}; published: {_names(imus) or 'none'}. Choose --odometry learned, which needs none"
+            )
         time.sleep(_POLL_S)
 
 
 class ImuReceiver:
-    """Gives the messages of an IMU to a stream, on a thread of its own; a context manager.
-
-    Args:
-        receive: the next messages, after at most the given seconds.
-        stream: takes the samples.
-    """
+    """Gives the messages of an IMU to a stream, on a thread of its own; a context manager."""
 
     def __init__(self, receive: Callable[[float], Iterable[Received]], stream: ImuStream) -> None:
-        self._receive, self._stream = receive, stream
+        self._receive, self.stream = receive, stream
         self._is_ended, self._strays = False, 0
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self.frame_id: str | None = None  # of the first message
@@ -241,9 +217,9 @@ class ImuReceiver:
 
     def wait_for(self, stamp: float) -> None:
         """Wait for the sample at a stamp of the scans' clock, for 50 ms and the delay of the IMU's clock at most."""
-        late_s = self._stream.offset_s
+        late_s = self.stream.offset_s
         end = time.monotonic() + _SWEEP_PATIENCE_S + max(0.0, late_s)
-        while self._stream.last_s - late_s < stamp and time.monotonic() < end:
+        while self.stream.last_s - late_s < stamp and time.monotonic() < end:
             time.sleep(_STEP_S)
 
     def _run(self) -> None:
@@ -259,14 +235,14 @@ class ImuReceiver:
         except ValueError:
             return
         stamp = (stamp_ns or message.published_ns) / 10**9
-        if numbers is None or stamp <= self._stream.last_s or self._is_stray(stamp):
+        if numbers is None or stamp <= self.stream.last_s or self._is_stray(stamp):
             return
         rates, forces = numbers[ANGULAR_VELOCITY], numbers[ACCELERATION]
         if np.isfinite(rates).all() and np.isfinite(forces).all():
-            self._stream.add(stamp, rates, forces)
+            self.stream.add(stamp, rates, forces)
             self.frame_id = self.frame_id or frame_id
 
     def _is_stray(self, stamp: float) -> bool:
         """Whether a stamp is an outlier, far ahead of the last one; several in a row mean that the clock was set."""
-        self._strays = self._strays + 1 if stamp > self._stream.last_s + _FAR_S else 0
-        return np.isfinite(self._stream.last_s) and 0 < self._strays < _STRAYS
+        self._strays = self._strays + 1 if stamp > self.stream.last_s + _FAR_S else 0
+        return np.isfinite(self.stream.last_s) and 0 < self._strays < _STRAYS

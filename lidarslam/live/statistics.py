@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,20 +17,11 @@ _RATE_OVER_S = 5.0
 _GAP_INTERVALS = 1.5
 
 
-@dataclass(frozen=True)
-class Latency:
+class Latency(NamedTuple):
     """Median and 99th percentile, milliseconds."""
 
     median_ms: float
     p99_ms: float
-
-    @classmethod
-    def of(cls, seconds: list[float]) -> "Latency | None":
-        """Of these latencies; None without any."""
-        if not seconds:
-            return None
-        median, p99 = 1e3 * np.quantile(seconds, [0.5, 0.99])
-        return cls(float(median), float(p99))
 
     def __str__(self) -> str:
         return f"median {self.median_ms:.0f} ms, 99 % under {self.p99_ms:.0f} ms"
@@ -60,10 +52,10 @@ class LiveCounts:
             f"{count(self.received, 'message')} received, {self.missing} missing between their stamps,"
             f" {self.dropped} dropped because registration was behind"
         ]
-        if self.from_arrival is not None:
-            lines.append(f"latency from the arrival of a scan to its pose: {self.from_arrival}")
-        if self.from_stamp is not None:
-            lines.append(f"latency from the stamp of a scan to its pose: {self.from_stamp}")
+        latencies = {"arrival": self.from_arrival, "stamp": self.from_stamp}
+        lines += [
+            f"latency from the {of} of a scan to its pose: {ms}" for of, ms in latencies.items() if ms is not None
+        ]
         return "\n".join(lines)
 
     def warnings(self) -> list[str]:
@@ -87,23 +79,19 @@ class LiveStatistics:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._stamps: list[float] = []
-        self._arrivals: list[float] = []
+        self._arrived: list[tuple[float, float]] = []  # stamp and arrival of each message
         self._from_arrival: list[float] = []
         self._from_stamp: list[float] = []
-        self._registered = 0
 
     def arrived(self, stamp_s: float, arrived_s: float) -> None:
         """Count a message that has arrived."""
         with self._lock:
-            self._stamps.append(stamp_s)
-            self._arrivals.append(arrived_s)
+            self._arrived.append((stamp_s, arrived_s))
 
     def registered(self, stamp_s: float, arrived_s: float) -> None:
         """Count a scan whose pose is published."""
         now = time.time()
         with self._lock:
-            self._registered += 1
             self._from_arrival.append(now - arrived_s)
             if abs(now - stamp_s) < _SAME_CLOCK_S:
                 self._from_stamp.append(now - stamp_s)
@@ -111,16 +99,21 @@ class LiveStatistics:
     def counts(self, dropped: int) -> LiveCounts:
         """The counts up to now; the queue dropped `dropped` messages."""
         with self._lock:
-            arrivals = np.array(self._arrivals)
+            stamps, arrivals = np.array(self._arrived).reshape(-1, 2).T
+            registered = len(self._from_arrival)
             return LiveCounts(
                 received=len(arrivals),
-                missing=count_missing(np.array(self._stamps)),
+                missing=count_missing(stamps),
                 dropped=dropped,
-                registered=self._registered,
+                registered=registered,
                 rate_hz=_rate(arrivals),
-                from_arrival=Latency.of(self._from_arrival),
-                from_stamp=Latency.of(self._from_stamp) if 2 * len(self._from_stamp) > self._registered else None,
+                from_arrival=_latency(self._from_arrival),
+                from_stamp=_latency(self._from_stamp) if 2 * len(self._from_stamp) > registered else None,
             )
+
+
+def _latency(seconds: list[float]) -> Latency | None:
+    return Latency(*(1e3 * np.quantile(seconds, [0.5, 0.99])).tolist()) if seconds else None
 
 
 def count_missing(stamps: FloatArray) -> int:

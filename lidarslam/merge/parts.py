@@ -23,10 +23,9 @@ from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.run.checkpoints import describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.request import RunRequest
+from lidarslam.run.request import RunRequest, require_apart
 from lidarslam.run.results import TrackedScans
-from lidarslam.run.session import RunSession, open_odometry, require_apart
-from lidarslam.run.tracking import NoScanError, Progress, track
+from lidarslam.run.run import NoScanError, Progress, RunSession, open_odometry, track
 from lidarslam.storage.directory import RunDirectory, files_in
 from lidarslam.storage.finished_run import read_summary
 from lidarslam.storage.state_file import read_state, write_state
@@ -150,7 +149,7 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
         try:
             session = RunSession(task.request, RunDirectory(out), odometry, unfinished=unfinished)
             with show(task.name) as progress:
-                scans = track(session, task.request, recording, range(len(recording)), progress, graph).scans
+                scans = track(session, recording, range(len(recording)), progress, graph).scans
         except NoScanError as error:
             unfinished.end(stopped=False)
             missing = f"{task.request.source}: interrupted" if error.interrupted else str(error)

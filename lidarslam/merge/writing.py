@@ -159,7 +159,7 @@ def write_merge(
         recordings=recordings,
         elapsed_s=time.perf_counter() - started,
         peak_rss_mb=peak_rss_mb(),
-        graph=None if common is None else GraphSummary.of(common),
+        graph=None if common is None else common.summary,
         map=written,
         warnings=(*_warnings(recordings, runs), *missing(parts), *filter(None, [beyond])),
     )

@@ -5,16 +5,14 @@ cores. After an installation, `python -m lidarslam.pipeline.compile_ahead` compi
 need not; with the names of some, these in its own process.
 """
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -24,6 +22,7 @@ from lidarslam.core.child_processes import bound
 from lidarslam.core.compiled import is_compiled
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.scan import Scan, squared_ranges
+from lidarslam.core.tasks import usable_cores
 
 _RINGS, _COLUMNS, _SWEEP_S = 16, 900, 0.1
 _HALF_ROOM_M = np.array([8.0, 6.0, 2.0])
@@ -75,28 +74,23 @@ def _alignment() -> None:
     align(InitialEstimate(np.eye(4)), SweepPair(images, images, _SWEEP_S, None))
 
 
-def _surfels() -> None:
+def _register(method: str) -> None:
     from lidarslam.mapping.config import MappingConfig
     from lidarslam.mapping.motion.prediction import Prior
-    from lidarslam.mapping.surfels.grid import SurfelGrid
     from lidarslam.mapping.tracking.mapper import Mapper
 
-    mapper = Mapper(MappingConfig())
+    mapper = Mapper(MappingConfig(method=method))
     for scan in made_up_scans():
         mapper.process(scan, Prior(_STEP, None))
+
+
+def _surfels() -> None:
+    from lidarslam.mapping.surfels.grid import SurfelGrid
+
+    _register("surfels")
     grid, points = SurfelGrid(0.5), made_up_scans()[0].points
     grid.insert(points, np.zeros(len(points)), np.zeros_like(points))
     grid.drop_beyond(np.zeros(3), 5.0)
-
-
-def _loam() -> None:
-    from lidarslam.mapping.config import MappingConfig
-    from lidarslam.mapping.motion.prediction import Prior
-    from lidarslam.mapping.tracking.mapper import Mapper
-
-    mapper = Mapper(MappingConfig(method="loam"))
-    for scan in made_up_scans():
-        mapper.process(scan, Prior(_STEP, None))
 
 
 def _map() -> None:
@@ -142,7 +136,7 @@ PARTS = {
         ),
     ),
     "loam": Part(
-        _loam,
+        partial(_register, "loam"),
         (
             *(f"mapping.loam.{kind}_kernels" for kind in ("feature", "neighbour")),
             "mapping.registration.linear_kernels",
@@ -180,24 +174,19 @@ class CompileAhead:
     """Compiles the loops that are not on disk yet; a context that ends its processes.
 
     Loops that fail to compile here are compiled in this process, on their first call.
-
-    Args:
-        parts: names of the parts whose loops are compiled.
     """
 
     def __init__(self, parts: list[str]) -> None:
         self._parts = uncompiled(parts)
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_closed = False
-        self._pool = ThreadPoolExecutor(max_workers=_cores(), thread_name_prefix="compile")
+        self._pool = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="compile")
         self._done: dict[str, Future[None]] = {part: self._pool.submit(self._compile, part) for part in self._parts}
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._is_closed = True
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in self._running:
@@ -227,10 +216,6 @@ class CompileAhead:
             if self._is_closed:
                 process.kill()
             process.wait()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # not on macOS
 
 
 def main(parts: list[str]) -> None:

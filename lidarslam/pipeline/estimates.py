@@ -1,7 +1,7 @@
 """A scan in the stages of the pipeline: with its odometry, then with its pose."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -32,6 +32,17 @@ class ScanOdometry:
     def velocity(self) -> FloatArray | None:
         """(6,) body velocity since the previous stamp, rotation first; None when no motion was measured."""
         return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
+
+    def estimated(self, stage_ms: dict[str, float], **values: Any) -> "ScanEstimate":
+        """The scan with its pose and quality, and the wall time of a further stage."""
+        return ScanEstimate(
+            stamp=self.scan.stamp,
+            is_odometry_asked=self.motion.is_asked,
+            points_read=len(self.scan),
+            points_dropped=self.scan.dropped,
+            stage_ms=self.stage_ms | stage_ms,
+            **values,
+        )
 
 
 @dataclass(frozen=True, eq=False)

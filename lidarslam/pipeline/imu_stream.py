@@ -35,11 +35,7 @@ class ImuStream(Stateful):
     """An IMU's part in the prior of each scan; `InertialPrediction` of the samples that have arrived so far.
 
     The rotation is found by the turns of the first scans where none is given. Errors of clock and rotation are
-    corrected as soon as the scans show them, and an IMU that contradicts them is no longer used.
-
-    Args:
-        T_lidar_imu: (4, 4) extrinsic calibration; None where it is not known.
-        warn: called with each correction or fault.
+    corrected as soon as the scans show them, and an IMU that contradicts them is no longer used; `warn` is told.
     """
 
     def __init__(self, T_lidar_imu: FloatArray | None, warn: Callable[[str], None]) -> None:
@@ -90,8 +86,7 @@ class ImuStream(Stateful):
     def add(self, stamp: float, angular_velocity: FloatArray, acceleration: FloatArray) -> None:
         """Take the next sample, from any thread: seconds on the clock of the scans, rad/s and m/s^2 (3,) each.
 
-        Raises:
-            InputError: the stamp is not after the last one.
+        InputError where the stamp is not after the last one.
         """
         with self._lock:
             if not stamp > self._last_s:

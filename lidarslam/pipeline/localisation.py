@@ -10,7 +10,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import TRANSFORM, Saved, State, Stateful
+from lidarslam.core.state import TRANSFORM, Restorable, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator
@@ -23,16 +23,6 @@ from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, SweepMotion
-
-
-class Restorable(Protocol):
-    """Carries a state from scan to scan."""
-
-    def state(self) -> State | None:
-        """The state it carries; None where it cannot be saved, nor a run resumed."""
-
-    def restore(self, saved: Saved) -> None:
-        """Resume from a state, before the first scan."""
 
 
 class Localiser(Restorable, Protocol):
@@ -88,14 +78,13 @@ class OdometryAlone(Stateful):
 
     def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """Chain the motion, and compare the scan with the previous one."""
-        started = time.perf_counter()
-        motion = odometry.motion
+        started, motion = time.perf_counter(), odometry.motion
         self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
         sweep = SweepMotion(odometry.velocity, following.velocity if following else None)
         fit = self._check.check(sweep.compensate(self._check.sample(odometry.scan)), motion.T_prev_curr)
         status, message = _judge(motion, fit)
-        return ScanEstimate(
-            stamp=odometry.scan.stamp,
+        return odometry.estimated(
+            {"check": 1e3 * (time.perf_counter() - started)},
             T_world_lidar=self._T_odom_lidar,
             T_odom_lidar=self._T_odom_lidar,
             covariance=None,
@@ -107,10 +96,6 @@ class OdometryAlone(Stateful):
             residual_m=fit.residual_m,
             inlier_ratio=fit.inlier_ratio,
             degenerate=motion.degenerate,
-            is_odometry_asked=motion.is_asked,
-            points_read=len(odometry.scan),
-            points_dropped=odometry.scan.dropped,
-            stage_ms=odometry.stage_ms | {"check": 1e3 * (time.perf_counter() - started)},
         )
 
 
@@ -118,8 +103,7 @@ class ScanToMap(Stateful):
     """Registers each scan to the map, with the odometry as initial guess.
 
     Args:
-        mapper: registers.
-        inertial: an IMU's part in the prior.
+        mapper, inertial: registers; an IMU's part in the prior.
         elevation: is given the scans that are registered to surfels.
         start: motions of the first scans, by stamp, that replace those of the odometry in the prior.
     """
@@ -137,12 +121,8 @@ class ScanToMap(Stateful):
         elevation: ElevationEstimator | None = None,
         start: Mapping[float, SmoothedMotion] | None = None,
     ) -> None:
-        self._start = start or {}
-        self._mapper = mapper
-        self._inertial = inertial
-        self._elevation = elevation
-        self._T_odom_lidar = np.eye(4)
-        self._T_world_last = np.eye(4)
+        self._mapper, self._inertial, self._elevation, self._start = mapper, inertial, elevation, start or {}
+        self._T_odom_lidar, self._T_world_last = np.eye(4), np.eye(4)
 
     @property
     def mapper(self) -> Mapper | None:
@@ -178,8 +158,9 @@ class ScanToMap(Stateful):
         expected = inverse(self._T_world_last) @ mapped.T_world_predicted
         self._T_odom_lidar = self._T_odom_lidar @ (motion.T_prev_curr if measured else expected)
         self._T_world_last = mapped.state.T_world_lidar
-        return ScanEstimate(
-            stamp=odometry.scan.stamp,
+        refine_ms = odometry.stage_ms.get("refine", 0.0) + 1e3 * (time.perf_counter() - started)
+        return odometry.estimated(
+            {"refine": refine_ms},
             T_world_lidar=mapped.state.T_world_lidar,
             T_odom_lidar=self._T_odom_lidar,
             covariance=mapped.state.covariance[:6, :6] if mapped.registered else None,
@@ -191,11 +172,6 @@ class ScanToMap(Stateful):
             residual_m=mapped.fit.residual_m if mapped.fit else None,
             inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,
             degenerate=mapped.degenerate,
-            is_odometry_asked=motion.is_asked,
-            points_read=len(odometry.scan),
-            points_dropped=odometry.scan.dropped,
-            stage_ms=odometry.stage_ms
-            | {"refine": odometry.stage_ms.get("refine", 0.0) + 1e3 * (time.perf_counter() - started)},
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
             cell_m=None if self.mapper is None else self.mapper.cell_m,
@@ -233,9 +209,6 @@ def make_localiser(
     """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
 
     With surfels, the error of the sensor's elevations is estimated as well, and the first scans may be smoothed.
-
-    Raises:
-        ConfigError: the mapping is another package's, and cannot be loaded.
     """
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())

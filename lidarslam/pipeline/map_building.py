@@ -1,16 +1,21 @@
-"""Building the global map: each scan is added one scan late, once the motion it was deskewed with is confirmed."""
+"""Building the global map, one scan late, once the motion of the scan is confirmed; correcting the local map."""
 
 import logging
+from collections import deque
+from concurrent.futures import Future
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
-from lidarslam.core.state import Saved, Stateful
+from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.consistency import ConsistencyCheck
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 
 logger = logging.getLogger(__name__)
@@ -19,9 +24,7 @@ logger = logging.getLogger(__name__)
 class MapBuilder(Stateful):
     """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration.
 
-    Args:
-        config: of the map.
-        store: where tiles of the map are stored that do not fit into memory; None: in a temporary file.
+    The store has the tiles of the map that do not fit into memory; without one, a temporary file has them.
     """
 
     # of the map; derived from the first scan with points unless it is configured, None until then
@@ -88,3 +91,47 @@ class MapBuilder(Stateful):
         if self._config.leave_out_moved:
             self.views.add(points, number)
         return points, estimate.T_world_lidar, self.voxel_size_m, attributes
+
+
+class MapCorrection(Stateful):
+    """Hands local maps that the pose graph rebuilds after loop closures to the mapper, a fixed number of scans later.
+
+    The pose graph rebuilds them on its own thread; which scans are registered to which map does not depend on threads.
+    """
+
+    _registered: int  # scans
+    _followed: int  # scans that the graph was given
+    _waiting: list[tuple[int, SurfelMap]]  # rebuilt maps, each with the number of the scan before which it was rebuilt
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._registered = self._followed = 0
+        self._waiting = []
+        self._drawing: deque[tuple[int, Future[SurfelMap | None]]] = deque()
+
+    def state(self) -> State:
+        """With the pending maps; the graph must be idle."""
+        self._collect(self._followed)
+        return super().state()
+
+    def add(self, drawing: Future[SurfelMap | None]) -> None:
+        """Take the graph's result for the next scan: a map without it, or None."""
+        self._drawing.append((self._followed, drawing))
+        self._followed += 1
+
+    def before_scan(self) -> None:
+        """Replace the local map before the next scan, where that is due; an error of the graph is raised."""
+        due = self._registered - SCANS_LATER
+        assert due < self._followed, "more scans wait for the graph than it is given"
+        self._collect(due)
+        while self._waiting and self._waiting[0][0] <= due:
+            self._mapper.redraw(self._waiting.pop(0)[1], SCANS_LATER)
+        self._registered += 1
+
+    def _collect(self, until: int) -> None:
+        """Wait for the maps that were rebuilt before the scans up to this one."""
+        while self._drawing and self._drawing[0][0] <= until:
+            scan, drawing = self._drawing.popleft()
+            drawn = drawing.result()
+            if drawn is not None:
+                self._waiting.append((scan, drawn))

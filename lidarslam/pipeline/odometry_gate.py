@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.config.settings import Config
-from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Shape, State, Stateful
 from lidarslam.core.tracking import Status
@@ -35,9 +35,6 @@ class OdometryGate(Stateful):
 
     Each scan is decided by the poses of all scans but the latest that were given to `follow`, however fast they arrive,
     so that results do not depend on timing.
-
-    Args:
-        odometry: is asked.
     """
 
     _odometry: SkippingOdometry
@@ -62,7 +59,9 @@ class OdometryGate(Stateful):
         interval_s = None if self._stamp is None else scan.stamp - self._stamp
         before, self._stamp, self._interval_s = self._interval_s, scan.stamp, interval_s
         is_gap = before is None or interval_s is None or interval_s > min(_LONGEST_S, _LARGEST_RATIO * before)
-        if is_gap or not len(scan) or self._is_needed():
+        if not is_gap and len(scan):
+            self.wait()
+        if is_gap or not len(scan) or not self._may_be_skipped():
             return self._odometry.estimate(scan)
         self._odometry.skip(scan)
         return Motion(np.eye(4), 0, "not needed", is_asked=False)
@@ -88,10 +87,6 @@ class OdometryGate(Stateful):
         """Close the odometry."""
         self._odometry.close()
 
-    def _is_needed(self) -> bool:
-        self.wait()
-        return not self._may_be_skipped()
-
     def _may_be_skipped(self) -> bool:
         """Whether the next scan can do without, if all pending results are as good as possible."""
         error_m = self._error_m * _FADING ** len(self._waiting)
@@ -111,8 +106,7 @@ class OdometryGate(Stateful):
         motion = log(inverse(before) @ estimate.T_world_lidar)
         if self._velocity is not None:
             error = log(inverse(exp(self._velocity * interval_s)) @ exp(motion))
-            error_m = float(np.linalg.norm(error[3:]) + _RANGE_M * np.linalg.norm(error[:3]))
-            self._error_m = max(_FADING * self._error_m, error_m)
+            self._error_m = max(_FADING * self._error_m, displacement_m(error, _RANGE_M))
             self._ok += 1
         self._velocity = motion / interval_s
 

@@ -28,8 +28,7 @@ from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline import threads
 from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, graph_scan
 from lidarslam.pipeline.localisation import Localiser
-from lidarslam.pipeline.map_building import MapBuilder
-from lidarslam.pipeline.map_correction import MapCorrection
+from lidarslam.pipeline.map_building import MapBuilder, MapCorrection
 from lidarslam.pipeline.odometry_gate import OdometryGate
 from lidarslam.pipeline.threads import BackgroundWorker
 
@@ -56,14 +55,7 @@ class Pipeline(Stateful):
     """Turns a stream of scans into a stream of poses, a global map and a pose graph.
 
     Recorded scans go through `run`; scans that arrive one by one through `register`, which returns the pose at
-    once. The state excludes that of odometry and graph.
-
-    Args:
-        odometry, localiser: estimate the poses.
-        config: of the global map.
-        graph: built meanwhile; complete when the last result has been delivered.
-        checkpointer: saves the state at intervals.
-        store: of the global map, see `MapBuilder`.
+    once. The graph is complete when the last result has been delivered. The state excludes that of odometry and graph.
     """
 
     map: MapBuilder  # the global map, and the data kept with it
@@ -134,15 +126,9 @@ class Pipeline(Stateful):
             raise self._error
 
     def register(self, scan: Scan, started: float, take: Take) -> ScanEstimate:
-        """The pose of the next scan at once; the map follows in the background.
+        """The pose of the next scan at once, given the reading of `time.perf_counter` when it arrived.
 
-        Args:
-            scan: the next one.
-            started: reading of `time.perf_counter` when it arrived.
-            take: called on the thread of the map.
-
-        Raises:
-            LidarSlamError: building the map of earlier scans failed.
+        The map follows in the background, where `take` is called. LidarSlamError where that of earlier scans failed.
         """
         odometry = self._estimate(scan, _ms_since(started))
         estimate = self._localise(odometry, None)

@@ -36,12 +36,7 @@ def prefetch(items: Iterable[T], ahead: int = 3) -> Iterator[T]:
 
 
 class BackgroundWorker:
-    """One thread, a bounded queue of calls.
-
-    Args:
-        name: of the thread.
-        max_pending: calls that may wait; `submit` waits while there are more, to bound the memory they hold.
-    """
+    """One thread, and a queue of calls; `submit` waits while more than `max_pending` do, to bound their memory."""
 
     def __init__(self, name: str, max_pending: int) -> None:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)

@@ -37,8 +37,7 @@ WITHOUT_EFFECT = {"viewer": True, "checkpoints": True}
 def describe_computed(request: RunRequest, recording: Recording) -> dict[str, Any]:
     """Everything that determines the results of a run; weights and prior by a digest of their content.
 
-    Raises:
-        InputError: a file cannot be read.
+    InputError where a file cannot be read.
     """
     config = request.config
     tree = config.model_dump(mode="json", exclude=WITHOUT_EFFECT)
@@ -53,8 +52,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
 def lost_when_finished(request: RunRequest) -> bool | None:
     """Whether tracking was lost, if `out` holds this very run and it is finished; None if it is not.
 
-    Raises:
-        InputError: it holds another finished run.
+    InputError where it holds another finished run.
     """
     out = request.out
     if About.read(out) is not None or not (out / files.CONFIG).is_file() or not (out / files.SUMMARY).is_file():
@@ -85,19 +83,10 @@ def abandoned(out: Path) -> str:
 
 
 def scans_left(scans: Iterator[Scan], held: Scan, odometry: Odometry, saved: Saved) -> Iterator[Scan]:
-    """The scans after the one that was read last; the odometry is restored.
+    """The scans after the one that was read last, `held`; the odometry is restored.
 
     The scans before are read again, so that their faults are counted again. An odometry without a state of its own is
-    run over them again.
-
-    Args:
-        scans: all that the run takes, from the first on.
-        held: the last one that was read.
-        odometry: new.
-        saved: with the state of the odometry.
-
-    Raises:
-        InputError: the scan that was read last is not in the recording, or differs.
+    run over them again. InputError where the scan that was read last is not in the recording, or differs.
     """
     if saved.has("odometry"):
         odometry.restore(saved.part("odometry"))
@@ -146,13 +135,7 @@ _RESUMED = "the run was resumed "
 
 
 class Checkpoints:
-    """Saves the state of a run at intervals; see `lidarslam.pipeline.pipeline.Checkpointer`.
-
-    Args:
-        unfinished: where.
-        config: how often.
-        odometry, log, graph: of the run, saved with the pipeline.
-    """
+    """Saves the state of a run, and that of its odometry, log and graph, at intervals; a `pipeline.Checkpointer`."""
 
     def __init__(
         self,
@@ -162,11 +145,8 @@ class Checkpoints:
         log: ScanLog,
         graph: KeyframeGraph | None,
     ) -> None:
-        self._unfinished = unfinished
-        self._config = config
-        self._odometry = odometry
-        self._log = log
-        self._graph = graph
+        self._unfinished, self._config = unfinished, config
+        self._odometry, self._log, self._graph = odometry, log, graph
         self._scans = 0  # since the last checkpoint
         self._done = self._asked = time.monotonic()
         self._cost_s: float | None = None  # of the last one
@@ -200,16 +180,7 @@ class Checkpoints:
         self._cost_s = self._done - self._asked
 
     def begin(self, pipeline: Pipeline, scans: Iterator[Scan], is_recorded: bool) -> Iterator[Scan]:
-        """Restore log, pipeline and odometry, and mark the run as running; the remaining scans.
-
-        Args:
-            pipeline: new.
-            scans: all that the run takes.
-            is_recorded: whether a Rerun recording is written.
-
-        Raises:
-            InputError: the checkpoint is damaged, or the recording is another one.
-        """
+        """Restore log, pipeline and odometry, and mark the run as running; the remaining scans of all that it takes."""
         saved, self._unfinished.saved = self._unfinished.saved, None  # its arrays are in use now
         if saved is not None:
             self._log.restore(saved.part("log"))

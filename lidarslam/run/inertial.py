@@ -37,9 +37,7 @@ _COMPARED_SCANS = 60
 def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
     """The samples that the odometry needs; None where it uses no IMU.
 
-    Raises:
-        ConfigError: the recording has no IMU.
-        InputError: the samples are damaged.
+    ConfigError where the recording has no IMU; InputError where the samples are damaged.
     """
     if not config.odometry.uses_imu:
         return None
@@ -54,17 +52,9 @@ def open_inertial(
 ) -> "Inertial | None":
     """The IMU's part in a run over the chosen scans; None where the odometry uses no IMU.
 
-    Its rotation is found where none is known; the errors of clock and rotation that the first scans show are corrected.
-
-    Args:
-        config: the configuration.
-        recording: has an IMU.
-        chosen: numbers of the scans.
-        warn: called with each error that was corrected.
-
-    Raises:
-        ConfigError: the recording has no IMU.
-        InputError: its samples are damaged or contradict the scans, or its rotation is neither known nor observable.
+    Its rotation is found where none is known; the errors of clock and rotation that the first scans show are corrected,
+    and told with `warn`. InputError where samples are damaged or contradict the scans, or the rotation is neither known
+    nor observable.
     """
     samples = imu_samples(config, recording)
     if samples is None:
@@ -88,23 +78,14 @@ def open_inertial(
     return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn), lever_sigma_m)
 
 
-def make_imu_stream(
-    config: Config, warn: Callable[[str], None], T_lidar_imu: FloatArray | None = None
-) -> "ImuStream | None":
-    """The IMU's part in a run whose samples arrive one by one; None where the odometry uses no IMU.
-
-    Args:
-        config: the configuration; its extrinsic calibration is used before others.
-        warn: called with each correction or fault.
-        T_lidar_imu: (4, 4) extrinsic calibration of another source, in upright axes.
-    """
+def make_imu_stream(config: Config, warn: Callable[[str], None]) -> "ImuStream | None":
+    """The IMU's part where samples arrive one by one, which warns of faults; None where the odometry uses none."""
     if not config.odometry.uses_imu:
         return None
     from lidarslam.pipeline.imu_stream import ImuStream
 
-    if (T_recorded_imu := config.odometry.T_recorded_imu) is not None:
-        T_lidar_imu = transform_of(config.reader.mounting) @ T_recorded_imu
-    return ImuStream(T_lidar_imu, warn)
+    T_recorded_imu = config.odometry.T_recorded_imu
+    return ImuStream(None if T_recorded_imu is None else transform_of(config.reader.mounting) @ T_recorded_imu, warn)
 
 
 class _Poses:
@@ -143,8 +124,7 @@ class _Poses:
 def _found(poses: _Poses, name: str, samples: ImuSamples) -> FloatArray:
     """(4, 4) T_lidar_imu from the turns of the first scans; its position stays unknown.
 
-    Raises:
-        InputError: they do not show it.
+    InputError where they do not show it.
     """
     from lidarslam.mapping.inertial.comparison import MountingError
 
@@ -168,8 +148,7 @@ def _aligned(
 ) -> tuple[ImuSamples, FloatArray]:
     """Samples on the LiDAR's clock, and T_lidar_imu (4, 4), without the errors that the first scans show.
 
-    Raises:
-        InputError: they show that the samples, or their axes, are something else.
+    InputError where they show that the samples, or their axes, are something else.
     """
     from lidarslam.mapping.inertial.comparison import FEWEST_COMPARED, MOST_CORRECTIONS
 

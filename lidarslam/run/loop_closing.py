@@ -4,16 +4,17 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.mapping.global_map.global_map import GlobalMap
-from lidarslam.mapping.loops.closure import GivenLoops, LoopClosure, RelativePose
+from lidarslam.mapping.loops.closure import GivenLoops, RelativePose
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import GraphSummary, LoopReport, Milliseconds
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
@@ -22,35 +23,6 @@ if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LoopReport:
-    """A loop closure in the summary."""
-
-    closure: LoopClosure  # between keyframes
-    accepted: bool  # whether it is in the graph: an outlier of the optimisation is not
-    scans: tuple[int, int]  # indices in their recordings, the second the later one
-    recordings: tuple[int, int] | None = None  # which, from 1; None where there is one only
-
-    def to_json(self) -> dict[str, Any]:
-        """An entry of summary.json."""
-        closure, of = self.closure, self.recordings
-        outlier = closure.accepted and not self.accepted
-        return {
-            "first_scan": self.scans[0],
-            "second_scan": self.scans[1],
-            "accepted": self.accepted,
-            "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
-            "found_by": "given" if closure.given else "appearance" if closure.by_appearance else "nearby",
-            "overlap": round(closure.overlap, 4),
-            "residual_m": round(closure.residual_m, 4) if np.isfinite(closure.residual_m) else None,
-            "inlier_ratio": round(closure.inlier_ratio, 4),
-            "consistent": closure.consistent,
-            "distance_m": round(float(np.linalg.norm(closure.T_first_second[:3, 3])), 4),
-            "turn_deg": round(float(np.rad2deg(rotation_angle(closure.T_first_second))), 4),
-            **({} if of is None else {"first_recording": of[0], "second_recording": of[1]}),
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +34,7 @@ class GraphOutcome:
     # keyframe_poses, edges: (K, 4, 4) and the relative poses between them, for pose_graph.g2o
     keyframe_poses: FloatArray
     edges: tuple[RelativePose, ...]
-    loops: tuple[LoopReport, ...]  # accepted and rejected
-    largest_correction_m: float  # of a scan's position; a move into the frame of another run does not count
-    keyframe_ms: tuple[float, ...]  # wall time of each keyframe, on a thread of its own
+    summary: GraphSummary
 
 
 def begin_graph(
@@ -100,11 +70,12 @@ def close_loops(
         return None
     logger.info("optimising the pose graph")
     result = graph.finish() if track is None else _placed(graph, log, track)
-    closed = _corrected(graph, result, global_map, log)
-    for warning in _not_closed(graph, () if closed is None else closed.loops, len(log)):
+    closed = correct(log, graph, result, global_map)
+    loops = () if closed is None else closed.summary.loops
+    for warning in _not_closed(graph, loops, len(log)):
         log.warn(warning)
     if closed is not None:
-        pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
+        pairs = [loop.scans for loop in loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
     return closed
 
@@ -130,17 +101,10 @@ def _placed(graph: "SlamGraph", log: ScanLog, track: "ProjectedTrack") -> "Corre
         return graph.present()
 
 
-def loops_so_far(graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog) -> "GraphOutcome | None":
-    """Correct the log with the loops that are closed by now; more scans may follow."""
-    if graph is None or global_map is None:
-        return None
-    return _corrected(graph, graph.present(), global_map, log)
-
-
-def _corrected(
-    graph: "SlamGraph", result: "Corrected | None", global_map: GlobalMap, log: ScanLog
+def correct(
+    log: ScanLog, graph: "SlamGraph", result: "Corrected | None", global_map: GlobalMap
 ) -> "GraphOutcome | None":
-    """Correct the log of one recording."""
+    """Correct the log of one recording by its graph; None where that has nothing to correct it with."""
     if result is None:
         return None
     closed = FinishedGraph(graph, result, global_map.voxel_size_m, global_map.most_points).outcome([0])
@@ -174,7 +138,9 @@ class FinishedGraph:
             for loop in self._loops(range(len(self.result.first_scans)), numbered=True)
             if not (loop.accepted or self._are_in(joined, loop.closure)) and len(set(loop.recordings or ())) > 1
         ]
-        return None if outcome is None else replace(outcome, loops=(*outcome.loops, *apart))
+        if outcome is None:
+            return None
+        return replace(outcome, summary=replace(outcome.summary, loops=(*outcome.summary.loops, *apart)))
 
     def outcome(self, recordings: Sequence[int], numbered: bool = False) -> GraphOutcome | None:
         """Some recordings, and the loops between them, on request with their numbers; None when none has a keyframe."""
@@ -183,18 +149,19 @@ class FinishedGraph:
         if not len(chosen):
             return None
         row = {int(key): new for new, key in enumerate(chosen)}
+        edges = [edge for edge in result.edges if self._are_in(recordings, edge)]
         return GraphOutcome(
             T_world_lidar=np.concatenate([result.scan_poses(recording) for recording in recordings]),
             global_map=self.graph.draw_map(result, self.voxel_size_m, recordings, self.most_points),
             keyframe_poses=result.keyframe_poses[chosen],
-            edges=tuple(
-                replace(edge, first=row[edge.first], second=row[edge.second])
-                for edge in result.edges
-                if self._are_in(recordings, edge)
+            edges=tuple(replace(edge, first=row[edge.first], second=row[edge.second]) for edge in edges),
+            summary=GraphSummary(
+                keyframes=len(chosen),
+                edges=len(edges),
+                loops=self._loops(recordings, numbered or len(recordings) > 1),
+                largest_correction_m=max(self._correction_m(recording) for recording in recordings),
+                ms_per_keyframe=Milliseconds.of([self.graph.keyframe_ms[k] for k in chosen]),
             ),
-            loops=self._loops(recordings, numbered or len(recordings) > 1),
-            largest_correction_m=max(self._correction_m(recording) for recording in recordings),
-            keyframe_ms=tuple(self.graph.keyframe_ms[k] for k in chosen),
         )
 
     def _correction_m(self, recording: int) -> float:

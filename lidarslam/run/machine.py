@@ -7,6 +7,8 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from lidarslam.core.tasks import usable_cores
+
 _PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "onnxruntime", "open3d", "open3d-cpu", "torch")
 
 
@@ -23,11 +25,10 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, str]:
     """Processor, cores of this process, memory and system; unknown entries are left out."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()  # not on macOS
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     described = {
         "processor": _processor(),
-        "cores": str(cores or 1),
+        "cores": str(usable_cores()),
         "memory": f"{memory:.1f} GiB",
         "system": f"{platform.system()} {platform.release()} ({platform.machine()})",
     }

@@ -8,10 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.config.settings import Config
+from lidarslam.core.errors import OutputError
+from lidarslam.core.tasks import THREADS, usable_cores
 from lidarslam.core.text import count
+from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.published.evalio import resolved
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.loops.closure import GivenLoops
+from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.viewer import RerunMode
 
 logger = logging.getLogger(__name__)
@@ -37,6 +43,11 @@ class RunRequest:
     given: GivenLoops = field(default_factory=GivenLoops)  # loop closures by hand
     report: bool = False  # whether a page and pictures are drawn, once all else is written
 
+    def open(self) -> tuple[Recording, range]:
+        """The recording, and the indices of the scans that are chosen of it; InputError where there are none."""
+        recording = open_recording(self.source, self.config.reader)
+        return recording, choose_scans(recording, self.source, self.start, self.stop, self.step)
+
 
 @dataclass(frozen=True)
 class LiveRequest:
@@ -59,22 +70,28 @@ class LiveRequest:
     report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
+def require_possible(request: RunRequest | LiveRequest, *read: Path) -> None:
+    """Refuse a run without a display for its window, or into a place that it reads, before anything is computed."""
+    if request.rerun == "spawn":
+        require_window("serve a browser with --rerun web, or write a file with --rerun save")
+    for place in read:
+        require_apart(request.out, place)
+
+
+def require_apart(out: Path, source: Path) -> None:
+    """Refuse to write into a recording; OutputError where `out` is the source."""
+    if out.resolve() == source.resolve():
+        raise OutputError(f"{out}: is the recording itself; name another directory for the run")
+
+
 def log_choices(request: RunRequest, scans: range, recorded: int) -> None:
     """Log the source and settings of a run that begins."""
     config = request.config
     logger.info("%s of %s, to %s", count(len(scans), "scan"), f"{recorded:,}", request.out)
-    logger.info(
-        "odometry: %s; mapping: %s; pose graph: %s",
-        config.odometry.method,
-        config.mapping.method,
-        "on" if config.pose_graph.enabled else "off",
-    )
-    logger.info(
-        "%s of %s; OMP_NUM_THREADS %s, NUMBA_NUM_THREADS %s",
-        count(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, "core"),
-        os.cpu_count(),
-        *(os.environ.get(name, "not set") for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")),
-    )
+    graph = "on" if config.pose_graph.enabled else "off"
+    logger.info("odometry: %s; mapping: %s; pose graph: %s", config.odometry.method, config.mapping.method, graph)
+    threads = ", ".join(f"{name} {os.environ.get(name, 'not set')}" for name in THREADS[:2])
+    logger.info("%s of %s; %s", count(usable_cores(), "core"), os.cpu_count(), threads)
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:

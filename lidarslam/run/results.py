@@ -33,7 +33,6 @@ from lidarslam.storage.directory import MAP_INDEX, MAP_TILES, RunDirectory
 
 logger = logging.getLogger(__name__)
 
-
 T = TypeVar("T")
 
 
@@ -132,17 +131,9 @@ def write_results(
     map_formats: Sequence[MapFormat] = (),
     show: Callable[[DrawnMap], None] = lambda _: None,
 ) -> RunOutcome:
-    """Draw the map, and write everything; the poses are final. A map that cannot be written costs no other file.
+    """Draw the map, show it, and write everything; the poses are final.
 
-    Args:
-        directory: of the run.
-        config, described: the settings, and the description of the run, for config.yaml.
-        tracked, closed: the results.
-        map_formats: further formats of the map.
-        show: called with the map.
-
-    Raises:
-        OutputError: a file cannot be written.
+    OutputError where a file cannot be written; a map that cannot be costs no other file.
     """
     scans, log = tracked.scans, tracked.scans.log
     drawn = corrected_map(tracked, closed, config.global_map, directory)
@@ -168,7 +159,8 @@ def write_results(
         log.warn("the map is empty: min_range_m, max_range_m and min_hits of global_map leave no point")
     skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out
     contradictions = find_contradictions(scans.slides, log.trajectory.T_world_lidar)
-    summary = summarise(log, written, skipped, closed, contradictions, tracked.elevation)
+    graph = None if closed is None else closed.summary
+    summary = summarise(log, written, skipped, graph, contradictions, tracked.elevation)
     directory.write_json(files.SUMMARY, summary.to_json())
     if failed is not None:
         raise OutputError(f"{failed}; the other results are there") from failed
@@ -224,22 +216,21 @@ class TileWriter:
     def write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
         """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
 
-        Raises:
-            OutputError: there is a file in place of the folder.
+        OutputError where there is a file in place of the folder.
         """
         if self.failure is None and not self._entries:
             self._begin()
-        if self.failure is None:
-            try:
-                self._write(tile, cloud, brightest)
-            except OutputError as error:
-                self.failure = error
-                self._remove()
-
-    def _write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
+        if self.failure is not None:
+            return
         name = f"{tile[0]}_{tile[1]}.laz"
-        with self._directory.replacing(f"{MAP_TILES}/{name}") as path:
-            write_cloud(path, cloud, brightest)
+        try:
+            with self._directory.replacing(f"{MAP_TILES}/{name}") as path:
+                write_cloud(path, cloud, brightest)
+        except OutputError as error:
+            self.failure = error
+            for entry in self._entries.values():  # to free the space for the other results
+                (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)
+            return
         self._entries[tile] = {
             "file": name,
             "tile": list(tile),
@@ -269,8 +260,3 @@ class TileWriter:
             raise OutputError(f"{folder}: a file is in the way; name another directory") from error
         except OSError as error:
             self.failure = cannot_write(folder, error)
-
-    def _remove(self) -> None:
-        """Free the space of the tiles for the other results."""
-        for entry in self._entries.values():
-            (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)

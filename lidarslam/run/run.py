@@ -1,23 +1,75 @@
-"""One run on disk: from a recording to a run directory."""
+"""A run on disk: from a recording, through the pipeline, to a run directory."""
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from lidarslam.core.errors import InputError
-from lidarslam.datasets.intake import choose_scans
+import numpy as np
+
+from lidarslam.config.settings import Config
+from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.geometry import inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.text import count
+from lidarslam.core.trajectory import Trajectory, read_tum
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.registry import open_recording
-from lidarslam.run.checkpoints import describe_computed
-from lidarslam.run.elevation import with_elevations
-from lidarslam.run.inertial import imu_samples
-from lidarslam.run.request import RunRequest, describe_run, log_choices
-from lidarslam.run.results import RunOutcome
-from lidarslam.run.session import open_session, require_apart
-from lidarslam.run.tracking import Progress, track
+from lidarslam.mapping.config import MAPPINGS
+from lidarslam.mapping.elevation import ElevationEstimator
+from lidarslam.mapping.global_map.drawing import DrawnMap
+from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.loops.closure import GivenLoops
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
+from lidarslam.odometry.interface import Odometry
+from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.pipeline.estimates import ScanEstimate
+from lidarslam.pipeline.localisation import Localiser, ScanMapper, ScanToMap, make_localiser
+from lidarslam.pipeline.map_building import MapBuilder
+from lidarslam.pipeline.odometry_gate import where_needed
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.threads import prefetch
+from lidarslam.run.checkpoints import Checkpoints, describe_computed
+from lidarslam.run.elevation import Elevation, with_elevations
+from lidarslam.run.inertial import imu_samples, open_inertial
+from lidarslam.run.interruption import Interruptions
+from lidarslam.run.loop_closing import begin_graph, close_loops
+from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible
+from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, reason_of, unless_damaged, write_results
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.storage.directory import RERUN, RunDirectory
+from lidarslam.storage.unfinished import Unfinished
+from lidarslam.viewer.viewer import Viewer
 from lidarslam.viewer.web_page import WebPage
 
-if TYPE_CHECKING:  # loads SciPy and the pose graph
+if TYPE_CHECKING:  # GTSAM and SciPy take a while to load
+    from lidarslam.mapping.inertial.inertial import Inertial
     from lidarslam.mapping.pose_graph.edges import ProjectedTrack
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+logger = logging.getLogger(__name__)
+
+# The folder of a run's results in UTM.
+UTM_FOLDER = "utm"
+
+R = TypeVar("R", RunRequest, LiveRequest)
+Progress = Callable[[int, int, ScanEstimate], None]
+"""Called after every scan with its number from 1, how many there are, and its result."""
+
+
+class NoScanError(InputError):
+    """No scan of a recording could be used, because of an interruption or of the recording."""
+
+    def __init__(self, message: str, interrupted: bool) -> None:
+        super().__init__(message)
+        self.interrupted = interrupted
 
 
 def execute(
@@ -36,19 +88,15 @@ def execute(
         progress: called after every scan.
         phase: called with a short text on the progress before the first scan and after the last.
         page: shows the run in browsers, with `rerun="web"`.
-
-    Raises:
-        LidarSlamError: the source, the configuration or the output directory is not usable, or there is nothing to
-            resume.
     """
-    require_apart(request.out, request.source)
+    require_possible(request, request.source)
     phase("opening the recording")
-    recording = open_recording(request.source, request.config.reader)
-    chosen = _choose(request, recording)
+    recording, chosen = request.open()
+    _require_given(request.given, len(chosen))
     log_choices(request, chosen, len(recording))
     imu_samples(request.config, recording)
     gnss = gnss_track(request)
-    with open_session(request, phase, recording, is_placed=gnss is not None) as session:
+    with open_session(request, phase, recording) as session:
         if request.resumable:
             session.claim(describe_computed(request, recording), request.resume)
         session.begin_graph(request.given, takes_gnss=True)
@@ -56,21 +104,15 @@ def execute(
             session.log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
         session.show(recording.name, page)
         session.wait_for_loops(for_first_scan=True)
-        request, recording = with_elevations(request, recording, chosen, phase)
-        session.request = request
+        session.request, recording = with_elevations(request, recording, chosen, phase)
         phase("reading the first scans")
-        tracked = track(session, request, recording, chosen, progress, session.graph)
+        tracked = track(session, recording, chosen, progress, session.graph)
         session.end_scans()
-        return session.finish(tracked, describe_run(request), gnss)
+        return session.finish(tracked, describe_run(session.request), gnss)
 
 
 def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
-    """The GNSS track of a recording, in UTM; None where the pose graph uses none.
-
-    Raises:
-        InputError: the recording has no GNSS positions.
-        ConfigError: pyproj is not installed.
-    """
+    """The GNSS track of a recording, in UTM; None where the pose graph uses none."""
     if not (request.config.pose_graph.enabled and request.config.pose_graph.gnss):
         return None
     from lidarslam.exports.geo import read_gnss, utm_around
@@ -81,16 +123,291 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
     return ProjectedTrack(track, utm.project(track.geodetic), utm.scale)
 
 
-def _choose(request: RunRequest, recording: Recording) -> range:
-    """The scans of a run.
-
-    Raises:
-        InputError: there are none, or not those of a loop closure that is given or forbidden.
-    """
-    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
-    scans = len(chosen)
-    for option, pairs in (("--loop", request.given.closed), ("--no-loop", request.given.forbidden)):
+def _require_given(given: GivenLoops, scans: int) -> None:
+    """Refuse a loop closure, given or forbidden, of scans that a run lacks."""
+    for option, pairs in (("--loop", given.closed), ("--no-loop", given.forbidden)):
         for first, second in pairs:
             if second >= scans:
                 raise InputError(f"{option} {first} {second}: the run has {scans} scans, from 0 to {scans - 1}")
-    return chosen
+
+
+@dataclass(eq=False)
+class RunSession(Generic[R]):
+    """A run in progress; opened with `open_session`, or by itself for scans that are only tracked."""
+
+    request: R
+    directory: RunDirectory
+    odometry: Odometry
+    phase: Callable[[str], None] = lambda _: None  # called with a short text on the progress
+    unfinished: Unfinished | None = None  # where checkpoints are saved
+    graph: "SlamGraph | None" = None
+    log: ScanLog = field(default_factory=ScanLog)
+    viewer: Viewer = field(default_factory=Viewer)
+    outcome: RunOutcome | None = None  # once the results are written
+    gnss: "ProjectedTrack | None" = None  # that they were written with
+    interruptions: Interruptions = field(default_factory=Interruptions)
+    compiling: CompileAhead | None = None
+    opened: ExitStack = field(default_factory=ExitStack)  # closed before the directory
+    _shown: ExitStack = field(default_factory=ExitStack)  # closed with the last that is shown
+
+    def claim(self, description: dict[str, Any], resume: bool) -> None:
+        """Save checkpoints of the run with that description, or resume it.
+
+        InputError where there is nothing to resume, it is damaged, or it is another run.
+        """
+        self.unfinished = self.opened.enter_context(Unfinished.claim(self.directory, description, resume))
+
+    def begin_graph(self, given: GivenLoops | None = None, takes_gnss: bool = False) -> None:
+        """Begin the pose graph, where there is one, or resume that of the checkpoint."""
+        file = None if self.unfinished is None else self.unfinished.files.submaps
+        self.graph = begin_graph(self.request.config, self.directory.path, file, takes_gnss, given)
+        if self.graph is not None:
+            self.opened.callback(self.graph.close)
+            if self.unfinished is not None and self.unfinished.saved is not None:
+                self.graph.restore(self.unfinished.saved.part("graph"))
+
+    def show(self, name: str, page: WebPage | None) -> None:
+        """Open the viewer; a Rerun recording that cannot be written is a warning."""
+        if self.request.rerun != "off":
+            self.viewer = self._shown.enter_context(self._viewing(name, page))
+
+    @contextmanager
+    def _viewing(self, name: str, page: WebPage | None) -> Iterator[Viewer]:
+        from lidarslam.viewer.rerun_recording import IncompleteRecordingError
+        from lidarslam.viewer.rerun_viewer import rerun_viewer
+
+        viewer, spawn = self.request.config.viewer, self.request.rerun == "spawn"
+        try:
+            with self.directory.replacing(RERUN) as path, rerun_viewer(name, viewer, path, spawn, page) as shown:
+                yield shown
+        except IncompleteRecordingError as error:
+            self.log.warn(f"no {RERUN}: {error}")
+
+    def close_viewer(self) -> None:
+        """End the viewer; a warning is added to the summary."""
+        self._shown.close()
+
+    def take(self, estimate: ScanEstimate, total_ms: float, built: MapBuilder) -> None:
+        """Log and show a scan, and at intervals the map."""
+        self.log.add(estimate, total_ms)
+        index = len(self.log) - 1
+        self.viewer.show_scan(index, estimate)
+        if built.global_map is not None and self.viewer.wants_map(index):
+            self.viewer.show_map(built.global_map.points())
+
+    def wait_for_loops(self, for_first_scan: bool = False) -> None:
+        """Wait until loops are compiled: all, or those that the first scan needs."""
+        if self.compiling is not None:
+            wait = self.compiling.wait_for_first_scan if for_first_scan else self.compiling.wait_for_all
+            wait(self.phase)
+
+    def end_scans(self) -> None:
+        """From here on a request to end the run waits for the results."""
+        self.interruptions.protect_results()
+        self.wait_for_loops()
+        self.phase("writing the results")
+
+    def finish(self, tracked: Tracked, described: dict[str, Any], gnss: "ProjectedTrack | None" = None) -> RunOutcome:
+        """Close the loops, with a GNSS track where there is one, and write everything, after `end_scans`."""
+        request, unfinished, self.gnss = self.request, self.unfinished, gnss
+        closed = close_loops(self.graph, tracked.global_map, self.log, self.viewer, gnss)
+        outcome = write_results(
+            self.directory, request.config, described, tracked, closed, request.map_formats, self._show_final
+        )
+        is_resumable = outcome.stopped is not None and unfinished is not None and unfinished.files.state.is_file()
+        self.outcome = replace(outcome, is_resumable=is_resumable)
+        return self.outcome
+
+    def _show_final(self, drawn: DrawnMap) -> None:
+        if drawn.cloud is not None:
+            self.viewer.show_final_map(drawn.cloud.points)
+        self.close_viewer()
+
+    def conclude(self) -> None:
+        """Once the directory is closed: leave no checkpoint of a finished run, draw the report, and write in UTM."""
+        if self.outcome is None:
+            return
+        if self.unfinished is not None:
+            self.unfinished.end(self.outcome.stopped is not None)
+        if self.request.report:
+            draw_report(self.request.out, self.outcome, self.phase)
+        if self.gnss is not None:
+            self.phase("writing the results in UTM")
+            write_in_utm(self.request.out)
+
+
+@contextmanager
+def open_session(
+    request: R, phase: Callable[[str], None], recording: Recording | None = None
+) -> Iterator[RunSession[R]]:
+    """Load the odometry and lock the directory; after the block, everything is closed and the report is drawn.
+
+    An external odometry has to overlap with the recording.
+    """
+    prior, resume = (request.prior, request.resume) if isinstance(request, RunRequest) else (None, False)
+    with Interruptions() as interruptions:
+        with ExitStack() as stack:
+            compiling = stack.enter_context(CompileAhead(parts_of(request.config)))
+            phase("loading the odometry")
+            odometry = stack.enter_context(closing(open_odometry(request.config, prior)))
+            if recording is not None and isinstance(odometry, ExternalOdometry):
+                info = recording.describe()
+                odometry.require_overlap(info.first_stamp, info.last_stamp)
+            directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, resume))
+            session = RunSession(
+                request, directory, odometry, phase, interruptions=interruptions, compiling=compiling, opened=stack
+            )
+            with session._shown:
+                yield session
+        session.conclude()
+
+
+def draw_report(out: Path, outcome: RunOutcome, phase: Callable[[str], None] = lambda _: None) -> None:
+    """Draw report.html and its pictures; a failure is a warning."""
+    from lidarslam.evaluation.comparison.comparison import MethodResult
+    from lidarslam.viewer.run_report import leave_report
+
+    phase("drawing the report")
+    leave_report(out, MethodResult(out.name, "ok", metrics=outcome.metrics))
+
+
+def write_in_utm(run: Path) -> None:
+    """Write map and trajectory of a finished run in UTM, in a folder of its own; see `lidarslam.exports.geo`.
+
+    Positions that do not determine the heading are a warning only: the run is written already.
+    """
+    from lidarslam.exports.geo import export_geo, georeference
+
+    try:
+        for line in export_geo(georeference(run), run / UTM_FOLDER, overwrite=True):
+            logger.info(line)
+    except InputError as error:
+        logger.warning("not written in UTM: %s", error)
+
+
+def require_no_trajectory(config: Config) -> None:
+    """Refuse an odometry that needs more of a recording than its scans one by one."""
+    if config.odometry.method == "external":
+        raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
+
+
+def open_odometry(config: Config, prior: Path | None) -> Odometry:
+    """The configured odometry, which the caller closes; ConfigError where it does not go with the mapping."""
+    method = config.odometry.method
+    if method == "constant-velocity" and not config.mapping.enabled:
+        raise ConfigError(
+            "constant-velocity only predicts the motion, and needs scan-to-map registration. Choose --odometry learned,"
+            " give a trajectory with --prior, or a mapping with --mapping surfels or --mapping loam"
+        )
+    if config.odometry.uses_imu and not config.mapping.enabled:
+        raise ConfigError(
+            f"{method}: the IMU takes part in scan-to-map registration. Choose --odometry learned, or a mapping with"
+            " --mapping surfels or --mapping loam"
+        )
+    if method == "external" and prior is None:
+        raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
+    if config.mapping.method not in MAPPINGS.built_in:
+        MAPPINGS.load(config.mapping.method, Callable)  # so that nothing is written if it cannot be
+    return where_needed(make_odometry(config.odometry, None if prior is None else read_tum(prior)), config)
+
+
+def track(
+    session: RunSession[RunRequest],
+    recording: Recording,
+    chosen: range,
+    progress: Progress,
+    graph: KeyframeGraph | None = None,
+    mapper: ScanMapper | None = None,
+) -> Tracked:
+    """Take the chosen scans of a recording through the pipeline, which saves, logs and shows them by the session.
+
+    A mapper replaces the one that is configured. NoScanError where no scan could be used; InputError where the run
+    began with another recording.
+    """
+    request, log, odometry, unfinished = session.request, session.log, session.odometry, session.unfinished
+    config, faults, estimator = request.config, Faults(), ElevationEstimator()
+    scans = take_in(recording, chosen, faults)
+    inertial = open_inertial(config, recording, chosen, log.warn)
+    if inertial is not None:
+        scans = map(inertial.gyroscope.evened, scans)
+    checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
+    localiser: Localiser
+    if mapper is not None:
+        localiser = ScanToMap(mapper, inertial)
+    else:
+        localiser = make_localiser(config, inertial, estimator, _start(config, recording, chosen, inertial))
+    store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
+    pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
+    if checkpoints is not None:
+        scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
+    truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
+    with suppress(InputError):  # raised again when the scans are read
+        for warning in recording.warnings:
+            log.warn(warning)
+    error = _process(pipeline, scans, session, truth, lambda number, result: progress(number, len(chosen), result))
+    if not log.table["points"].any():
+        if isinstance(error, KeyboardInterrupt):
+            raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)
+        why = "; ".join(_why_none(log, faults, error))
+        raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
+    elevation = Elevation.found(recording, estimator)
+    found = [odometry.warning if isinstance(odometry, ExternalOdometry) else None, elevation and elevation.warning]
+    for warning in (*(inertial.warnings if inertial is not None else ()), *filter(None, found)):
+        log.warn(warning)
+    tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
+    return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
+
+
+def _start(
+    config: Config, recording: Recording, chosen: range, inertial: "Inertial | None"
+) -> dict[float, SmoothedMotion]:
+    """The motions of the first scans, where they have to be smoothed."""
+    if config.mapping.method != "surfels" or len(chosen) < SHOWING:
+        return {}
+    logger.info("the first scans are registered beforehand")
+    with suppress(InputError):  # raised again when the scans are read
+        scans = take_in(recording, chosen, Faults())
+        if inertial is None:
+            return smoothed_start(scans, config.mapping)
+        return smoothed_start(map(inertial.gyroscope.evened, scans), config.mapping, inertial.anew())
+    return {}
+
+
+def _process(
+    pipeline: Pipeline,
+    scans: Iterable[Scan],
+    session: RunSession[RunRequest],
+    truth: Trajectory | None,
+    progress: Callable[[int, ScanEstimate], None],
+) -> InputError | KeyboardInterrupt | None:
+    """Take every scan through the pipeline; the error that ended it early, or None."""
+    log, finished = session.log, time.perf_counter()
+    try:
+        with closing(pipeline.run(prefetch(scans))) as estimates:
+            for estimate in estimates:
+                before, finished = finished, time.perf_counter()
+                if truth is not None:
+                    _show_reference(session.viewer, truth, log.stamps[0] if len(log) else estimate.stamp)
+                    truth = None
+                session.take(estimate, 1e3 * (finished - before), pipeline.map)
+                progress(len(log), estimate)
+    except (InputError, KeyboardInterrupt) as error:
+        log.warn(f"stopped after {count(len(log), 'scan')}: {reason_of(error)}")
+        return error.with_traceback(None)  # whose frames hold maps and scans
+    return None
+
+
+def _show_reference(viewer: Viewer, truth: Trajectory, first_stamp: float) -> None:
+    """Show the ground truth in the run's world: they coincide at the first scan."""
+    if len(truth) >= 2:
+        nearest = np.clip(first_stamp, truth.stamps[0], truth.stamps[-1])
+        viewer.show_reference(truth.transformed(inverse(truth.at(np.array([nearest]))[0])))
+
+
+def _why_none(log: ScanLog, faults: Faults, error: InputError | None) -> Iterator[str]:
+    if error is not None:
+        yield str(error)
+    yield from faults.warnings()
+    if len(log):
+        invalid = count(int(log.table["points_dropped"].sum()), "invalid point")
+        yield f"{count(len(log), 'scan')} without a valid point, {invalid} (NaN, at the origin, too far)"

@@ -31,7 +31,7 @@ COLUMNS = (
 )
 
 _STATUSES = tuple(Status)
-# The numbers of a scan, 434 bytes; NaN where there is none.
+# The numbers of a scan; NaN where there is none.
 _ROW = np.dtype(
     [
         ("stamp", "f8"),
@@ -44,7 +44,7 @@ _ROW = np.dtype(
         ("sigmas", "f8", len(SIGMAS)),
         ("turn_rate", "f8", 3),
         ("odometry_asked", "?"),
-        ("total_ms", "f8"),
+        ("total_ms", "f8"),  # from the scan before done to this one done
         ("stage_ms", "f8", len(STAGES)),
         ("T_world_lidar", "f8", (4, 4)),
         ("T_odom_lidar", "f8", (4, 4)),
@@ -57,10 +57,10 @@ class ScanLog(Stateful):
 
     messages: list[str]  # of each scan
     warnings: list[str]  # sentences for the summary
-    _degenerate: list[str]
+    degenerate: list[str]  # of each scan, the names of its degenerate directions with spaces between
 
     def __init__(self) -> None:
-        self.messages, self.warnings, self._degenerate = [], [], []
+        self.messages, self.warnings, self.degenerate = [], [], []
         self._rows = bytearray()  # of `_ROW`
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class ScanLog(Stateful):
             result.T_world_lidar,
             result.T_odom_lidar,
         )
-        self._degenerate.append(" ".join(result.degenerate))
+        self.degenerate.append(" ".join(result.degenerate))
         self.messages.append(result.message)
         self._rows += np.array(row, dtype=_ROW).tobytes()  # last, as Ctrl-C may interrupt: `len` counts rows
 
@@ -95,81 +95,49 @@ class ScanLog(Stateful):
 
     def correct(self, T_world_lidar: FloatArray) -> None:
         """Replace the poses (N, 4, 4) by those that the pose graph corrected."""
-        if T_world_lidar.shape != (len(self), 4, 4):
-            raise ValueError(f"expected a pose for each of {len(self)} scans, got {T_world_lidar.shape}")
-        rows = self._table()
+        rows = self.table
         rows["T_world_lidar"] = T_world_lidar
         self._rows = bytearray(rows.tobytes())
 
     def mark(self, indices: Sequence[int], status: Status, message: str) -> None:
         """Replace the status of scans, and its reason."""
-        rows = self._table()
+        rows = self.table
         rows["status"][list(indices)] = _STATUSES.index(status)
         self._rows = bytearray(rows.tobytes())
         for index in indices:
             self.messages[index] = message
 
     @property
-    def degenerate(self) -> list[str]:
-        """Of each scan, the names of its degenerate directions with spaces between."""
-        return list(self._degenerate)
+    def table(self) -> NDArray[np.void]:
+        """(N,) the numbers of all scans, by the names of `_ROW`; a copy, as a view would keep the log from growing."""
+        return np.frombuffer(bytearray(self._rows), _ROW)
 
     @property
     def statuses(self) -> list[Status]:
         """Of each scan."""
-        return [_STATUSES[index] for index in self._table()["status"]]
-
-    @property
-    def points_read(self) -> int:
-        """Valid points of all scans."""
-        return int(self._table()["points"].sum())
-
-    @property
-    def points_dropped(self) -> int:
-        """Invalid points of all scans."""
-        return int(self._table()["points_dropped"].sum())
+        return [_STATUSES[index] for index in self.table["status"]]
 
     @property
     def stamps(self) -> FloatArray:
         """(N,) seconds."""
-        return self._table()["stamp"]
-
-    @property
-    def turn_rates(self) -> FloatArray:
-        """(N, 3) rad/s within the sweeps; NaN where unknown."""
-        return self._table()["turn_rate"]
-
-    @property
-    def odometry_asked(self) -> int:
-        """Number of scans at which the odometry was asked for the motion."""
-        return int(self._table()["odometry_asked"].sum())
-
-    @property
-    def total_ms(self) -> FloatArray:
-        """(N,) wall time from one scan done to the next."""
-        return self._table()["total_ms"]
-
-    @property
-    def stage_ms(self) -> FloatArray:
-        """(N, 6) wall time of each of the `STAGES`."""
-        return self._table()["stage_ms"]
+        return self.table["stamp"]
 
     @property
     def trajectory(self) -> Trajectory:
         """The final poses."""
-        return Trajectory(self.stamps, self._table()["T_world_lidar"])
+        return Trajectory(self.stamps, self.table["T_world_lidar"])
 
     @property
     def odometry(self) -> Trajectory:
         """The poses of the odometry alone."""
-        return Trajectory(self.stamps, self._table()["T_odom_lidar"])
+        return Trajectory(self.stamps, self.table["T_odom_lidar"])
 
     def format_csv(self) -> str:
         """The content of scans.csv: a row per scan, empty where there is no number."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(COLUMNS)
-        rows = zip(self._table(), self._degenerate, self.messages, strict=False)
+        rows = zip(self.table, self.degenerate, self.messages, strict=False)
         for index, (row, degenerate, message) in enumerate(rows):
             counts = (row["points"], row["points_dropped"], row["points_used"])
             fit = ("" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in ("residual_m", "inlier_ratio"))
@@ -182,15 +150,12 @@ class ScanLog(Stateful):
 
     def state(self) -> State:
         """All of it."""
-        return super().state() | {"rows": self._table()}
+        return super().state() | {"rows": self.table}
 
     def restore(self, saved: Saved) -> None:
         """Resume from a state, before the first scan."""
         super().restore(saved)
         rows = saved.value("rows")
-        if getattr(rows, "dtype", None) != _ROW or not rows.shape == (len(self.messages),) == (len(self._degenerate),):
+        if getattr(rows, "dtype", None) != _ROW or not rows.shape == (len(self.messages),) == (len(self.degenerate),):
             raise saved.unfit(f"{len(self.messages)} rows of the log", rows)
         self._rows = bytearray(rows.tobytes())
-
-    def _table(self) -> NDArray[np.void]:
-        return np.frombuffer(bytearray(self._rows), _ROW)  # a copy: a view would keep the buffer from growing

@@ -1,4 +1,4 @@
-"""Scale of the points' times, from how fast sensors turn within their sweeps and from scan to scan."""
+"""A run in numbers, and sentences about what is wrong with it: the content of summary.json."""
 
 import resource
 import sys
@@ -10,66 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.text import count
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.drawing import TiledMap
+from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES
-from lidarslam.run.elevation import Elevation, elevation_json
-from lidarslam.run.loop_closing import GraphOutcome, LoopReport
+from lidarslam.run.elevation import Elevation
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import SCANS_CSV
 from lidarslam.storage.finished_run import is_unconstrained
-
-# Slower turns, rad/s, and fewer scans decide nothing; between scans farther apart, a shaken sensor turns differently.
-_LEAST_RATE, _FEWEST, _MOST_INTERVAL_S = np.deg2rad(5.0), 15, 0.15
-# A share of the intervals by which they may differ.
-_EVEN = 0.5
-# Ratios with the right times: 0.99 to 1.19 on simulated and real recordings; with doubled ones 0.5 to 0.7.
-_RIGHT = (0.75, 1.4)
-
-
-def time_scale(
-    trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]
-) -> tuple[float, int] | None:
-    """Ratio of the turn rates within sweeps to those from scan to scan; one where the points' times are right.
-
-    Args:
-        trajectory: of N scans.
-        turn_rates: (N, 3) rad/s within each sweep, in the LiDAR frame; NaN where unknown.
-        is_tracked: (N,) whether the pose is right.
-
-    Returns:
-        It, and the number of scans that turned; None where too few did.
-    """
-    T, interval_s = trajectory.T_world_lidar, np.diff(trajectory.stamps)
-    if len(T) < _FEWEST or np.median(interval_s) > _MOST_INTERVAL_S:
-        return None
-    rates = log(inverse(T[:-1]) @ T[1:])[:, :3] / interval_s[:, None]
-    is_even = np.abs(interval_s / np.median(interval_s) - 1.0) < _EVEN
-    is_even &= is_tracked[:-1] & is_tracked[1:]
-    # A sweep may lie before or after its stamp.
-    around, within = 0.5 * (rates[:-1] + rates[1:]), turn_rates[1:-1]
-    turns = is_even[:-1] & is_even[1:] & np.isfinite(within).all(axis=1)
-    turns &= np.linalg.norm(around, axis=1) > _LEAST_RATE
-    if turns.sum() < _FEWEST:
-        return None
-    return float((within * around)[turns].sum() / (around[turns] ** 2).sum()), int(turns.sum())
-
-
-def time_scale_warning(found: tuple[float, int] | None) -> str | None:
-    """The error of the points' times by a ratio; None where it is near one, or unknown."""
-    if found is None or _RIGHT[0] < found[0] < _RIGHT[1]:
-        return None
-    ratio, scans = found
-    fault = "backwards" if ratio < 0.0 else "too long" if ratio < 1.0 else "too short"
-    return (
-        f"the points' times are {fault}, as it seems: within the sweeps of {scans} scans the sensor turns {ratio:.2f}"
-        " times as fast as from scan to scan; check reader.time_unit and reader.time_field, or correct them with"
-        f" --set reader.time_scale={'-1' if ratio < 0.0 else 'FACTOR'}"
-    )
 
 
 @dataclass(frozen=True)
@@ -127,11 +79,6 @@ class WrittenMap:
         }
 
 
-# An interval between scans is a gap when it exceeds the median by this many times and seconds.
-_GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
-_WALKING_MPS = 1.5
-
-
 @dataclass(frozen=True)
 class LostStretch:
     """Successive lost scans: indices, stamps, and the message of the first."""
@@ -144,26 +91,43 @@ class LostStretch:
 
 
 @dataclass(frozen=True)
-class GraphSummary:
-    """The pose graph of a run."""
+class LoopReport:
+    """A loop closure in the summary."""
 
-    # keyframes, edges: their numbers
+    closure: LoopClosure  # between keyframes
+    accepted: bool  # whether it is in the graph: an outlier of the optimisation is not
+    scans: tuple[int, int]  # indices in their recordings, the second the later one
+    recordings: tuple[int, int] | None = None  # which, from 1; None where there is one only
+
+    def to_json(self) -> dict[str, Any]:
+        """An entry of summary.json."""
+        closure, of = self.closure, self.recordings
+        outlier = closure.accepted and not self.accepted
+        return {
+            "first_scan": self.scans[0],
+            "second_scan": self.scans[1],
+            "accepted": self.accepted,
+            "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
+            "found_by": "given" if closure.given else "appearance" if closure.by_appearance else "nearby",
+            "overlap": round(closure.overlap, 4),
+            "residual_m": round(closure.residual_m, 4) if np.isfinite(closure.residual_m) else None,
+            "inlier_ratio": round(closure.inlier_ratio, 4),
+            "consistent": closure.consistent,
+            "distance_m": round(float(np.linalg.norm(closure.T_first_second[:3, 3])), 4),
+            "turn_deg": round(float(np.rad2deg(rotation_angle(closure.T_first_second))), 4),
+            **({} if of is None else {"first_recording": of[0], "second_recording": of[1]}),
+        }
+
+
+@dataclass(frozen=True)
+class GraphSummary:
+    """The optimised pose graph of a run."""
+
     keyframes: int
     edges: int
     loops: tuple[LoopReport, ...]  # accepted loop closures, and rejected candidates
-    largest_correction_m: float  # of a scan's position by the graph
-    ms_per_keyframe: Milliseconds | None  # on the thread of the graph; None when there was no keyframe
-
-    @classmethod
-    def of(cls, closed: GraphOutcome) -> "GraphSummary":
-        """Of an optimised graph."""
-        return cls(
-            keyframes=len(closed.keyframe_poses),
-            edges=len(closed.edges),
-            loops=closed.loops,
-            largest_correction_m=closed.largest_correction_m,
-            ms_per_keyframe=Milliseconds.of(closed.keyframe_ms) if closed.keyframe_ms else None,
-        )
+    largest_correction_m: float  # of a scan's position; a move into the frame of another run does not count
+    ms_per_keyframe: Milliseconds  # on the thread of the graph
 
     @property
     def closed(self) -> int:
@@ -225,26 +189,23 @@ class RunSummary:
 
     def to_json(self) -> dict[str, Any]:
         """The content of summary.json."""
+        elevation = dict.fromkeys(Elevation.__dataclass_fields__) if self.elevation is None else asdict(self.elevation)
         return {
-            "scans": self.scans,
-            "length_m": self.length_m,
-            "duration_s": self.duration_s,
-            "elapsed_s": self.elapsed_s,
-            "elapsed_ms_per_scan": self.elapsed_ms_per_scan,
+            **{name: getattr(self, name) for name in _NUMBERS},
             "latency_ms": vars(self.latency_ms),
             "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
             "slowest_scan": None if self.slowest is None else vars(self.slowest),
-            "realtime_factor": self.realtime_factor,
-            "peak_rss_mb": self.peak_rss_mb,
-            "lost_scans": self.lost_scans,
             "lost": [vars(stretch) for stretch in self.lost],
-            "degraded_scans": self.degraded_scans,
-            "unconstrained_m": self.unconstrained_m,
-            "odometry_asked": self.odometry_asked,
             "map_contradictions": [vars(found) for found in self.contradictions],
-            **elevation_json(self.elevation),
+            **elevation,
             **graph_and_map_json(self.graph, self.map, self.warnings),
         }
+
+
+_NUMBERS = (
+    *("scans", "length_m", "duration_s", "elapsed_s", "elapsed_ms_per_scan", "realtime_factor", "peak_rss_mb"),
+    *("lost_scans", "degraded_scans", "unconstrained_m", "odometry_asked"),
+)
 
 
 def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings: Sequence[str]) -> dict[str, Any]:
@@ -261,22 +222,13 @@ def summarise(
     log: ScanLog,
     written: WrittenMap,
     skipped: int,
-    closed: GraphOutcome | None = None,
+    graph: GraphSummary | None = None,
     contradictions: tuple[Contradiction, ...] = (),
     elevation: Elevation | None = None,
 ) -> RunSummary:
-    """Summarise a run.
-
-    Args:
-        log: its scans.
-        written: the map.
-        skipped: scans that were asked for and are missing without a warning in the log.
-        closed: the optimised pose graph, if there is one.
-        contradictions: where the map contradicts itself.
-        elevation: the error of the sensor's elevations.
-    """
-    trajectory, total_ms = log.trajectory, log.total_ms
-    stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
+    """Summarise a run, of which `skipped` scans are missing without a warning in the log."""
+    trajectory, total_ms, stage_ms = log.trajectory, log.table["total_ms"], log.table["stage_ms"]
+    stages = {"total": total_ms} | dict(zip(STAGES, stage_ms.T, strict=True))
     elapsed_s, unconstrained_m = float(total_ms.sum()) / 1e3, _unconstrained_m(log)
     return RunSummary(
         scans=len(log),
@@ -284,20 +236,25 @@ def summarise(
         duration_s=trajectory.duration_s,
         elapsed_s=elapsed_s,
         ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
-        latency_ms=Milliseconds.of(log.stage_ms.sum(axis=1)),
+        latency_ms=Milliseconds.of(stage_ms.sum(axis=1)),
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
         peak_rss_mb=peak_rss_mb(),
         lost=tuple(_lost_stretches(log)),
         degraded_scans=log.statuses.count(Status.DEGRADED),
         unconstrained_m=unconstrained_m,
-        odometry_asked=log.odometry_asked,
-        graph=None if closed is None else GraphSummary.of(closed),
+        odometry_asked=int(log.table["odometry_asked"].sum()),
+        graph=graph,
         map=written,
         warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m)),
         contradictions=contradictions,
-        slowest=SlowestScan.of(log.stage_ms),
+        slowest=SlowestScan.of(stage_ms),
         elevation=elevation,
     )
+
+
+# An interval between scans is a gap when it exceeds the median by this many times and seconds.
+_GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
+_WALKING_MPS = 1.5
 
 
 def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
@@ -339,10 +296,9 @@ def _warnings(
             f"{count(len(gaps), 'gap')} in the stamps, where scans are missing or a clock was set; the longest:"
             f" {steps[longest]:.1f} s after scan {longest}"
         )
-    if log.points_dropped:
-        share = log.points_dropped / max(1, len(log))
-        points = count(log.points_dropped, "invalid point")
-        yield f"{points} dropped (NaN, at the origin or out of range), {share:.0f} per scan"
+    if dropped := int(log.table["points_dropped"].sum()):
+        share = dropped / max(1, len(log))
+        yield f"{count(dropped, 'invalid point')} dropped (NaN, at the origin or out of range), {share:.0f} per scan"
     if degraded := log.statuses.count(Status.DEGRADED):
         yield f"tracking was degraded on {count(degraded, 'scan')}; {SCANS_CSV} gives the reasons"
     length_m = log.trajectory.length_m
@@ -352,7 +308,7 @@ def _warnings(
             " surface constrains, as in a featureless corridor or at a start amid people who walk along"
         )
     is_tracked = np.array([status is Status.OK for status in log.statuses])
-    if (wrong := time_scale_warning(time_scale(log.trajectory, log.turn_rates, is_tracked))) is not None:
+    if (wrong := time_scale_warning(time_scale(log.trajectory, log.table["turn_rate"], is_tracked))) is not None:
         yield wrong
     if contradictions:
         clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)
@@ -369,3 +325,47 @@ def peak_rss_mb() -> float:
     unit = 1.0 if sys.platform == "darwin" else 1024.0
     usages = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(usages) * unit / 2**20
+
+
+# Slower turns, rad/s, and fewer scans decide nothing; between scans farther apart, a shaken sensor turns differently.
+_LEAST_RATE, _FEWEST, _MOST_INTERVAL_S = np.deg2rad(5.0), 15, 0.15
+# A share of the intervals by which they may differ.
+_EVEN = 0.5
+# Ratios with the right times: 0.99 to 1.19 on simulated and real recordings; with doubled ones 0.5 to 0.7.
+_RIGHT = (0.75, 1.4)
+
+
+def time_scale(
+    trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]
+) -> tuple[float, int] | None:
+    """Ratio of the turn rates within sweeps to those from scan to scan; one where the points' times are right.
+
+    Of N scans, the turn rates (N, 3) rad/s within each sweep, in the LiDAR frame and NaN where unknown, and whether the
+    pose is right (N,). With the number of scans that turned; None where too few did.
+    """
+    T, interval_s = trajectory.T_world_lidar, np.diff(trajectory.stamps)
+    if len(T) < _FEWEST or np.median(interval_s) > _MOST_INTERVAL_S:
+        return None
+    rates = log(inverse(T[:-1]) @ T[1:])[:, :3] / interval_s[:, None]
+    is_even = np.abs(interval_s / np.median(interval_s) - 1.0) < _EVEN
+    is_even &= is_tracked[:-1] & is_tracked[1:]
+    # A sweep may lie before or after its stamp.
+    around, within = 0.5 * (rates[:-1] + rates[1:]), turn_rates[1:-1]
+    turns = is_even[:-1] & is_even[1:] & np.isfinite(within).all(axis=1)
+    turns &= np.linalg.norm(around, axis=1) > _LEAST_RATE
+    if turns.sum() < _FEWEST:
+        return None
+    return float((within * around)[turns].sum() / (around[turns] ** 2).sum()), int(turns.sum())
+
+
+def time_scale_warning(found: tuple[float, int] | None) -> str | None:
+    """The error of the points' times by a ratio; None where it is near one, or unknown."""
+    if found is None or _RIGHT[0] < found[0] < _RIGHT[1]:
+        return None
+    ratio, scans = found
+    fault = "backwards" if ratio < 0.0 else "too long" if ratio < 1.0 else "too short"
+    return (
+        f"the points' times are {fault}, as it seems: within the sweeps of {scans} scans the sensor turns {ratio:.2f}"
+        " times as fast as from scan to scan; check reader.time_unit and reader.time_field, or correct them with"
+        f" --set reader.time_scale={'-1' if ratio < 0.0 else 'FACTOR'}"
+    )

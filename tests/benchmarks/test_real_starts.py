@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from real_starts import DEFAULT_METHODS, METHODS, OPTIONS, Ended, Judged, judge, length_error, row, starts_of
 
-from lidarslam.commands.run import run
+from lidarslam.commands.runs import run
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.trajectory import Trajectory
 

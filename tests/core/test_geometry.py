@@ -69,9 +69,7 @@ def test_exp_is_rigid_and_composes(xi, other):
 @quick
 def test_conjugation_moves_the_tangent_vector_by_the_adjoint(xi, other):
     T = g.exp(other)
-    R, t = T[:3, :3], T[:3, 3]
-    moved = np.concatenate([R @ xi[:3], g.skew(t) @ R @ xi[:3] + R @ xi[3:]])
-    np.testing.assert_allclose(T @ g.exp(xi) @ g.inverse(T), g.exp(moved), atol=1e-10)
+    np.testing.assert_allclose(T @ g.exp(xi) @ g.inverse(T), g.exp(g.adjoint(T) @ xi), atol=1e-10)
 
 
 @given(tangents)
@@ -163,15 +161,6 @@ def test_what_is_no_motion_does_not_stop_anything(bad):
     with np.errstate(all="ignore"):
         assert g.exp(np.full(6, bad)).shape == (4, 4)
         assert g.log(np.full((4, 4), bad)).shape == (6,)
-
-
-def test_nothing_is_changed_in_place():
-    T = g.exp(turn(1.0))
-    T.setflags(write=False)
-    points = np.ones((3, 3))
-    points.setflags(write=False)
-    g.log(g.orthonormalize(g.interpolate(T, g.inverse(T), 0.5)))
-    g.transform_points(T, points)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Text of unknown origin cannot steer a terminal or leave a folder; hints can be typed."""
 
 import os
+import shutil
 import subprocess
 import sys
 import unicodedata
@@ -131,29 +132,14 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return programs
 
 
-def test_a_program_off_the_path_is_named_by_its_file(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert as_typed("lidarslam") == "./.venv/bin/lidarslam"
-    monkeypatch.chdir(environment)
-    assert as_typed("lidarslam") == "./lidarslam"
-    monkeypatch.chdir("/usr")
-    assert as_typed("lidarslam") == str(environment / "lidarslam")
-
-
-def test_a_program_on_the_path_is_named_by_its_name(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", str(environment))
-    assert as_typed("lidarslam") == "lidarslam"
-
-
-def test_another_program_of_the_name_on_the_path_is_not_meant(
+def test_a_program_is_named_by_its_file_where_the_shell_does_not_find_it(
     environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "lidarslam").write_text("#!/bin/sh\n")
-    (other / "lidarslam").chmod(0o755)
-    monkeypatch.setenv("PATH", str(other))
     assert as_typed("lidarslam") == "./.venv/bin/lidarslam"
-
-
-def test_a_program_that_is_not_beside_keeps_its_name(environment: Path) -> None:
-    assert as_typed("rerun") == "rerun"
+    assert as_typed("rerun") == "rerun", "it is not beside"
+    other = shutil.copytree(environment, tmp_path / "other")
+    for path, typed in ((environment, "lidarslam"), (other, "./.venv/bin/lidarslam")):
+        monkeypatch.setenv("PATH", str(path))
+        assert as_typed("lidarslam") == typed
+    monkeypatch.chdir("/usr")
+    assert as_typed("lidarslam") == str(environment / "lidarslam")

@@ -8,11 +8,16 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 
 
-def by_arrays(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
-    """The last comer of every slot; integers of 32 bits wrap around, as a hash may."""
+def slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
+    """Integers of 32 bits wrap around, as a hash may."""
     cells = np.floor(points.astype(np.float32) * np.float32(1.0 / cell_m)).astype(np.int32)
     slots = (cells * np.array([73_856_093, 19_349_669, 83_492_791], dtype=np.int32)).sum(axis=1, dtype=np.int32)
-    last = {int(slot) & ((1 << 20) - 1): n for n, slot in enumerate(slots)}
+    return np.asarray(slots & ((1 << 20) - 1), dtype=np.int32)
+
+
+def by_arrays(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
+    """The last comer of every slot."""
+    last = {int(slot): n for n, slot in enumerate(slots_of(points, cell_m))}
     return np.array(sorted(last.values()), dtype=np.intp)
 
 
@@ -32,25 +37,11 @@ def test_nearly_every_cell_keeps_one(rng: np.random.Generator) -> None:
     assert len(kept) > 0.98 * len(np.unique(cells, axis=0))
 
 
-def test_any_layout_of_points_will_do(rng: np.random.Generator) -> None:
-    points = rng.normal(0.0, 15.0, (1_000, 3))
-    np.testing.assert_array_equal(one_per_cell(np.asfortranarray(points), 0.5), one_per_cell(points, 0.5))
-    readonly = points.copy()
-    readonly.setflags(write=False)
-    np.testing.assert_array_equal(one_per_cell(readonly, 0.5), one_per_cell(points, 0.5))
-
-
 def test_what_is_no_place_does_no_harm() -> None:
     points = np.array([[np.nan, 0.0, 0.0], [np.inf, 1e300, -np.inf], [1e30, 1e30, 1e30], [5.0, 5.0, 5.0]])
     with np.errstate(over="ignore"):
         assert 3 in one_per_cell(points, 0.1)
-    assert len(one_per_cell(np.empty((0, 3)), 0.1)) == 0
-
-
-def slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
-    cells = np.floor(points.astype(np.float32) * np.float32(1.0 / cell_m)).astype(np.int32)
-    slots = (cells * np.array([73_856_093, 19_349_669, 83_492_791], dtype=np.int32)).sum(axis=1, dtype=np.int32)
-    return np.asarray(slots & ((1 << 20) - 1), dtype=np.int32)
+    assert len(one_per_cell(np.empty((0, 3)), 0.1)) == len(central_per_cell(np.empty((0, 3)), 0.1)) == 0
 
 
 def assert_central(points: FloatArray, cell_m: float) -> None:
@@ -80,7 +71,3 @@ def test_the_most_central_points_are_the_same_whichever_way_the_sensor_goes_roun
     assert len(np.intersect1d(forwards, backwards)) > 0.98 * len(forwards)  # a few cells at the border have two points
     last = len(points) - 1 - one_per_cell(points[::-1], 0.7)
     assert len(np.intersect1d(one_per_cell(points, 0.7), last)) < 0.1 * len(last)
-
-
-def test_there_is_nothing_central_in_nothing() -> None:
-    assert len(central_per_cell(np.empty((0, 3)), 0.1)) == 0

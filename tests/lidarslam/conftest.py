@@ -17,8 +17,10 @@ from lidarslam.compare.comparison import Counter, Narrator
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
+
+from ..conftest import write_recording
 
 
 class Files(dict[str, Any]):
@@ -116,13 +118,8 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture(scope="session")
 def small_recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
     """Six scans with ground truth, not to be written to."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
-    for index, scan in enumerate(room_scans[:6]):
-        np.save(folder / f"{index:06d}.npy", scan.points[::3])
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:6], fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
-    return folder
+    scans = [scan.select(np.arange(0, len(scan), 3)) for scan in room_scans[:6]]
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, room_truth)
 
 
 @pytest.fixture(scope="session")
@@ -143,10 +140,4 @@ def finished_run(tmp_path: Path, whole_run: Path) -> Path:
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
     """Five scans with ground truth, not to be written to."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
-    for index, scan in enumerate(room_scans[:5]):
-        np.save(folder / f"{index:06d}.npy", scan.points)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
-    return folder
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", room_scans[:5], room_truth)

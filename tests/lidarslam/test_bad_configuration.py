@@ -77,8 +77,7 @@ class Bomb:
         return os.system, (f"touch '{self.file}'",)
 
 
-@pytest.mark.parametrize("name", ["weights.pt", "weights.pth", "weights.safetensors"])
-@pytest.mark.parametrize("form", ["torch", 0, 2, 4])
+@pytest.mark.parametrize(("name", "form"), [("weights.pt", "torch"), ("weights.pth", 2), ("weights.safetensors", 4)])
 def test_a_pickle_is_never_loaded(tmp_path: Path, small_recording: Path, name: str, form: object) -> None:
     opened = tmp_path / "opened"
     if form == "torch":
@@ -139,9 +138,7 @@ def test_weights_that_do_not_fit(tmp_path: Path, small_recording: Path, small_we
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("start", "kept"), [(None, 0.5), (None, 0.001), (None, 0.0), (struct.pack("<Q", 2**62), 1.0), (b"\xff" * 8, 1.0)]
-)
+@pytest.mark.parametrize(("start", "kept"), [(None, 0.5), (None, 0.0), (struct.pack("<Q", 2**62), 1.0)])
 def test_weights_that_are_cut_off_or_lie_about_their_header(
     tmp_path: Path, small_recording: Path, start: bytes | None, kept: float
 ) -> None:
@@ -190,8 +187,9 @@ BAD_TRAJECTORIES = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_TRAJECTORIES)
-@pytest.mark.parametrize("role", ["prior", "reference"])
+@pytest.mark.parametrize(
+    ("name", "role"), [*((name, "prior") for name in BAD_TRAJECTORIES), ("NaN", "reference"), ("one pose", "reference")]
+)
 def test_a_trajectory_that_is_none(
     tmp_path: Path, small_recording: Path, finished_run: Path, name: str, role: str
 ) -> None:

@@ -25,7 +25,7 @@ from lidarslam.storage.directory import FILES, RunDirectory
 
 from ..conftest import lidarslam
 
-FAST = ("--odometry", "constant-velocity")
+FAST = ("--odometry", "constant-velocity", "--no-report")
 
 
 def shell(*arguments: object, **options: object) -> "subprocess.CompletedProcess[str]":
@@ -50,8 +50,16 @@ def files_no_longer_than(size: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, handler)
 
 
-@pytest.mark.parametrize("size", [0, 300, 1_200, 4_000, 100_000])
-@pytest.mark.parametrize("more", [(), ("--pcd",), ("--pose-graph",), ("--set", "global_map.most_points=2000")])
+@pytest.mark.parametrize(
+    ("size", "more"),
+    [
+        *((size, ()) for size in (0, 1_200, 4_000, 100_000)),
+        (300, ("--pose-graph",)),
+        (100_000, ("--pcd",)),
+        (4_000, ("--pose-graph",)),
+        (4_000, ("--set", "global_map.most_points=2000")),
+    ],
+)
 def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, more: Sequence[str]) -> None:
     """The map is 300 kB, the log of the scans 600 bytes, the configuration 3.6 kB."""
     out = tmp_path / "run"
@@ -99,7 +107,7 @@ def test_tiles_that_find_no_room_cost_no_other_result(
     assert not (out / "map" / "index.json").exists()
 
 
-@pytest.mark.parametrize("size", [0, 4_000, 100_000])
+@pytest.mark.parametrize("size", [4_000, 100_000])
 def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recording: Path, size: int) -> None:
     """Where the disk fills up as a run replaces an earlier one, before it has replaced anything or after."""
     out = tmp_path / "run"
@@ -110,7 +118,7 @@ def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recordi
     assert result.exit_code == 1
     is_mixed = before != {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
     assert is_mixed == (size == 100_000)
-    evaluated = lidarslam("evaluate", out)
+    evaluated = lidarslam("evaluate", out, "--no-report")
     if is_mixed:
         assert evaluated.exit_code == 1
         assert "this run did not finish" in evaluated.stderr
@@ -118,7 +126,7 @@ def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recordi
     else:
         assert evaluated.exit_code == 0
     assert lidarslam("run", small_recording, "--out", out, *FAST, "--start", 1, "--overwrite").exit_code == 0
-    assert lidarslam("evaluate", out).exit_code == 0
+    assert lidarslam("evaluate", out, "--no-report").exit_code == 0
     assert json.loads((out / "summary.json").read_text())["scans"] == 5
 
 
@@ -202,7 +210,6 @@ def test_a_folder_that_cannot_be_written(small_recording: Path, finished_run: Pa
 
 
 NAMES = [
-    "a b",
     "Größe 测试",
     "new\nline",
     "-x",
@@ -222,7 +229,7 @@ def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, m
     assert result.stdout.replace("\n", "").isprintable()
     assert {"summary.json", "map.ply", "config.yaml"} <= set(left_in(tmp_path / name))
     assert json.loads((tmp_path / name / "summary.json").read_text())["scans"] == 6
-    assert lidarslam("evaluate", f"./{name}").exit_code == 0
+    assert lidarslam("evaluate", f"./{name}", "--no-report").exit_code == 0
 
 
 def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_recording: Path) -> None:
@@ -261,7 +268,7 @@ def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
     elsewhere = [{"directory": name} for name in ("..", ".", "", "/", "../run", 3, None)]
     (out / "summary.json").write_text(json.dumps({"recordings": elsewhere}))
     again = shutil.copytree(small_recording, tmp_path / "again")
-    command = ("merge", small_recording, again, "--out", out, *FAST, "--overwrite")
+    command = ("merge", small_recording, again, "--out", out, "--odometry", "constant-velocity", "--overwrite")
     assert lidarslam(*command).exit_code in (0, 1)
     assert (out / "01_room").is_dir()
     assert {"config.yaml", "map.ply", "summary.json"} <= {path.name for path in tmp_path.iterdir()}
@@ -368,10 +375,9 @@ def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
     assert ended.stderr == "lidarslam: the current folder was removed; change to another\n"
 
 
-@pytest.mark.parametrize("limit_kb", [400_000, 1_000_000])
-def test_an_address_space_that_libraries_fill_is_refused(limit_kb: int) -> None:
+def test_an_address_space_that_libraries_fill_is_refused() -> None:
     """OpenBLAS would wait for memory without an end, deaf to SIGTERM."""
-    command = f"ulimit -v {limit_kb}; exec '{sys.executable}' -m lidarslam info nothing"
+    command = f"ulimit -v 1000000; exec '{sys.executable}' -m lidarslam info nothing"
     ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 1
     assert "the address space is limited to" in ended.stderr

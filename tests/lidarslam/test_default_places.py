@@ -15,7 +15,7 @@ from lidarslam.storage.unfinished import About, Unfinished
 from ..conftest import lidarslam
 
 TIME = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d"
-FAST = ("--odometry", "constant-velocity", "--stop", "3")
+FAST = ("--odometry", "constant-velocity", "--stop", "3", "--no-report")
 
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -50,7 +50,7 @@ def test_a_run_is_written_to_a_place_of_its_own_which_is_named_first_and_last(sm
     out = only("runs")
     assert re.fullmatch(f"room_{TIME}", out.name)
     assert ran.stderr == f"lidarslam: results go to {out}\n"
-    assert f"written to {out}; " in ran.stdout
+    assert f"written to {out}\n" in ran.stdout
     assert ran.stdout.endswith(f"next: lidarslam view {out}\n      lidarslam evaluate {out}\n")
     assert json.loads((out / "summary.json").read_text())["scans"] == 3
 

@@ -17,10 +17,12 @@ import lidarslam
 from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
+
+from ..conftest import write_recording
 
 SCANS = 20
 MODEL = replace(MEMS_IMU, T_lidar_imu=make_transform(exp([0.2, -0.1, 1.4, 0.0, 0.0, 0.0])[:3, :3], [0.05, 0.0, -0.1]))
@@ -44,17 +46,9 @@ def shaken(times: FloatArray) -> FloatArray:
 
 def record(folder: Path, room: Any, scans: int = SCANS, mounting: bool = True, step: int = 1) -> Path:
     """Sweeps of a shaken sensor with its IMU's samples and the truth."""
-    folder.mkdir()
-    stamps = 0.1 * step * np.arange(1, scans // step + 1)
-    few = replace(room, points=4000)
-    for index, stamp in enumerate(stamps):
-        scan = few.sweep(shaken, float(stamp))
-        table = np.empty(len(scan), dtype=[("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
-        table["x"], table["y"], table["z"] = scan.points.T
-        table["time"] = scan.time_offsets
-        np.save(folder / f"{index:06d}.npy", table)
-    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", Trajectory(stamps, shaken(stamps)))
+    stamps, few = 0.1 * step * np.arange(1, scans // step + 1), replace(room, points=4000)
+    sweeps = (few.sweep(shaken, float(stamp)) for stamp in stamps)
+    write_recording(folder, sweeps, Trajectory(stamps, shaken(stamps)), is_timed=True)
     imu = sample_imu(MODEL, shaken, 0.0, float(stamps[-1]) + 0.2, seed=5)
     rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])
     header = "T_lidar_imu: " + " ".join(map(str, MODEL.T_lidar_imu[:3].ravel()))

@@ -37,7 +37,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(tmp_path: Path, small_recording: Path) -> Callable[..., Result]:
     def run(*options: str) -> Result:
         command = ["run", str(small_recording), "--out", str(tmp_path / "run"), "--odometry", "constant-velocity"]
-        return CliRunner().invoke(main, [*command, *options])
+        return CliRunner().invoke(main, [*command, "--no-report", *options])
 
     return run
 
@@ -74,7 +74,7 @@ def test_the_second_and_third_wait_for_the_results(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     at_scan(monkeypatch, 4)
-    pressed_at(monkeypatch, "lidarslam.run.session.write_results", 2)
+    pressed_at(monkeypatch, "lidarslam.run.run.write_results", 2)
     result = run()
     assert result.exit_code == 1
     told = [record.message for record in caplog.records if WRITING in record.message]
@@ -101,7 +101,7 @@ def test_who_insists_abandons_the_results_and_can_resume(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_scan(monkeypatch, 4)
-    pressed_at(monkeypatch, "lidarslam.run.session.write_results", 3)
+    pressed_at(monkeypatch, "lidarslam.run.run.write_results", 3)
     result = run("--set", "checkpoints.every_scans=2")
     assert result.exit_code == 1
     assert "interrupted, no results were written; continue from the last checkpoint with --resume" in result.output
@@ -112,29 +112,27 @@ def test_who_insists_abandons_the_results_and_can_resume(
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 6
 
 
+@pytest.mark.parametrize(
+    ("scans", "options", "told"),
+    [
+        (4, ["--set", "checkpoints.every_scans=2"], "stopped after 4 scans: interrupted; continue with --resume"),
+        (1, [], "no checkpoint to continue from; --overwrite begins again"),
+    ],
+)
 def test_resuming_is_promised_where_there_is_a_checkpoint(
-    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, scans: int, options: list[str], told: str
 ) -> None:
-    at_scan(monkeypatch, 4)
-    result = run("--set", "checkpoints.every_scans=2")
-    assert "stopped after 4 scans: interrupted; continue with --resume" in result.output
-
-
-def test_resuming_is_not_promised_without_a_checkpoint(
-    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    at_scan(monkeypatch, 1)
-    result = run()
+    at_scan(monkeypatch, scans)
+    result = run(*options)
     assert result.exit_code == 1
-    assert "stopped after 1 scan: interrupted; " in result.output
-    assert "no checkpoint to continue from; --overwrite begins again" in result.output
-    assert "--resume" not in result.output
+    assert told in result.output
+    assert ("--resume" in result.output) == bool(options)
 
 
 def test_before_the_first_scan_nothing_is_kept(
     run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for place in ("lidarslam.run.session.open_odometry", "lidarslam.run.tracking.prefetch"):
+    for place in ("lidarslam.run.run.open_odometry", "lidarslam.run.run.prefetch"):
         with monkeypatch.context() as patch:
             pressed_at(patch, place, 1)
             result = run()

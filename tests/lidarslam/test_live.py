@@ -28,7 +28,7 @@ from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.live import bounded
 from lidarslam.live.messages import PosePublisher, serialize_transform
-from lidarslam.live.receiving import IncomingQueue, Received, find_imu, find_topic
+from lidarslam.live.receiving import IncomingQueue, PublishedTopic, Received, find_imu, find_topic
 from lidarslam.live.statistics import LiveStatistics, count_missing
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
@@ -38,6 +38,7 @@ from .conftest import scan_estimate
 LIDARSLAM = [sys.executable, "-m", "lidarslam"]
 PLAY = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "play_bag.py")]
 SCANS = 12
+CLOUD = "sensor_msgs/msg/PointCloud2"
 STORE = get_typestore(Stores.ROS2_JAZZY)
 # Neither other tests nor a robot on the network are met here.
 LOOPBACK = (
@@ -92,7 +93,7 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     """With constant velocity a run knows no more of a scan than a live one: the poses are the same, bit for bit."""
-    from lidarslam.live.dds import DdsNode, PublishedTopic
+    from lidarslam.live.dds import DdsNode
 
     method = ["--odometry", "constant-velocity", "--no-report", "--set", "mapping.budget_ms=1e6"]
     live, ran = tmp_path / "live", tmp_path / "ran"
@@ -138,12 +139,12 @@ def test_interrupted_it_writes_what_came(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     """The poses until then are those of the robot, whose static transforms were published before."""
-    from lidarslam.live.dds import DdsNode, PublishedTopic
+    from lidarslam.live.dds import DdsNode
 
     out, T_base_lidar = tmp_path / "live", make_transform(np.diag([-1.0, -1.0, 1.0]), [1.0, 0.0, 2.0])
     node = DdsNode(domain)
     static = node.publisher("/tf_static", TRANSFORMS_TYPE, is_kept=True)
-    static.publish(serialize_transform(0, "base_link", "velodyne", T_base_lidar))
+    static(serialize_transform(0, "base_link", "velodyne", T_base_lidar))
     odometry = node.subscribe(PublishedTopic("/lidarslam/odometry", "nav_msgs/msg/Odometry", True))
     options = ["--domain", str(domain), "--topic", "points", "--base-frame", "base_link", "-o", str(out)]
     lidarslam = started(*LIDARSLAM, "live", *options, "--odometry", "constant-velocity", "--rerun", "save")
@@ -183,7 +184,7 @@ def message_at(
     table["t"] = np.linspace(0.0, last_time, 200)
     stamp_ns = round(1e9 * stamp_s)
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    cloud = types["sensor_msgs/msg/PointCloud2"](
+    cloud = types[CLOUD](
         header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id),
         height=1,
         width=200,
@@ -194,11 +195,11 @@ def message_at(
         data=np.frombuffer(table.tobytes(), np.uint8),
         is_dense=True,
     )
-    return bytes(STORE.serialize_cdr(cloud, "sensor_msgs/msg/PointCloud2"))
+    return bytes(STORE.serialize_cdr(cloud, CLOUD))
 
 
 def test_point_times_are_inferred_from_the_first_cloud() -> None:
-    live = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(1000.5, "os"), NOW)
+    live = CloudDecoder(ReaderConfig(), CLOUD, Faults()).scan(message_at(1000.5, "os"), NOW)
     assert live is not None
     assert (live.stamp_ns, live.frame_id, live.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
     np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
@@ -206,7 +207,7 @@ def test_point_times_are_inferred_from_the_first_cloud() -> None:
 
 def test_point_times_and_elevations_are_corrected_as_set() -> None:
     raw, as_set = message_at(1000.5), ReaderConfig(time_scale=-0.5, elevation_correction_deg=0.2)
-    decoders = (CloudDecoder(config, "sensor_msgs/msg/PointCloud2", Faults()) for config in (ReaderConfig(), as_set))
+    decoders = (CloudDecoder(config, CLOUD, Faults()) for config in (ReaderConfig(), as_set))
     as_sent, corrected = (decoder.scan(raw, NOW) for decoder in decoders)
     assert as_sent is not None
     assert corrected is not None
@@ -219,7 +220,7 @@ def test_clouds_are_turned_as_set() -> None:
     scans = []
     for axes, mounting in (((0, 1, 2), "upright"), ((1, 2, 0), (90.0, 0.0, 90.0))):
         config = ReaderConfig.model_validate({"mounting": mounting})
-        live = CloudDecoder(config, "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(100.0, axes=axes), NOW)
+        live = CloudDecoder(config, CLOUD, Faults()).scan(message_at(100.0, axes=axes), NOW)
         assert live is not None
         scans.append(live.scan)
     np.testing.assert_array_equal(scans[1].points, scans[0].points)
@@ -228,7 +229,7 @@ def test_clouds_are_turned_as_set() -> None:
 
 def test_a_time_field_without_times_is_a_warning() -> None:
     faults = Faults()
-    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
     for number in range(12):
         live = decoder.scan(message_at(1000.0 + 0.1 * number, last_time=0.0), NOW)
         assert live is not None
@@ -238,7 +239,7 @@ def test_a_time_field_without_times_is_a_warning() -> None:
 
 def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() -> None:
     faults = Faults()
-    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
     messages = [message_at(100.0), message_at(99.0), message_at(100.1, "rear"), message_at(100.2)[:200], b"\0\1"]
     scans = [decoder.scan(raw, NOW) for raw in [*messages, message_at(100.3)]]
     assert [scan is not None for scan in scans] == [True, False, False, False, False, True]
@@ -250,7 +251,7 @@ def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() 
 def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few() -> None:
     """Clouds are published every tenth of a second, and after a pause of ten seconds."""
     faults = Faults()
-    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
     published = [*np.arange(0.0, 0.5, 0.1), *np.arange(10.5, 12.0, 0.1)]
     stamps = [100.0 + time_s for time_s in published]
     stamps[2] = 2e9
@@ -266,14 +267,14 @@ def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few() -> None:
 @pytest.mark.parametrize("ahead_s", [0.0, 37.0])
 def test_a_stray_stamp_at_the_very_beginning_costs_one_scan(ahead_s: float) -> None:
     """Also where the sensor's clock is ahead, as that of TAI; there the first scan decides nothing by itself."""
-    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults())
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, Faults())
     stamps = [2.1e9, *(NOW / 1e9 + ahead_s + 0.1 * number for number in range(1, 5))]
     scans = [decoder.scan(message_at(stamp), NOW + number * 10**8) for number, stamp in enumerate(stamps)]
     assert [scan is not None for scan in scans] == [False, ahead_s == 0.0, True, True, True]
 
 
 def test_headers_without_stamps_have_the_time_of_publication() -> None:
-    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults())
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, Faults())
     scans = [decoder.scan(message_at(0.0), published_ns) for published_ns in (10**18, 10**18 + 10**8)]
     assert [scan.stamp_ns for scan in scans if scan is not None] == [10**18, 10**18 + 10**8]
 
@@ -323,22 +324,19 @@ def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock() -> None
     assert "3 scans dropped" in other.counts(dropped=3).warnings()[0]
 
 
-class Topic:
-    """A topic that is published."""
-
-    def __init__(self, name: str, message_type: str = "sensor_msgs/msg/PointCloud2") -> None:
-        self.name, self.message_type = name, message_type
+def topic_of(name: str, message_type: str = CLOUD) -> PublishedTopic:
+    return PublishedTopic(name, message_type)
 
 
 def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lidarslam.live.receiving._SETTLED_S", 0.0)
-    clouds = Topic("/points")
-    seen = iter([[], [Topic("/scan", "sensor_msgs/msg/LaserScan")], [clouds]])
+    clouds = topic_of("/points")
+    seen = iter([[], [topic_of("/scan", "sensor_msgs/msg/LaserScan")], [clouds]])
     assert find_topic(lambda: next(seen, [clouds]), None, 0) is clouds
     with pytest.raises(InputError, match="clouds are published on /a, /b; choose one with --topic"):
-        find_topic(lambda: [Topic("/a"), Topic("/b")], None, 0)
+        find_topic(lambda: [topic_of("/a"), topic_of("/b")], None, 0)
     with pytest.raises(InputError, match="/scan: holds sensor_msgs/msg/LaserScan"):
-        find_topic(lambda: [Topic("/scan", "sensor_msgs/msg/LaserScan")], "/scan", 0)
+        find_topic(lambda: [topic_of("/scan", "sensor_msgs/msg/LaserScan")], "/scan", 0)
 
 
 def test_it_waits_no_longer_than_it_is_told() -> None:
@@ -416,21 +414,25 @@ def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:
 
 def play(bag: Path, domain: int) -> None:
     """Publish all topics of a bag at the times at which they were recorded, once somebody takes its clouds."""
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsSubscription
+    from cyclonedds.domain import DomainParticipant
+
     from lidarslam.live.dds import DdsNode
 
     node = DdsNode(domain)
+    subscribed = BuiltinDataReader(DomainParticipant(domain), BuiltinTopicDcpsSubscription)
     with AnyReader([bag]) as reader:
         publishers = {
             connection.topic: node.publisher(connection.topic, connection.msgtype, connection.topic == "/tf_static")
             for connection in reader.connections
         }
         messages = [(connection.topic, time_ns, bytes(raw)) for connection, time_ns, raw in reader.messages()]
-    while not publishers["/velodyne_points"]._writer.get_matched_subscriptions():
+    while "rt/velodyne_points" not in [one.topic_name for one in subscribed.read(1000)]:
         time.sleep(0.05)
     begin, first_ns = time.monotonic() + 0.5, messages[0][1]
     for topic, time_ns, raw in messages:
         time.sleep(max(0.0, begin + (time_ns - first_ns) / 1e9 - time.monotonic()))
-        publishers[topic].publish(raw)
+        publishers[topic](raw)
 
 
 def test_an_imu_beside_the_clouds_takes_part(
@@ -458,10 +460,10 @@ def test_an_imu_beside_the_clouds_takes_part(
 
 
 def test_the_only_imu_is_chosen() -> None:
-    kind, other = "sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"
+    kind, other = "sensor_msgs/msg/Imu", CLOUD
 
-    def topics(*names: str) -> Callable[[], list[Topic]]:
-        return lambda: [Topic("/points", other), *(Topic(name, kind) for name in names)]
+    def topics(*names: str) -> Callable[[], list[PublishedTopic]]:
+        return lambda: [topic_of("/points", other), *(topic_of(name, kind) for name in names)]
 
     assert find_imu(topics("/imu"), None).name == "/imu"
     assert find_imu(topics("/a/imu", "/b/imu"), "b/imu").name == "/b/imu"

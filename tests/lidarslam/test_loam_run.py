@@ -12,28 +12,20 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.mapping.loam.features import find_features
 
+from ..conftest import write_recording
+
 SCANS = 8
-FIELDS = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8"), ("ring", "u2")])
 
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[[FloatArray], FloatArray]) -> Path:
     """Sweeps of a scanner with rings."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
     stamps = 0.1 * np.arange(1, SCANS + 1)
-    for index, stamp in enumerate(stamps):
-        scan = room.ring_sweep(drive, float(stamp))
-        table = np.empty(len(scan), dtype=FIELDS)
-        table["x"], table["y"], table["z"] = scan.points.T
-        table["time"], table["ring"] = scan.time_offsets, scan.rings
-        np.save(folder / f"{index:06d}.npy", table)
-    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", Trajectory(stamps, drive(stamps)))
-    return folder
+    scans, truth = (room.ring_sweep(drive, float(stamp)) for stamp in stamps), Trajectory(stamps, drive(stamps))
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, truth, is_timed=True)
 
 
 def lidarslam(*arguments: object) -> str:

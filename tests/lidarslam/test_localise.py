@@ -14,6 +14,8 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.finished_run import load_run
 
+from ..conftest import write_recording
+
 Drive = Callable[[FloatArray], FloatArray]
 SCANS, FIRST = 34, 8
 WITHOUT_ODOMETRY = ["--odometry", "constant-velocity"]
@@ -21,16 +23,8 @@ WITHOUT_ODOMETRY = ["--odometry", "constant-velocity"]
 
 def record(folder: Path, room: Any, drive: Drive) -> Path:
     """Scans as .npy files, with times and stamps."""
-    folder.mkdir()
-    stamps = 0.1 * np.arange(1, SCANS + 1)
-    for index, stamp in enumerate(stamps):
-        scan = room.sweep(drive, float(stamp))
-        rows = np.empty(len(scan.points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8")])
-        rows["x"], rows["y"], rows["z"] = scan.points.T
-        rows["time"] = scan.time_offsets
-        np.save(folder / f"{index:06d}.npy", rows)
-    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
-    return folder
+    scans = (room.sweep(drive, 0.1 * number) for number in range(1, SCANS + 1))
+    return write_recording(folder, scans, is_timed=True)
 
 
 def call(*words: str | Path) -> Result:

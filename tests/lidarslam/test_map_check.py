@@ -16,16 +16,13 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
 
+from ..conftest import write_recording
+
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) -> Path:
     """Twenty scans of a room, compensated."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
-    for index, scan in enumerate(room_scans):
-        np.save(folder / f"{index:06d}.npy", scan.points)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps, fmt="%.9f")
-    return folder
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", room_scans)
 
 
 def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str) -> tuple[Result, dict[str, Any]]:

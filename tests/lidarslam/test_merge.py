@@ -20,12 +20,12 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import read_tum, write_tum
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeRequest
 from lidarslam.merge.writing import MergeOutcome, format_merge
 from lidarslam.pipeline.estimates import ScanEstimate
-from lidarslam.run.tracking import Progress
+from lidarslam.run.run import Progress
 from lidarslam.simulation.motion import Motion, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
@@ -33,6 +33,8 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 from lidarslam.storage.directory import FILES
 from lidarslam.storage.finished_run import load_map, load_run
+
+from ..conftest import write_recording
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 
@@ -205,17 +207,9 @@ MAPPED = ("odometry.method=constant-velocity", "checkpoints.every_scans=1")
 
 
 @pytest.fixture
-def rooms(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> list[Path]:
+def rooms(tmp_path: Path, room_scans: list[Scan]) -> list[Path]:
     """Three short recordings."""
-    folders = []
-    for number in range(3):
-        folder = tmp_path / f"in room {number}"
-        folder.mkdir()
-        for index, scan in enumerate(room_scans[:5]):
-            np.save(folder / f"{index:06d}.npy", scan.points)
-        np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
-        folders.append(folder)
-    return folders
+    return [write_recording(tmp_path / f"in room {number}", room_scans[:5]) for number in range(3)]
 
 
 def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_path: Path) -> None:

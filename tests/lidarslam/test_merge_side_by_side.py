@@ -21,7 +21,7 @@ from lidarslam.merge import parts as tracking
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeRequest
 from lidarslam.merge.writing import MergeOutcome
-from lidarslam.run.tracking import Progress
+from lidarslam.run.run import Progress
 
 pytest.importorskip("ray")
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lidarslam.commands.options import take_config
-from lidarslam.commands.run import run
+from lidarslam.commands.runs import run
 from lidarslam.compare.methods import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError

@@ -1,6 +1,7 @@
 """The interface for Python programs, on scans of known truth."""
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from lidarslam.core.trajectory import read_tum, write_tum
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.run.session import open_odometry
+from lidarslam.run.run import open_odometry
 from lidarslam.storage.finished_run import load_run
 
 # Nothing but NumPy and compiled loops, so that tests are fast.
@@ -117,16 +118,13 @@ def test_saved_runs_are_like_others(slam: Slam, tmp_path: Path, room_scans: list
     with pytest.raises(OutputError, match="replace it with --overwrite"):
         slam.save(out)
     slam.save(str(out), overwrite=True)
-    names = {
+    assert {path.name for path in out.iterdir()} >= {
         "config.yaml",
         "trajectory.tum",
-        "trajectory.kitti",
         "odometry.tum",
         "map.ply",
         "scans.csv",
-        "summary.json",
     }
-    assert {path.name for path in out.iterdir()} >= names
     run = load_run(out)
     np.testing.assert_allclose(run.trajectory.T_world_lidar, slam.trajectory().T_world_lidar, atol=1e-8)
     assert len(run.map_points) == len(slam.map())
@@ -310,14 +308,6 @@ def test_an_error_in_the_background_is_raised_once(slam: Slam, room_scans: list[
     assert len(slam.trajectory()) == 3
 
 
-def test_an_error_of_earlier_scans_in_the_background_is_raised_by_a_later_one(
-    slam: Slam, room_scans: list[Scan]
-) -> None:
-    slam._pipeline.map.thin = None  # type: ignore[assignment]
-    with pytest.raises(LidarSlamError, match="building the map failed: TypeError"):
-        register(slam, room_scans)
-
-
 def test_closed_is_closed(room_scans: list[Scan], tmp_path: Path) -> None:
     before = threading.active_count()
     with Slam(GRAPH) as slam:
@@ -361,29 +351,20 @@ def test_a_wrong_configuration_is_refused(settings: Any, told: str) -> None:
         Slam(settings)
 
 
-@pytest.fixture
-def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    folder = tmp_path / "room"
-    folder.mkdir()
-    for index, scan in enumerate(room_scans):
-        np.save(folder / f"{index:06d}.npy", scan.points)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps, fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
-    return folder
-
-
-def test_a_recording_is_a_sequence_of_scans(recording: Path, room_scans: list[Scan], room_truth: Trajectory) -> None:
-    opened = lidarslam.open(recording, stop=5)
-    assert len(opened) == 5
+def test_a_recording_is_a_sequence_of_scans(
+    recording: Path, tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    recording = shutil.copytree(recording, tmp_path / "room")
+    opened = lidarslam.open(recording, stop=4)
+    assert len(opened) == len(list(opened)) == 4
     for scan, written in zip(opened, room_scans, strict=False):
         np.testing.assert_allclose(scan.points, written.points)
         assert scan.stamp == pytest.approx(written.stamp)
-    assert len(list(opened)) == 5
     assert opened.name == "room"
     assert opened.ground_truth is not None
     np.testing.assert_allclose(opened.ground_truth.T_world_lidar, room_truth.T_world_lidar, atol=1e-8)
     (recording / "000002.npy").write_bytes(b"")
-    assert len(list(opened)) == 4
+    assert len(list(opened)) == 3
     assert any("left out" in warning for warning in opened.warnings)
     with pytest.raises(InputError, match="no such file"):
         lidarslam.open(recording / "elsewhere")

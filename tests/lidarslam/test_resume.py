@@ -374,7 +374,7 @@ def test_a_run_may_be_killed_at_any_time(
         kill_and_resume(run, expected, source, tmp_path / str(number), kill_after_s=float(delay_s))
 
 
-@pytest.mark.parametrize("share", [0.1, 0.55, 0.8, 0.95])
+@pytest.mark.parametrize("share", [0.55, 0.95])
 def test_a_run_may_be_killed_while_it_writes(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, share: float
 ) -> None:

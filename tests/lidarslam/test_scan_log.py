@@ -59,11 +59,11 @@ def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps
 
 
 def test_the_numbers_of_all_scans(log: ScanLog) -> None:
-    assert (len(log), log.points_read, log.points_dropped) == (2, 200, 2)
+    assert (len(log), log.table["points"].sum(), log.table["points_dropped"].sum()) == (2, 200, 2)
     assert log.statuses == [Status.OK, Status.LOST]
     assert log.warnings == ["twice"]
     np.testing.assert_array_equal(log.stamps, [1.0, 2.5])
-    np.testing.assert_array_equal(log.total_ms, [10.0, 20.0])
+    np.testing.assert_array_equal(log.table["total_ms"], [10.0, 20.0])
     np.testing.assert_array_equal(log.odometry.T_world_lidar[1], exp(np.full(6, 0.5)))
     log.correct(np.tile(np.eye(4), (2, 1, 1)))
     np.testing.assert_array_equal(log.trajectory.positions, np.zeros((2, 3)))

@@ -21,6 +21,8 @@ from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.train.settings import TrainConfig
 
+from ..conftest import write_recording
+
 
 def settings_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     for name, field in model.model_fields.items():
@@ -49,6 +51,11 @@ BESIDE = {
 VECTORS = ("odometry.imu_rotation_deg", "odometry.imu_position_m", "reader.mounting")
 # At one of their bounds no point of this recording is left for the map.
 MAY_EMPTY = ("global_map.max_range_m", "global_map.min_hits")
+
+
+def test_there_are_few_settings_and_each_is_described() -> None:
+    assert len(SETTINGS) <= 60
+    assert [name for name, field in SETTINGS.items() if not field.description] == []
 
 
 @pytest.mark.parametrize("name", NUMBERS)
@@ -94,18 +101,10 @@ def needed(name: str, bound: float) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    """Eight sweeps of 3 000 points, with their times and the truth."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    folder.mkdir()
-    for number, scan in enumerate(room_scans[:8]):
-        assert scan.time_offsets is not None
-        table = np.zeros(3000, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8")])
-        table["x"], table["y"], table["z"] = scan.points[::3].T
-        table["time"] = scan.time_offsets[::3]
-        np.save(folder / f"{number}.npy", table)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:8], fmt="%.9f")
-    return folder
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) -> Path:
+    """Eight sweeps of 3 000 points, with their times."""
+    scans = [scan.select(np.arange(0, 9000, 3)) for scan in room_scans[:8]]
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, is_timed=True)
 
 
 @pytest.mark.slow

@@ -18,9 +18,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.intake import choose_scans, take_in
+from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import make_localiser
@@ -63,8 +62,7 @@ def execute_peer(
     with an odometry of ours. A damaged recording ends both at the same scan. `progress` is called after every scan that
     the peer has registered, with its number from 1 and the total; `range_m` is as of `estimate`.
     """
-    recording = open_recording(request.source, request.config.reader)
-    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
+    recording, chosen = request.open()
     errors: list[InputError] = []
     scans = _until_damaged(take_in(recording, chosen, Faults()), errors)
     samples = recording.imu if peer.needs_imu else None
