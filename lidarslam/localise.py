@@ -81,29 +81,19 @@ _REVOKED = "a place was found here, but later scans did not confirm it"
 class Localisation:
     """When and how a recording was found; scans are numbered from 0."""
 
-    refused: tuple[tuple[int, str], ...]  # scan and reason of every search without a place
-    found: int | None = None  # the scan that was found first; None: never
-    confirmed: int | None = None  # the scan that confirmed it
-    after_s: float | None = None  # time from the first scan to that
-    inlier_ratio: float | None = None  # mean of the scans that it was found with
-    tracked: int = 0  # scans that were registered to the map
-    placed_afterwards: int = 0  # scans before the first place that follow from it
+    searches_refused: tuple[tuple[int, str], ...]  # scan and reason of every search without a place
+    found_scan: int | None = None  # the scan that was found first; None: never
+    confirmed_scan: int | None = None  # the scan that confirmed it
+    confirmed_after_s: float | None = None  # time from the first scan to that
+    found_inlier_ratio: float | None = None  # mean of the scans that it was found with
     times_found: int = 0  # more than once where it was lost in between
+    tracked_scans: int = 0  # scans that were registered to the map
+    placed_afterwards: int = 0  # scans before the first place that follow from it
 
     def to_json(self) -> dict[str, Any]:
         """The section of summary.json, without the map."""
-        refused = [{"scan": scan, "reason": reason} for scan, reason in self.refused]
-        return {
-            "found": self.found is not None,
-            "found_scan": self.found,
-            "confirmed_scan": self.confirmed,
-            "confirmed_after_s": self.after_s,
-            "found_inlier_ratio": self.inlier_ratio,
-            "times_found": self.times_found,
-            "tracked_scans": self.tracked,
-            "placed_afterwards": self.placed_afterwards,
-            "searches_refused": refused,
-        }
+        refused = [{"scan": scan, "reason": reason} for scan, reason in self.searches_refused]
+        return {"found": self.found_scan is not None, **vars(self), "searches_refused": refused}
 
 
 @dataclass(frozen=True)
@@ -150,7 +140,7 @@ def _write(
     _correct(log, localiser)
     found = _localisation(log, localiser)
     section = {"localisation": {"map": described["map"], **found.to_json()}}
-    if found.found is not None:
+    if found.found_scan is not None:
         run = session.finish(replace(tracked, global_map=None), described)
         directory.write_json(files.SUMMARY, run.summary.to_json() | section)
         return LocaliseOutcome(run, found)
@@ -186,13 +176,13 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
     lost, afterwards = log.statuses.count(Status.LOST), len(localiser.placed_afterwards)
     return Localisation(
         refused,
-        found=first.scan,
-        confirmed=first.confirmed,
-        after_s=float(log.stamps[first.confirmed] - log.stamps[0]),
-        inlier_ratio=float(np.mean([fit.inlier_ratio or 0.0 for fit in first.fits])),
-        tracked=len(log) - lost - afterwards,
-        placed_afterwards=afterwards,
+        found_scan=first.scan,
+        confirmed_scan=first.confirmed,
+        confirmed_after_s=float(log.stamps[first.confirmed] - log.stamps[0]),
+        found_inlier_ratio=float(np.mean([fit.inlier_ratio or 0.0 for fit in first.fits])),
         times_found=len(localiser.found),
+        tracked_scans=len(log) - lost - afterwards,
+        placed_afterwards=afterwards,
     )
 
 
@@ -204,9 +194,10 @@ def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> s
 def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     summary, found, out = outcome.run.summary, outcome.localisation, request.run.out
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
-    yield f"found at scan {found.found}, confirmed at scan {found.confirmed}, after {found.after_s:.1f} s"
+    confirmed = f"confirmed at scan {found.confirmed_scan}, after {found.confirmed_after_s:.1f} s"
+    yield f"found at scan {found.found_scan}, {confirmed}"
     before = f", {found.placed_afterwards:,} before that placed afterwards" if found.placed_afterwards else ""
-    yield f"{found.tracked:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
+    yield f"{found.tracked_scans:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
     yield from format_times(summary)
     yield from format_end(out, summary)
     yield f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}"
@@ -214,6 +205,6 @@ def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
 
 def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
     """A line about a recording that was not found."""
-    refused, scans = outcome.localisation.refused, count(outcome.run.summary.scans, "scan")
+    refused, scans = outcome.localisation.searches_refused, count(outcome.run.summary.scans, "scan")
     last = f"; the last search: {refused[-1][1]}" if refused else ""
     return f"{request.run.source}: not found in {request.map} with {scans}{last}; {SUMMARY} has all reasons"

@@ -267,7 +267,7 @@ def localise(
             request = LocaliseRequest(RunRequest(source, out, config, resumable=False, **options), map_path, guess)
             page = _page(serve, request.run.rerun)
             outcome = execute(request, progress, progress.phase, page)
-        if outcome.localisation.found is None:
+        if outcome.localisation.found_scan is None:
             note(format_not_found(request, outcome))
             ctx.exit(EXIT_MENDABLE)
         say(format_localisation(request, outcome))

@@ -71,23 +71,14 @@ def _require_plain(values: Any, any_number: bool, errors: str) -> None:
             elif isinstance(value, list):
                 inner += value
             elif isinstance(value, str):
-                _require_text(value, errors)
-            elif not any_number:
-                _require_number(value)
+                if "\0" in value:
+                    raise ValueError("a text has a NUL character")
+                value.encode(errors=errors)  # half of a surrogate pair raises a ValueError
+            elif isinstance(value, float) and not any_number and not math.isfinite(value):
+                raise ValueError("a number is not finite")
+            elif isinstance(value, int) and not any_number and abs(value) >= _LARGEST_INTEGER:
+                raise ValueError("an integer has more than 64 bits")
         if not inner:
             return
         level = inner
     raise ValueError("nested too deeply")
-
-
-def _require_text(value: str, errors: str) -> None:
-    if "\0" in value:
-        raise ValueError("a text has a NUL character")
-    value.encode(errors=errors)  # half of a surrogate pair raises a ValueError
-
-
-def _require_number(value: Any) -> None:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("a number is not finite")
-    if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
-        raise ValueError("an integer has more than 64 bits")

@@ -198,13 +198,6 @@ def test_two_are_not_at_work_on_one_run(tmp_path: Path) -> None:
         assert About.read(tmp_path) is not None
 
 
-def test_what_failed_before_it_began_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), claim(tmp_path, {}) as unfinished:
-        unfinished.begin(0)
-        raise RuntimeError
-    assert not list(tmp_path.iterdir())
-
-
 def test_results_that_are_not_whole_are_not_taken_for_such_by_a_failed_attempt_to_replace_them(tmp_path: Path) -> None:
     with claim(tmp_path, {}) as unfinished:
         unfinished.begin(0)
