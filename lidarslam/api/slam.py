@@ -71,7 +71,7 @@ class Slam:
         require_no_trajectory(self._config)
         with CompileAhead(parts_of(self._config)) as compiling:
             self._odometry = open_odometry(self._config, None)
-            compiling.wait_for_all(logger.info)
+            compiling.wait(logger.info)
         self._graph = begin_graph(self._config)
         self._log, self._faults = ScanLog(), Faults()
         self._imu = make_imu_stream(self._config, self._log.warn)

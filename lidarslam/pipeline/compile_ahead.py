@@ -8,7 +8,8 @@ need not; with the names of some, these in its own process.
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent import futures
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
@@ -193,19 +194,13 @@ class CompileAhead:
             process.kill()
         self._pool.shutdown()
 
-    def wait_for_first_scan(self, report: Callable[[str], None]) -> None:
-        """Wait for the loops that the first scan needs; `report` is called with a line about them."""
-        self._wait([part for part in self._parts if not PARTS[part].is_late], report)
-
-    def wait_for_all(self, report: Callable[[str], None]) -> None:
-        """Wait for the others too."""
-        self._wait(self._parts, report)
-
-    def _wait(self, parts: list[str], report: Callable[[str], None]) -> None:
+    def wait(self, report: Callable[[str], None], for_first_scan: bool = False) -> None:
+        """Wait for all loops, or those that the first scan needs; `report` is called with a line about them."""
+        parts = [part for part in self._parts if not (for_first_scan and PARTS[part].is_late)]
         pending = {self._done[part] for part in parts}
         while pending:
             report(f"compiling loops, once on this machine ({len(parts) - len(pending)} of {len(parts)})")
-            _, pending = wait(pending, return_when=FIRST_COMPLETED)
+            _, pending = futures.wait(pending, return_when=FIRST_COMPLETED)
 
     def _compile(self, part: str) -> None:
         command = [sys.executable, "-m", "lidarslam.pipeline.compile_ahead", part]
@@ -224,7 +219,7 @@ def main(parts: list[str]) -> None:
         PARTS[name].rehearse()
     if not parts:
         with CompileAhead(list(PARTS)) as compiling:
-            compiling.wait_for_all(print)
+            compiling.wait(print)
 
 
 if __name__ == "__main__":

@@ -198,8 +198,7 @@ class RunSession(Generic[R]):
     def wait_for_loops(self, for_first_scan: bool = False) -> None:
         """Wait until loops are compiled: all, or those that the first scan needs."""
         if self.compiling is not None:
-            wait = self.compiling.wait_for_first_scan if for_first_scan else self.compiling.wait_for_all
-            wait(self.phase)
+            self.compiling.wait(self.phase, for_first_scan)
 
     def end_scans(self) -> None:
         """From here on a request to end the run waits for the results."""
