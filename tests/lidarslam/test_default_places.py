@@ -77,6 +77,7 @@ def test_results_bear_the_name_of_the_recording(source: str, sequence: str | Non
     assert source_name(Path(source), sequence) == name
 
 
+@pytest.mark.slow  # four commands
 def test_the_other_commands_have_a_place_too(small_recording: Path) -> None:
     made = lidarslam("simulate", "--world", "hall", "--scans", 2, "--format", "ply")
     assert made.exit_code == 0
