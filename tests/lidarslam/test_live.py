@@ -406,7 +406,8 @@ def play(bag: Path, domain: int) -> None:
     from lidarslam.live.dds import DdsNode
 
     node = DdsNode(domain)
-    subscribed = BuiltinDataReader(DomainParticipant(domain), BuiltinTopicDcpsSubscription)
+    participant = DomainParticipant(domain)  # held, as the library deletes objects without a reference
+    subscribed = BuiltinDataReader(participant, BuiltinTopicDcpsSubscription)
     with AnyReader([bag]) as reader:
         publishers = {
             connection.topic: node.publisher(connection.topic, connection.msgtype, connection.topic == "/tf_static")
