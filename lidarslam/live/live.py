@@ -39,7 +39,6 @@ class LiveOutcome:
     """The outcome of a live run."""
 
     run: RunOutcome  # as of a recording
-    topic: str
     counts: LiveCounts  # of the scans
     is_interrupted: bool  # whether Ctrl-C ended it
 
@@ -94,7 +93,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
         described: dict[str, Any] = {"version": version("lidarslam"), "source": None, "topic": topic.name}
         described |= {"domain": request.domain, "base_frame": request.base_frame}
         outcome = session.finish(tracked, described)
-    return LiveOutcome(outcome, topic.name, counts, is_interrupted)
+    return LiveOutcome(outcome, counts, is_interrupted)
 
 
 def _warm_up(config: Config) -> None:

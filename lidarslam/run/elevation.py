@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,12 +59,6 @@ class Elevation:
             f" {self.elevation_correction_deg:g} are corrected: try --set"
             f" reader.elevation_correction_deg={self.elevation_bias_deg:.2f}"
         )
-
-
-def elevation_json(elevation: Elevation | None) -> dict[str, Any]:
-    """Its keys of summary.json."""
-    names = Elevation.__dataclass_fields__
-    return dict.fromkeys(names) if elevation is None else asdict(elevation)
 
 
 def with_elevations(
