@@ -15,7 +15,6 @@ from lidarslam.core.plugins import PlugPoint
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
     from lidarslam.core.tasks import Where
-    from lidarslam.evaluation.comparison.gates import Gate
 
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
@@ -259,7 +258,7 @@ def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: 
 def gate_options(with_method: bool) -> _Decorator:
     """The options `--max` and `--min`, in a comparison also of one method; their values are `maxima` and `minima`."""
 
-    def parse(_ctx: click.Context, param: click.Parameter, bounds: tuple[str, ...]) -> tuple["Gate", ...]:
+    def parse(_ctx: click.Context, param: click.Parameter, bounds: tuple[str, ...]) -> tuple[Any, ...]:
         from lidarslam.evaluation.comparison.gates import parse_gate
 
         kind: Literal["max", "min"] = "max" if param.name == "maxima" else "min"
