@@ -98,6 +98,7 @@ class ScanEstimate:
     T_odom_lidar: Annotated[FloatArray, TRANSFORM]  # the odometry alone; where it measured nothing, a prediction
     is_odometry_asked: bool  # whether the odometry was asked for the motion
     motion: SweepMotion  # of the sensor during the sweep
+    first_velocity: Annotated[FloatArray, Shape(6)] | None = None  # of the first scan, as the second one shows it
     belongs_in_map: bool  # whether the pose is accurate enough to add the scan to the map
     is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
     gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not

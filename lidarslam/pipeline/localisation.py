@@ -165,6 +165,7 @@ class ScanToMap(Stateful):
             T_odom_lidar=self._T_odom_lidar,
             covariance=mapped.state.covariance[:6, :6] if mapped.registered else None,
             motion=SweepMotion(mapped.state.velocity, mapped.state.velocity),
+            first_velocity=mapped.first_velocity,
             status=mapped.status,
             message=mapped.message,
             belongs_in_map=mapped.added,

@@ -8,6 +8,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
 from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.consistency import ConsistencyCheck
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
@@ -72,17 +73,23 @@ class MapBuilder(Stateful):
         self._pending = (thinned, estimate) if estimate.belongs_in_map else None
         self._scans += 1
 
-    def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray, float, PointAttributes] | None:
+    def add_pending(
+        self, following: ScanEstimate | None
+    ) -> tuple[FloatArray, FloatArray, float, PointAttributes] | None:
         """Add the scan before; its points (N, 3), pose, voxel size and attributes as added, None where there is none.
 
-        Where tracking was lost right after it, the motion after its stamp is unknown: it is deskewed again with the
-        motion before.
+        It is deskewed again where the following scan shows another motion: where tracking was lost there, the motion
+        after its stamp is unknown, and only that before it counts; the first scan's is known by the second.
         """
         pending, self._pending = self._pending, None
         if pending is None or self.voxel_size_m is None:  # no scan had a point so far
             return None
         thinned, estimate = pending
-        points = SweepMotion(estimate.motion.before, None).compensate(thinned) if next_is_lost else estimate.points
+        points = estimate.points
+        if following is not None and following.status is Status.LOST:
+            points = SweepMotion(estimate.motion.before, None).compensate(thinned)
+        elif following is not None and following.first_velocity is not None:
+            points = SweepMotion(following.first_velocity, None).compensate(thinned)
         if self.global_map is None:
             self.global_map = self._new_map(self.voxel_size_m)
         number, attributes = self._scans - 1, thinned.attributes(self._config.fields)

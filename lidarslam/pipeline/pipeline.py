@@ -18,7 +18,6 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
-from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
@@ -199,7 +198,7 @@ class Pipeline(Stateful):
         thinned = self.map.thin(odometry.scan)
         estimate = replace(estimate, points=estimate.motion.compensate(thinned))
         deskew_ms, started = _ms_since(started), time.perf_counter()
-        self._add_pending(next_is_lost=estimate.status is Status.LOST)
+        self._add_pending(estimate)
         self.map.add(thinned, estimate)
         if self._graph is not None:
             arrived = graph_scan(odometry, estimate)
@@ -209,9 +208,9 @@ class Pipeline(Stateful):
                 self._correction.add(drawing)
         return replace(estimate, stage_ms=estimate.stage_ms | {"deskew": deskew_ms, "map": _ms_since(started)})
 
-    def _add_pending(self, next_is_lost: bool = False) -> None:
+    def _add_pending(self, following: ScanEstimate | None = None) -> None:
         """Add the last scan to the map, unless it is in it already."""
-        added = self.map.add_pending(next_is_lost)
+        added = self.map.add_pending(following)
         if added is not None and self._graph is not None:
             self._graph_worker.submit(self._graph.draw, *added)
 

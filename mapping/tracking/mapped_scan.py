@@ -32,6 +32,8 @@ class MappedScan:
     # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
     is_connected: bool = True
     turn_rate: FloatArray | None = None  # (3,) rad/s within the sweep, in the LiDAR frame; None without point times
+    # (6,) body velocity of the first scan as the second shows it, in the result of the second; None in all others
+    first_velocity: FloatArray | None = None
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU
 
     @classmethod

@@ -186,7 +186,7 @@ class Mapper(Stateful):
             local_map = self._new_map(first, last)
             self._tracker.rewind(before)
             mapped = self._track(scan, prior, last, local_map)
-        return mapped
+        return replace(mapped, first_velocity=last.velocity)
 
     def _lose(
         self, scan: SampledScan, prediction: Prediction, local_map: LocalMap, fit: Fit | None, reason: str

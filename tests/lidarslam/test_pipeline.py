@@ -9,21 +9,30 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from scipy.spatial import cKDTree
 
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.pose_graph.keyframes import GraphScan
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
-from lidarslam.pipeline.localisation import OdometryAlone
+from lidarslam.pipeline.localisation import OdometryAlone, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import EVERY_SCANS
+from lidarslam.simulation.motion import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 
 
 def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:
@@ -194,6 +203,27 @@ def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: 
     for result, T_room_lidar in zip(results[:-1], truth.T_world_lidar, strict=False):
         assert room.distance_to_surface(transform_points(T_room_lidar, result.points)).max() < 1e-6
     assert all(result.status is Status.OK for result in results)
+
+
+def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows() -> None:
+    """A car at speed, without an odometry: nothing is known of the first sweep's motion until the second."""
+    world = build_world("street", 0)
+    motion = motion_along_route("car-fast", world, 0)
+    mount = mount_pose("upright", motion.sensor_height_m)
+    simulation = Simulation(world, find_sensor("vlp-16"), motion, mount, scan_count=2)
+    first, second = simulation.scans()
+    config = Config.model_validate({"odometry": {"method": "constant-velocity"}})
+    pipeline = Pipeline(make_odometry(config.odometry), make_localiser(config), GlobalMapConfig(voxel_size_m=0.2))
+    results = list(pipeline.run([first, second]))
+    assert all(result.status is Status.OK for result in results)
+    T_map_lidar = simulation.ground_truth.at(np.array([first.stamp, second.stamp]), 0.2)
+    velocity = log(inverse(T_map_lidar[0]) @ T_map_lidar[1]) / (second.stamp - first.stamp)
+    assert np.linalg.norm(velocity[3:]) > 9.0
+    assert first.time_offsets is not None
+    true = move(first.points, first.time_offsets, velocity)
+    assert pipeline.map.global_map is not None
+    distance, _ = cKDTree(pipeline.map.global_map.points()).query(true[np.linalg.norm(true, axis=1) < 30.0])
+    assert np.quantile(distance, 0.99) < 0.2, "a voxel; the sweep moves by a metre"
 
 
 def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive: Callable[..., FloatArray]) -> None:
