@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all lint check lowest audit release docs install clean
+.PHONY: demo test test-slow test-all lint check lowest audit release docs install clean
 
 demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
@@ -13,13 +13,15 @@ demo: $(VENV)/.base
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
 
 test: install
-	@echo "running the tests: about 20 minutes on two cores"
+	@echo "running the tests: about 6 minutes on two cores"
 	$(PYTEST)
 
-# The slow tests too, those on recordings where they are at hand.
-test-all: install
-	@echo "running all tests, the slow ones too"
-	$(PYTEST) -m "slow or not slow"
+# Those that take more than a few seconds, and those on recordings where they are at hand.
+test-slow: install
+	@echo "running the slow tests: SLOW_MINUTES on two cores"
+	$(PYTEST) -m slow
+
+test-all: test test-slow
 
 lint: install
 	$(BIN)/ruff check .

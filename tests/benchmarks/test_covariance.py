@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from covariance import nees_of_poses, nees_of_registration
-from odometry_accuracy import EXPECTED_SHARES, shares_within_sigmas
+from covariance import EXPECTED_SHARES, nees_of_poses, nees_of_registration, shares_within_sigmas
 
 from lidarslam.core.geometry import FloatArray, exp
 

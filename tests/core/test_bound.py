@@ -58,7 +58,9 @@ def test_who_is_killed_leaves_no_process_behind(
     code: str, killed_by: signal.Signals, still_runs: Callable[[int], bool]
 ) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", f"import os, sys, time\n{code}"]
+    # Under nohup, a hang-up would be ignored.
+    start = "import os, signal, sys, time; signal.signal(signal.SIGHUP, signal.SIG_DFL)"
+    command = [sys.executable, "-c", f"{start}\n{code}"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
     ) as parent:

@@ -99,6 +99,7 @@ def merged(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
     return out, merge(request(out, places["first"], places["foreign"], places["second"]), quiet)
 
 
+@pytest.mark.slow
 def test_all_that_find_one_another_are_in_the_frame_of_the_first(
     merged: tuple[Path, MergeOutcome], places: dict[str, Path]
 ) -> None:
@@ -119,6 +120,7 @@ def test_all_that_find_one_another_are_in_the_frame_of_the_first(
     assert np.linalg.norm(apart) < 0.05
 
 
+@pytest.mark.slow
 def test_the_common_map_holds_what_is_joined_and_nothing_else(
     merged: tuple[Path, MergeOutcome], places: dict[str, Path]
 ) -> None:
@@ -139,6 +141,7 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(
     assert np.median(both) < 0.06
 
 
+@pytest.mark.slow
 def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
     out, outcome = merged
     summary = json.loads((out / "summary.json").read_text())
@@ -168,12 +171,35 @@ def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcom
     assert "02_foreign: 12 scans" in text
 
 
+@pytest.mark.slow
+def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(
+    merged: tuple[Path, MergeOutcome], places: dict[str, Path], tmp_path: Path
+) -> None:
+    for place in places.values():
+        turned = tmp_path / place.name
+        turned.mkdir()
+        for path in sorted(place.glob("*.npy")):
+            table = np.load(path)
+            table["y"], table["z"] = -table["z"], table["y"].copy()
+            np.save(turned / path.name, table)
+        (turned / "timestamps.txt").write_bytes((place / "timestamps.txt").read_bytes())
+    sources = [tmp_path / name for name in ("first", "foreign", "second")]
+    outcome = merge(request(tmp_path / "merged", *sources, settings=("reader.mounting=left",)), quiet)
+    assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
+    for name in (".", "01_first", "02_foreign", "03_second"):
+        np.testing.assert_allclose(load_map(tmp_path / "merged" / name).points, load_map(merged[0] / name).points)
+        if name != ".":
+            poses, expected = (read_tum(out / name / "trajectory.tum") for out in (tmp_path / "merged", merged[0]))
+            np.testing.assert_allclose(poses.T_world_lidar, expected.T_world_lidar, atol=1e-6)
+
+
 def graph_keys(out: Path) -> tuple[list[int], int]:
     """Keys of the poses of a pose graph, and how many edges it has."""
     words = [line.split() for line in (out / "pose_graph.g2o").read_text().splitlines()]
     return [int(key) for tag, key, *_ in words if tag == "VERTEX_SE3:QUAT"], sum(w[0] == "EDGE_SE3:QUAT" for w in words)
 
 
+@pytest.mark.slow
 def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) -> None:
     out, _ = merged
     runs = [load_run(out / name) for name in ("01_first", "02_foreign", "03_second")]

@@ -125,6 +125,24 @@ def test_a_lap_is_closed_in_spite_of_drift(twice):
     assert all(submaps[c.second].way_m - submaps[c.first].way_m > 10.0 for c in found)
 
 
+def test_a_lap_is_closed_by_appearance_alone(twice, monkeypatch):
+    submaps, truth = twice
+    monkeypatch.setattr(KeyframeDatabase, "_nearby", lambda *_: iter(()))
+    found = accepted(detect(submaps, drifted(truth))[0])
+    assert len(found) >= detection._CONSISTENT + 1
+    assert_right(found, truth)
+    assert all(c.by_appearance and c.consistent >= detection._CONSISTENT for c in found)
+
+
+def test_closures_keep_their_distance(twice, monkeypatch):
+    submaps, truth = twice
+    monkeypatch.setattr(detection, "_SPACING_M", 7.0)
+    found = accepted(detect(submaps, drifted(truth))[0])
+    ways = np.array([submaps[c.second].way_m for c in found])
+    assert len(ways) >= 2
+    assert (np.diff(ways) >= 7.0).all()
+
+
 def test_nothing_is_closed_on_a_way_without_return(hall):
     truth = round_trip(0.45)
     closures, _ = detect(submaps_of(hall, truth), truth)
