@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow test-all lint check lowest audit release docs install clean
+.PHONY: demo test test-long test-all lint check lowest audit release docs install clean
 
 demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
@@ -16,12 +16,15 @@ test: install
 	@echo "running the tests: about 6 minutes on two cores"
 	$(PYTEST)
 
-# Those that take more than a few seconds, and those on recordings where they are at hand.
-test-slow: install
-	@echo "running the slow tests: SLOW_MINUTES on two cores"
-	$(PYTEST) -m slow
+# Those that take more than a few seconds.
+test-long: install
+	@echo "running the long tests: about 6 minutes on two cores"
+	$(PYTEST) -m "long and not slow"
 
-test-all: test test-slow
+# All of them, the slow ones on recordings where they are at hand.
+test-all: install
+	@echo "running all tests: about 40 minutes on two cores"
+	$(PYTEST) -m "slow or not slow"
 
 lint: install
 	$(BIN)/ruff check .
@@ -29,7 +32,7 @@ lint: install
 	$(BIN)/mypy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
-# Everything that continuous integration asks.
+# Before a commit; continuous integration runs the long tests, too.
 check: lint
 	$(PYTEST)
 

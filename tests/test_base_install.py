@@ -23,7 +23,7 @@ def base_install(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_command_but_training_and_export_does_without(base_install: dict[str, str], tmp_path: Path) -> None:
     commands = [
         "simulate --out office --world office --scans 6 --format ply",

@@ -41,7 +41,7 @@ def test_every_command_has_a_whole_summary_and_help_with_an_example() -> None:
         assert f"lidarslam {name}" in result.output.split("Example:")[-1], name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_run_exits_with_3_when_tracking_was_lost(recording: Path, tmp_path: Path) -> None:
     np.save(recording / "000003.npy", np.full((100, 3), np.nan))
     result = lidarslam("run", recording, "--out", tmp_path / "run", "--no-report")
@@ -186,7 +186,7 @@ def test_merge_exits_as_run_does(
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_view_writes_a_recording_and_pictures_also_coloured_by_error(recording: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 

@@ -9,7 +9,7 @@ import pytest
 NOTEBOOK = Path(__file__).parents[1] / "docs" / "notebooks" / "first_map.ipynb"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_first_map_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     # Its shell commands are those of this environment.

@@ -42,7 +42,7 @@ def test_the_citation_describes_the_project() -> None:
 
 def test_workflows_call_the_commands_of_the_makefile() -> None:
     commands = [step["run"] for workflow in WORKFLOWS for step in _steps(workflow) if "run" in step]
-    assert sorted(commands) == ["make lint", "make lowest", "make release", "make test"]
+    assert sorted(commands) == ["make lint", "make lowest", "make release", "make test", "make test-long"]
     assert {command.removeprefix("make ") for command in commands} <= TARGETS
     actions = [step["uses"] for workflow in WORKFLOWS for step in _steps(workflow) if "uses" in step]
     assert all(re.fullmatch(r"actions/[a-z-]+@v\d+", action) for action in actions)

@@ -67,7 +67,7 @@ def tasks(request: pytest.FixtureRequest) -> Iterator[Tasks]:
         yield opened
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_are_in_order_whoever_is_first(tasks: Tasks) -> None:
     done: list[tuple[int, float]] = []
     assert list(tasks.run(square, [0.0, 1.0, 2.0, 3.0, 4.0], lambda *one: done.append(one))) == SQUARES

@@ -120,7 +120,7 @@ def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(
     assert {path.name for path in (out / "room" / "prior").iterdir()} == {"process.json", "process.log"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_whatever_a_method_dies_of_is_its_row(
     recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
 ) -> None:
@@ -207,7 +207,7 @@ def test_without_any_reference_there_is_still_a_table(
     assert not outcome.is_empty
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tmp_path: Path, told: Told) -> None:
     prior = recording / "ground_truth.tum"
     entries = (

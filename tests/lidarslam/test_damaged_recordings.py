@@ -146,7 +146,7 @@ SPOILT = (
 UNREADABLE = ("cut", "noise", "pickled", "no x", "gone", "folder")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @fuzzed
 @given(st.lists(st.sampled_from(SPOILT + UNREADABLE), min_size=1, max_size=8), st.integers(0, 2**32))
 def test_any_sequence_of_damaged_files(tmp_path, tables, faults, seed):
@@ -221,7 +221,7 @@ def write_bag(folder: Path, scans: list[tuple[int, str, np.ndarray]]) -> Path:
 SHIFTS_NS = (0, 0, 0, 0, 0, -PERIOD_NS, 30_000_000, -YEAR_NS, YEAR_NS, -STAMP_NS, 5 * 10**9 - STAMP_NS, 4 * 10**9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @fuzzed
 @given(
     st.lists(
@@ -265,7 +265,7 @@ def test_a_clock_that_jumps_a_year_ahead_for_good_is_followed_and_told(tmp_path,
     assert any("1 gap in the stamps" in w and "31536000.1 s after scan 3" in w for w in summary["warnings"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_clock_set_back_for_good_ends_the_run_with_a_line_and_what_there_is(tmp_path, tables):
     stamps = messages_at([tables[i % 8] for i in range(20)], lambda i: usual_ns(i) - (YEAR_NS if i > 5 else 0))
     bag = write_bag(tmp_path / "drive", stamps)

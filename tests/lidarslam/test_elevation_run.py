@@ -43,7 +43,7 @@ def summary(source: Path, out: Path, *settings: str) -> dict[str, Any]:
     return json.loads((out / "summary.json").read_text())  # type: ignore[no-any-return]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_reports_the_bias_and_what_to_set(low: Path, tmp_path: Path) -> None:
     found = summary(low, tmp_path / "run")
     bias_deg, sigma_deg, correction_deg = (found[key] for key in KEYS)

@@ -111,7 +111,7 @@ def _invoke(*arguments: str) -> str:
     return done.output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_run_and_what_follows_it(sequence: Path, tmp_path: Path) -> None:
     _invoke("run", SOURCE, "--odometry", "kiss-icp", "--no-report")
     (run,) = (tmp_path / "runs").iterdir()
@@ -133,7 +133,7 @@ def test_info_as_json(sequence: Path) -> None:
     assert known["point_time"]["last_s"] == pytest.approx(0.1, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_compare_names_folders_without_slashes(sequence: Path, tmp_path: Path) -> None:
     _invoke("compare", SOURCE, "--methods", "kiss-icp", "--out", "compared")
     assert (tmp_path / "compared" / "hilti_2022_basement_2" / "kiss-icp" / "trajectory.tum").is_file()

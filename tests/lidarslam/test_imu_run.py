@@ -76,7 +76,7 @@ def rotation_error_deg(out: Path, source: Path) -> float:
     return float(np.rad2deg(np.sqrt((rotation_angle(inverse(found) @ true) ** 2).mean())))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_shaken_sweeps_are_straightened(recording: Path, run: Any) -> None:
     errors = {}
     for method in ("constant-velocity", "imu"):
@@ -118,7 +118,7 @@ def test_an_imu_needs_a_map(recording: Path, run: Any) -> None:
     assert "the IMU takes part in scan-to-map registration" in result.output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_mounting_is_found_where_the_recording_has_none(tmp_path: Path, room: Any, run: Any) -> None:
     source = record(tmp_path / "room", room, scans=115, mounting=False)
     result, out = run(source, "--odometry", "imu", "--stop", "115")
@@ -153,7 +153,7 @@ def longer(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
     return record(tmp_path_factory.mktemp("imu") / "room", room, scans=40)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_late_clock_is_corrected(longer: Path, tmp_path: Path, run: Any) -> None:
     late = flawed(longer, tmp_path / "late", lambda rows: rows + np.eye(7)[0] * 0.02)
     result, out = run(late, "--odometry", "imu")
@@ -172,7 +172,7 @@ def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Pat
     assert not (out / "trajectory.tum").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_in_a_finished_map_the_imu_takes_part(longer: Path, tmp_path: Path, run: Any) -> None:
     result, out = run(longer, "--odometry", "imu")
     assert result.exit_code == 0, result.output
@@ -210,7 +210,7 @@ def test_a_programs_own_loop_takes_the_samples_as_they_come(longer: Path, is_giv
     assert np.rad2deg(np.sqrt((rotation_angle(inverse(motions) @ true) ** 2).mean())) < 0.15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_late_clock_is_corrected_on_the_way(longer: Path, tmp_path: Path) -> None:
     late = flawed(longer, tmp_path / "late", lambda rows: rows + np.eye(7)[0] * 0.02)
     angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()

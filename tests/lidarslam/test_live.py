@@ -89,7 +89,7 @@ def read_stamps(messages: list[bytes]) -> list[int]:
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
@@ -135,7 +135,7 @@ def test_scans_wait_for_nothing() -> None:
     assert bounded(given).mapping == given.mapping
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
 def test_interrupted_it_writes_what_came(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
@@ -424,7 +424,7 @@ def play(bag: Path, domain: int) -> None:
         publishers[topic](raw)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_imu_beside_the_clouds_takes_part(
     tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:

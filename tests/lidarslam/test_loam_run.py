@@ -55,7 +55,7 @@ def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
     assert (out / "pose_graph.g2o").exists() == bool(more)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_comparison_with_loam(source: Path, tmp_path: Path) -> None:
     lidarslam("compare", source, "--out", tmp_path / "out", "--methods", "constant-velocity+loam")
     (method,) = json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"].items()

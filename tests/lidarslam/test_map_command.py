@@ -108,7 +108,7 @@ def l_shaped(rng: np.random.Generator) -> PointCloud:
     return PointCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
     room, T = l_shaped(np.random.default_rng(5)), exp([0.02, -0.03, 2.4, 2.0, -1.0, 0.3])
     write_cloud(tmp_path / "first.ply", room)

@@ -115,7 +115,7 @@ def test_rings_and_times_are_those_of_the_first_point(
     assert [name for name, _ in load_map(only).attributes.present()] == ["ring"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_geometry_does_not_depend_on_the_fields(source: Path, tmp_path: Path) -> None:
     for name, fields in (("none", "[]"), ("all", "[intensity, rgb, ring, time]")):
         run(source, tmp_path / name, *WAYS["pose graph"], "--set", f"global_map.fields={fields}")

@@ -99,7 +99,7 @@ def merged(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
     return out, merge(request(out, places["first"], places["foreign"], places["second"]), quiet)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_that_find_one_another_are_in_the_frame_of_the_first(
     merged: tuple[Path, MergeOutcome], places: dict[str, Path]
 ) -> None:
@@ -120,7 +120,7 @@ def test_all_that_find_one_another_are_in_the_frame_of_the_first(
     assert np.linalg.norm(apart) < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_common_map_holds_what_is_joined_and_nothing_else(
     merged: tuple[Path, MergeOutcome], places: dict[str, Path]
 ) -> None:
@@ -141,7 +141,7 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(
     assert np.median(both) < 0.06
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
     out, outcome = merged
     summary = json.loads((out / "summary.json").read_text())
@@ -199,7 +199,7 @@ def graph_keys(out: Path) -> tuple[list[int], int]:
     return [int(key) for tag, key, *_ in words if tag == "VERTEX_SE3:QUAT"], sum(w[0] == "EDGE_SE3:QUAT" for w in words)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) -> None:
     out, _ = merged
     runs = [load_run(out / name) for name in ("01_first", "02_foreign", "03_second")]

@@ -68,7 +68,7 @@ def _wait_for(condition: Callable[[], bool], seconds: float = 300.0) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_node_that_dies_costs_only_its_recordings(
     crossings: list[Path], tmp_path: Path, serial: dict[str, Any], timeless: Files
 ) -> None:

@@ -106,7 +106,7 @@ def rolled(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
     return run(recordings["rolled"], tmp_path_factory.mktemp("runs") / "rolled", *CONSTANT)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_are_those_of_the_upright_recording(recordings, upright, rolled, tmp_path):
     told = run(recordings["rolled"], tmp_path / "told", *CONSTANT, "--set", "reader.mounting=left")
     for directory in (rolled, told):
@@ -123,7 +123,7 @@ def test_results_are_those_of_the_upright_recording(recordings, upright, rolled,
     np.testing.assert_array_equal(exported, scans)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_resumed_run_guesses_the_same(recordings, upright, tmp_path):
     words = [word for word in (*FAST, *CONSTANT) if "=" in word]
     config = load_config(settings=[*words, "odometry.method=constant-velocity", "checkpoints.every_scans=3"])
@@ -139,7 +139,7 @@ def test_a_resumed_run_guesses_the_same(recordings, upright, tmp_path):
     assert files(request.out) == files(upright)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "turn"),
     [
@@ -157,7 +157,7 @@ def test_with_the_imu(recordings, tmp_path, method, turn):
     np.testing.assert_allclose(points(turned), points(expected), atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_python_interface(recordings, simulation, upright):
     settings = {
         "odometry.method": "constant-velocity",
@@ -172,7 +172,7 @@ def test_the_python_interface(recordings, simulation, upright):
     np.testing.assert_allclose(T_world_lidar, poses(upright), atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_localisation(recordings, upright, tmp_path):
     found = {}
     for name in ("upright again", "rolled again"):
@@ -182,7 +182,7 @@ def test_localisation(recordings, upright, tmp_path):
     np.testing.assert_allclose(found["rolled again"], found["upright again"], atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_exports(upright, rolled, tmp_path):
     written = []
     for one in (rolled, upright):

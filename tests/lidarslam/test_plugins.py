@@ -118,7 +118,7 @@ def test_a_source_is_recognised(example: Path, room_scans: list[Scan], tmp_path:
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 3, result.output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_peer_is_compared(example: Path, recording: Path, tmp_path: Path) -> None:
     result = lidarslam("compare", recording, "--out", tmp_path / "compared", "--methods", "origin,still")
     methods = json.loads((tmp_path / "compared" / "comparison.json").read_text())["methods"]

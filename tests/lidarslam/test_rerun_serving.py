@@ -48,7 +48,7 @@ def test_a_view_ends_well(serve: Serve, finished_run: Path, request_to_end: sign
     assert "Aborted" not in out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_is_served_while_it_goes_on_and_afterwards(serve: Serve, small_recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     process, address = serve("run", small_recording, "--out", out, "--odometry", "constant-velocity", "--rerun", "web")

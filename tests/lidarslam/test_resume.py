@@ -281,7 +281,7 @@ def assert_same(out: Path, expected: Path) -> None:
 SLOW = ("learned", "odometry alone", "kiss-icp")  # for their odometry; those with --pose-graph show loops
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("method", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in METHODS])
 def test_a_killed_run_comes_to_the_same_results(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str
@@ -375,7 +375,7 @@ def test_a_run_may_be_killed_at_any_time(
         kill_and_resume(run, expected, source, tmp_path / str(number), kill_after_s=float(delay_s))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.55, 0.95])
 def test_a_run_may_be_killed_while_it_writes(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, share: float
@@ -486,7 +486,7 @@ def test_damage_is_told_in_one_line(
     assert_same(killed, whole("constant velocity").out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_killed_before_its_first_state_begins_again(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path
 ) -> None:
@@ -518,7 +518,7 @@ def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(
     assert (result.exit_code, "did not finish" in result.stderr) == (1, True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("part", [0.5, 0.9])
 def test_what_a_killed_overwrite_was_to_replace_is_given_back(
     run: Run,
@@ -568,7 +568,7 @@ def test_there_must_be_something_to_resume(run: Run, source: Path, tmp_path: Pat
     assert ended.status == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_rerun_recording_goes_on_in_a_new_file(
     run: Run, whole: Callable[[str], Whole], source: Path, killed: Path
 ) -> None:

@@ -58,7 +58,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("scale", "fault"), [(1.0, None), (2.0, "too long"), (-1.0, "backwards")])
 def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: float, fault: str | None) -> None:
     options = ["--odometry", "constant-velocity", "--no-report", "--set", f"reader.time_scale={scale}"]

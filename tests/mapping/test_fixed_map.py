@@ -123,7 +123,7 @@ def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room):
     assert off_m[guided.found[0].scan :].max() < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_place_that_later_scans_contradict_is_given_up(room, room_map):
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     localiser = MapLocaliser(MappingConfig(), room_map)

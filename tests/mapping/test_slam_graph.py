@@ -347,7 +347,7 @@ def two(walk: Walk, second_walk: Walk) -> tuple[SlamGraph, Corrected]:
     return follow_all(walk, second_walk)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_second_recording_finds_itself_in_the_first(walk, second_walk, two):
     graph, result = two
     count = len(walk.truth)
