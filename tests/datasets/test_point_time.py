@@ -245,3 +245,9 @@ def test_nan_of_any_kind_is_left_out() -> None:
     assert spread is not None
     assert spread.middle == pytest.approx(3.0, abs=0.6)
     assert spread.span == pytest.approx(7.0, abs=0.1)
+
+
+def test_values_that_no_clock_reads_are_left_out() -> None:
+    damaged = np.concatenate([SWEEP, [1.7e308, -1.7e308]])
+    spread, expected = value_spread(damaged), value_spread(SWEEP)
+    assert spread == expected

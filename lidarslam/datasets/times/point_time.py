@@ -38,6 +38,8 @@ _IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
 _COARSEST_OF_SWEEP = 0.1
 # Instead of the extremes, so that a few stray values do not matter.
 _QUANTILES = (0.005, 0.5, 0.995)
+# No clock reads this, in any unit; the difference of two damaged values could overflow.
+_NO_CLOCK = 1e100
 
 
 @dataclass(frozen=True)
@@ -224,11 +226,11 @@ class ValueSpread(NamedTuple):
 
 
 def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
-    """The spread of integer or float values (N,), NaN left out; None when all, or all but a few, are equal."""
+    """The spread of integer or float values (N,) that may be times; None when all, or all but a few, are equal."""
     whole = values.dtype.kind in "iu"
     with np.errstate(invalid="ignore"):  # damaged bytes may be a NaN of the signalling kind
         numbers = values.reshape(-1).astype(np.int64 if whole else np.float64)
-    numbers = numbers[np.isfinite(numbers)]
+    numbers = numbers[np.abs(numbers) < _NO_CLOCK]  # nor NaN
     set_times = numbers[numbers != 0]
     # Among clock readings a zero is a missing return; among relative times it is a time.
     if len(set_times) and np.abs(set_times).min() > 10 * float(np.ptp(set_times)):
