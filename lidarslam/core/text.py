@@ -80,6 +80,11 @@ def small_length(metres: float) -> str:
     return f"{1000.0 * metres:.2g} mm"
 
 
+def up_to(metres: float) -> str:
+    """The bound of a length: up to 24 cm, less than 0.1 mm."""
+    return f"up to {small_length(metres)}" if metres >= 0.0001 else "less than 0.1 mm"
+
+
 def _ansi_quoted(word: str) -> str:
     spelt = re.sub(r"[\\']", r"\\\g<0>", word)
     return f"$'{_STEERING.sub(_as_bytes, spelt)}'"

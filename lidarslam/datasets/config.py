@@ -31,7 +31,7 @@ class ReaderConfig(Settings):
         description="per-point time: relative to the scan's stamp, a reading of a clock, from the azimuth, or none",
     )
     time_scale: float = Field(
-        1.0, ge=-100.0, le=100.0, description="factor on the per-point times, counted from the scan's stamp"
+        1.0, ge=-2.0, le=2.0, description="factor on the per-point times, counted from the scan's stamp"
     )
     mounting: Mounting = Field(
         "auto",

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.text import as_typed, command_line, count, joined, scan_span, small_length
+from lidarslam.core.text import as_typed, command_line, count, joined, scan_span, small_length, up_to
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.run.results import RunOutcome
@@ -84,7 +84,7 @@ def _tiles(tiled: TiledMap) -> str:
 
 
 def _loops(graph: GraphSummary) -> str:
-    moved = f", poses corrected by up to {small_length(graph.largest_correction_m)}" if graph.closed else ""
+    moved = f", poses corrected by {up_to(graph.largest_correction_m)}" if graph.closed else ""
     rejected = len(graph.loops) - graph.closed
     candidates = f" ({count(rejected, 'candidate')} rejected; {SUMMARY} gives the reasons)" if rejected else ""
     return f"{count(graph.keyframes, 'keyframe')}, {count(graph.closed, 'loop')} closed{moved}{candidates}"

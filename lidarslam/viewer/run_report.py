@@ -17,7 +17,7 @@ from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.text import count, scan_span, small_length
+from lidarslam.core.text import count, scan_span, small_length, up_to
 from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult, ScanSeries, SequenceComparison
 from lidarslam.evaluation.report.report import render_run
 from lidarslam.mapping.global_map.point_cloud import PointCloud
@@ -168,8 +168,8 @@ def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
         graph = summary["pose_graph"]
         closed = count(summary["loop_closures"], "loop")
         shown["pose graph"] = (
-            f"{count(graph['keyframes'], 'keyframe')}, {closed} closed, poses corrected by up to"
-            f" {small_length(graph['largest_correction_m'])}"
+            f"{count(graph['keyframes'], 'keyframe')}, {closed} closed, poses corrected by"
+            f" {up_to(graph['largest_correction_m'])}"
         )
     return shown
 

@@ -21,6 +21,7 @@ from lidarslam.core.text import (
     require_name,
     safe_name,
     stays_below,
+    up_to,
 )
 
 
@@ -143,3 +144,11 @@ def test_a_program_is_named_by_its_file_where_the_shell_does_not_find_it(
         assert as_typed("lidarslam") == typed
     monkeypatch.chdir("/usr")
     assert as_typed("lidarslam") == str(environment / "lidarslam")
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [(0.0, "less than 0.1 mm"), (8.6e-14, "less than 0.1 mm"), (0.0005, "up to 0.5 mm"), (0.24, "up to 24 cm")],
+)
+def test_a_bound_of_a_length(metres: float, text: str) -> None:
+    assert up_to(metres) == text
