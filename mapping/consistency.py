@@ -57,8 +57,9 @@ _LEAST_WAY_M = 0.2
 # a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
-# Least contradicting pairs of a stretch in runs of at least this many; one in others, or where another confirms it.
-_LEAST_PAIRS, _FEW_PAIRS = 2, 4
+# Least contradicting pairs of a stretch in runs of at least this many; one in others, or one of so many votes that
+# another confirms: fewer are chance in the sparse scans of a Mid-360.
+_LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE = 2, 4, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,6 +383,8 @@ def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) ->
 
 def _is_confirmed(pair: Contradiction, known: Sequence[Contradiction]) -> bool:
     """Whether another pair with the same first scan peaks at the same shift, though not as clearly."""
+    if pair.votes < _LEAST_VOTES_OF_ONE:
+        return False
     others = (other for other in known if other is not pair and other.first == pair.first)
     return any(abs(other.shift_m - pair.shift_m) < (_TOLERANCE_BINS + 0.5) * BIN_M for other in others)
 

@@ -123,8 +123,8 @@ def test_a_bare_tunnel_says_nothing(street):
     assert found(near, poses([0.5 * STEP_M] * (SCANS - 1))) == ()
 
 
-@pytest.mark.parametrize(("confirmed", "stretches"), [(True, 1), (False, 0)])
-def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, stretches):
+@pytest.mark.parametrize(("confirmed", "votes", "stretches"), [(True, 14.0, 1), (False, 14.0, 0), (True, 9.0, 0)])
+def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, votes, stretches):
     shift_m, standing = 0.4, np.tile(np.eye(4), (31, 1, 1))
 
     def pair(first, second, shift_m, votes, votes_at_pose):
@@ -132,7 +132,7 @@ def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, stre
         near[20], near[20 + round(10 * shift_m)] = votes_at_pose, votes
         return PairTest(first, second, np.array([1.0, 0.0, 0.0]), np.zeros(3), shift_m, votes, near)
 
-    contradicting, weaker = pair(0, 20, shift_m, 14.0, 4.0), pair(0, 10, shift_m, 16.0, 12.0)
+    contradicting, weaker = pair(0, 20, shift_m, votes, 4.0), pair(0, 10, shift_m, 16.0, 12.0)
     other = weaker if confirmed else pair(0, 10, 0.0, 12.0, 12.0)
     agreeing = [pair(10, 20, 0.0, 20.0, 20.0), pair(20, 30, 0.0, 20.0, 20.0)]
     found = find_contradictions([contradicting, other, *agreeing], standing)
