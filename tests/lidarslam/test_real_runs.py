@@ -43,6 +43,20 @@ def test_scans_do_not_slide_at_any_rate(real_data: Path, tmp_path: Path, name: s
 @pytest.mark.real_data
 @pytest.mark.slow
 @pytest.mark.parametrize("odometry", METHODS)
+@pytest.mark.parametrize("yaw_deg", [30, 80, 135])
+def test_the_direction_of_the_axes_does_not_matter(
+    real_data: Path, tmp_path: Path, odometry: str, yaw_deg: int
+) -> None:
+    """The same sweeps fall into other cells, as any small change would have it."""
+    options = "--odometry", odometry, "--set", f"reader.mounting=[0, 0, {yaw_deg}]"
+    result = run(real_data / "sim_office_spin", tmp_path / "run", *options)
+    assert result["ate_rmse_m"] < 0.015
+    assert result["lost_scans"] == 0
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+@pytest.mark.parametrize("odometry", METHODS)
 @pytest.mark.parametrize("step", [1, 2, 3, 5])
 def test_a_real_drive_at_speed_from_its_first_scan(real_data: Path, tmp_path: Path, odometry: str, step: int) -> None:
     """Sequence 04 is at 13 m/s when it begins; KISS-ICP is off by 19 m at every fifth scan."""
