@@ -3,7 +3,6 @@
 import ast
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -86,7 +85,7 @@ CONFINED = {
     "cyclonedds": ("lidarslam.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
-MOST_LINES, MOST_ENTRIES = 500, 20
+MOST_LINES = 500
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "common", "base", "helpers", "helper", "misc", "tools"}
 
 
@@ -275,14 +274,8 @@ def name_breaches(modules: Modules) -> list[str]:
 
 
 def size_breaches(modules: Modules) -> list[str]:
-    """Files too long to be read at once, and folders with too many entries to be overlooked."""
-    long = [f"{module.name} has {module.lines} lines" for module in modules.values() if module.lines > MOST_LINES]
-    linked = {f"lidarslam.{package}" for package in LINKED}
-    counted = (name for name in modules if "." in name and name not in {*linked, "lidarslam.__main__"})
-    entries = Counter(name.rpartition(".")[0] for name in counted)
-    packages = [module.name for module in modules.values() if module.is_package]
-    counts = {name: entries[name] + 1 for name in packages}  # with its __init__
-    return long + [f"{name} has {count} entries" for name, count in counts.items() if count > MOST_ENTRIES]
+    """Files too long to be read at once."""
+    return [f"{module.name} has {module.lines} lines" for module in modules.values() if module.lines > MOST_LINES]
 
 
 def folder_breaches(modules: Modules) -> list[str]:
@@ -487,11 +480,6 @@ def test_a_run_begins_without_libraries_that_few_runs_need():
             "lidarslam.mapping.graph -> lidarslam.mapping.loops -> lidarslam.mapping.graph",
         ),
         (size_breaches, {"lidarslam__mapping__a": "\n" * 501}, "lidarslam.mapping.a has 501 lines"),
-        (
-            size_breaches,
-            {"lidarslam__mapping": "", **{f"lidarslam__mapping__{letter}": "" for letter in "abcdefghijklmnopqrst"}},
-            "lidarslam.mapping has 21 entries",
-        ),
     ],
 )
 def test_a_planted_breach_is_told(rule, planted, told):

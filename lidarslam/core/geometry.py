@@ -44,6 +44,14 @@ def skew(v: FloatArray) -> FloatArray:
     return K
 
 
+def levelling(up: FloatArray) -> FloatArray:
+    """The smallest rotation (3, 3) that turns a unit vector (3,) to z; half a turn about x if that points down."""
+    if up[2] < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    K = skew(np.array([up[1], -up[0], 0.0]))
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + up[2]), dtype=np.float64)
+
+
 def rotation_angle(T: FloatArray) -> FloatArray:
     """Angle in [0, pi], radians, of rotations or transforms (..., >=3, >=3).
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import make_directory, replacing
-from lidarslam.core.geometry import FloatArray, make_transform, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, levelling, make_transform, rotation_angle, transform_points
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import read_transform
 from lidarslam.datasets.mounting import recorded_axes
@@ -116,7 +116,7 @@ def _levelled(whole: _Map, first: Path, asked: MapEdits) -> Generator[str, None,
         else:
             ground = _ground(whole, first)
             up, by = ground.up, f"the ground, {100.0 * ground.share:.0f} % of what faces upwards"
-        T = edits.levelling(up)
+        T = make_transform(levelling(up), np.zeros(3))
         whole = whole.moved(T)
         yield f"levelled by {np.rad2deg(rotation_angle(T)):.2f} degrees, to {by}"
     if asked.ground_at_zero:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, exp, transform_points
+from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
 
@@ -98,13 +98,6 @@ def ground_plane(cloud: PointCloud) -> GroundPlane | None:
         height_m = float(up @ middle)
     share = float(np.mean(np.abs(points @ up - height_m) < _GROUND_M))
     return GroundPlane(up, height_m, share) if up[2] > np.cos(_NARROWING[0]) else None
-
-
-def levelling(up: FloatArray) -> FloatArray:
-    """The least rotation `T_level_world` (4, 4) that turns a unit vector (3,) to z."""
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    angle = np.arctan2(np.linalg.norm(axis), up[2])
-    return exp([*(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)), 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)

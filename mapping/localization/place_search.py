@@ -9,14 +9,21 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.geometry import (
+    FloatArray,
+    exp,
+    inverse,
+    levelling,
+    make_transform,
+    rotation_angle,
+    transform_points,
+)
 from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
 from lidarslam.mapping.localization.local_mapping import KeptScan, KeptScans
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.birds_eye_map import levelling
 from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.fit import NO_FIT, Fit
 from lidarslam.mapping.tracking.scan_matcher import measure_fit

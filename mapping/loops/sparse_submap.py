@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, levelling
 from lidarslam.core.state import BlockFile
 from lidarslam.core.thinning import one_per_cell
-from lidarslam.mapping.tracking.birds_eye_map import levelling
 
 PLANE, LINE = 1, 2
 # Nearer points are mostly the carrier itself.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from lidarslam.core.geometry import FloatArray, make_transform, skew
+from lidarslam.core.geometry import FloatArray, levelling, make_transform
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.tracking.budget import Steps
 
@@ -116,12 +116,6 @@ class BirdsEyeMap:
         z = height_shift(around, level[:, 2], self.cell_m / _HEIGHT_BINS)
         R = self.R_level_world.T @ turn @ self.R_level_world @ T_world_lidar[:3, :3]
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
-
-
-def levelling(up: FloatArray) -> FloatArray:
-    """The smallest rotation (3, 3) that takes a unit vector (3,) near z to z."""
-    K = skew(np.array([up[1], -up[0], 0.0]))
-    return np.asarray(np.eye(3) + K + K @ K / (1.0 + up[2]), dtype=np.float64)
 
 
 def _columns(level: FloatArray, corner: FloatArray, cell_m: float) -> FloatArray:
