@@ -1,8 +1,8 @@
 """Smoothing of the first scans: their motions by registration backwards in time, to the map of the scans after them."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from itertools import chain, islice, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,10 +22,12 @@ if TYPE_CHECKING:  # GTSAM takes a while to load
 # Scans that are smoothed, and those of them that show whether that is needed, where a sweep makes a map.
 SMOOTHED, SHOWING = 20, 8
 _FEWEST_KNOWN, _LEAST_OK = 6, 0.7
-# With an IMU they are smoothed, too, where they are this far apart, seconds.
-_LONG_S = 0.15
-# Scans by which their first velocity is chosen then, and the velocities, m/s: at rest to running.
-TRIED, _SPACING_M_S = 5, 1.0
+# With an IMU, scans this far apart, seconds, or that do not constrain a direction, leave the first velocity open. It is
+# the likeliest of these, m/s, at rest to running, by so many scans.
+_LONG_S, TRIED, _SPACING_M_S = 0.15, 5, 1.0
+# Mean evidence of motions along a corridor, in units of the least: in one, 0.55 to 1 for the right velocity, 0.25 to
+# 0.35 for others.
+_LEAST_CONSTRAINT = 0.45
 _VELOCITIES = [np.zeros(3)] + [
     speed * np.array([np.cos(angle), np.sin(angle), 0.0])
     for speed, count in ((1.0, 6), (2.0, 8))
@@ -85,26 +87,24 @@ def smoothed_start(
     IMU's samples are used in both directions of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
-    taken, rest = [], iter(scans)
-    ordered = _Tracking(unlimited, inertial)
-    if inertial is not None:
-        taken = list(islice(rest, TRIED))
-        if len(taken) == TRIED and taken[1].stamp - taken[0].stamp > _LONG_S:
-            ordered = _likeliest(taken, unlimited, inertial)
-        else:
-            rest, taken = chain(taken, rest), []
-    needed = bool(taken)
-    for scan in rest:
+    ordered, taken, needed, least = _Tracking(unlimited, inertial), list[Scan](), False, np.inf
+    for scan in scans:
         mapped = ordered.process(scan, Prior())
         taken.append(scan)
         needed |= not ordered.has_rings or mapped.status is not Status.OK
+        if inertial is not None and len(taken) == TRIED:
+            if taken[1].stamp - taken[0].stamp > _LONG_S:
+                ordered, needed = _likeliest(taken, unlimited, inertial, _quality), True
+            elif not all(one.fit is None or one.fit.is_constrained for one in ordered.results):
+                ordered, needed, least = _likeliest(taken, unlimited, inertial, _constraint), True, _LEAST_CONSTRAINT
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not needed):
             break
     forwards = ordered.results
     if not needed or len(taken) < SHOWING:
         return {}
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
-    if len(known) < _FEWEST_KNOWN or sum(one.status is Status.OK for one in known) < _LEAST_OK * len(known):
+    is_right = sum(one.status is Status.OK for one in known) >= _LEAST_OK * len(known) or _constraint(known) > least
+    if len(known) < _FEWEST_KNOWN or not is_right:
         return {}
     end_s = taken[-1].stamp
     reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))
@@ -115,8 +115,22 @@ def smoothed_start(
     return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
 
 
-def _likeliest(scans: list[Scan], config: MappingConfig, inertial: "Inertial") -> _Tracking:
-    """The first scans, tracked from the velocity at which they fit best: scans far apart leave it open.
+def _quality(results: list[MappedScan]) -> float:
+    """How well scans fit: the mean share of inliers times support."""
+    return float(
+        np.mean([0.0 if one.fit is None else one.fit.inlier_share * (one.fit.support or 0.0) for one in results])
+    )
+
+
+def _constraint(results: list[MappedScan]) -> float:
+    """How well inliers constrain the weakest direction, on average."""
+    return float(np.mean([one.fit.constraint for one in results if one.fit is not None]))
+
+
+def _likeliest(
+    scans: list[Scan], config: MappingConfig, inertial: "Inertial", score: Callable[[list[MappedScan]], float]
+) -> _Tracking:
+    """The first scans, tracked from the velocity that scores best.
 
     The IMU's measurements relate it to the motion between all scans, and so the later ones decide.
     """
@@ -129,10 +143,8 @@ def _likeliest(scans: list[Scan], config: MappingConfig, inertial: "Inertial") -
         tracking.process(scans[1], Prior(moved, covariance=covariance, caution=1.0))
         for scan in scans[2:]:
             tracking.process(scan, Prior())
-        fits = [one.fit for one in tracking.results if one.fit is not None]
-        quality = sum(fit.inlier_share * (fit.support or 0.0) for fit in fits)
-        if quality > most:
-            best, most = tracking, quality
+        if (scored := score(tracking.results)) > most:
+            best, most = tracking, scored
     assert best is not None
     return best
 
