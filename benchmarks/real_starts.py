@@ -2,9 +2,11 @@
 
     python benchmarks/real_starts.py 2011_09_26/2011_09_26_drive_0005_sync KITTI/sequences/04
     python benchmarks/real_starts.py RECORDING --steps 1 2 3 5 --every 20 --methods learned+map ct-icp --all
+    python benchmarks/real_starts.py RECORDING --every 100000 --scans 1000 --yaws 0 30 60 --methods learned+map
 
 Prints a Markdown table, a row for each recording, method and scan step. A run takes `--scans` scans from each start,
 every `--every`-th scan of the recording; near the end of the recording it takes what is left, if that is half of it.
+With `--yaws`, our methods start again with the axes turned by each angle: the same points fall into other cells.
 
 - worst, median ATE: metres, after SE(3) alignment, over the starts; with ground truth only;
 - worst start: the scan that the worst run starts at, by ATE, or by length where there is no truth;
@@ -26,6 +28,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -100,11 +103,12 @@ def starts_of(scans: int, every: int, wanted: int, step: int) -> list[range]:
     return [run for run in runs if run.start == 0 or 2 * len(run) >= wanted]
 
 
-def run_ours(method: str, source: Path, scans: range) -> Ended:
-    """A run as the command line makes it."""
+def run_ours(method: str, source: Path, scans: range, yaw_deg: float = 0.0) -> Ended:
+    """A run as the command line makes it, with the axes turned by an angle."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         where = ["--start", str(scans.start), "--stop", str(scans.stop), "--step", str(scans.step)]
+        where += ["--set", f"reader.mounting=[0, 0, {yaw_deg}]"] if yaw_deg else []
         done = CliRunner().invoke(lidarslam, ["run", str(source), "--out", str(out), *where, *OPTIONS[method]])
         if done.exception is not None and not isinstance(done.exception, SystemExit):
             raise done.exception
@@ -155,9 +159,14 @@ def judged_runs(
         methods.insert(0, REFERENCE)
     for scans in starts_of(len(recording), arguments.every, arguments.scans, step):
         of_length = None if uses_reference else truth
-        for method in methods:
-            ended = run_ours(method, source, scans) if method in OPTIONS else run_other(method, recording, scans)
-            if uses_reference and method == REFERENCE:
+        for method, yaw_deg in product(methods, arguments.yaws):
+            if method in OPTIONS:
+                ended = run_ours(method, source, scans, yaw_deg)
+            elif yaw_deg == arguments.yaws[0]:
+                ended = run_other(method, recording, scans)
+            else:
+                continue
+            if uses_reference and method == REFERENCE and yaw_deg == arguments.yaws[0]:
                 of_length = ended.trajectory
             judged = judge(ended, scans, truth, of_length, arguments.shortest)
             _report(f"{recording.name} step {step} start {scans.start} {method}: {_line(judged)} {ended.message}")
@@ -232,6 +241,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument(
         "--lengths-of", choices=["truth", REFERENCE], default="truth", help="what lengths are held against"
+    )
+    parser.add_argument(
+        "--yaws", nargs="+", type=float, default=[0.0], help="angles by which the axes are turned, degrees"
     )
     parser.add_argument("--wrong-percent", type=float, default=3.0)
     parser.add_argument("--all", action="store_true", help="every run too")

@@ -91,3 +91,15 @@ def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: P
     result = run(real_data / "sim_stairs", tmp_path / "run", "--step", str(step))
     assert result["ate_rmse_m"] < 0.3
     assert result["lost_scans"] == 0
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0, 20, 40, 80])
+def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, start: int) -> None:
+    """Hardly any surface constrains the first velocity, 2.2 m/s; the run is right, and reports that."""
+    out = tmp_path / "run"
+    options = "--odometry", "learned+imu", "--start", str(start), "--stop", str(start + 40)
+    ended = CliRunner().invoke(main, ["run", str(real_data / "sim_corridor_yard"), "--out", str(out), *options])
+    assert ended.exit_code == 3, ended.output
+    assert json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.02
