@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.core.state import TRANSFORM, Shape
+from lidarslam.core.tracking import AXES
 from lidarslam.mapping.config import MappingConfig
 
 # Least standard deviations of any pose, rotation first.
@@ -31,6 +32,9 @@ _UNEVEN = 1.0 / 8.0
 _ODOMETRY_SMOOTHING, _GATE = 0.2, 27.9
 # Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
 _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
+# An odometry conflicts with a registration where their translations differ by more than this squared Mahalanobis
+# distance by its own covariance, by this much, and by this share of the motion.
+_CONFLICT_SQUARED, _CONFLICT_M, _CONFLICT_SHARE = 16.0, 0.03, 0.25
 # Consistent motions in a row after which an odometry may reject a registration.
 _PROVEN_AFTER = 10
 
@@ -64,6 +68,17 @@ class Prior:
     def without_odometry(self) -> "Prior":
         """The measurement of an IMU alone."""
         return Prior(inertial=self.inertial)
+
+    def conflict(self, T_prev_curr: FloatArray) -> str | None:
+        """The axis along which an odometry alone measured a clearly different motion than (4, 4); None for none."""
+        if self.T_prev_curr is None or self.covariance is None or self.inertial is not None:
+            return None
+        apart = log(inverse(self.T_prev_curr) @ T_prev_curr)[3:]
+        moved_m = max(float(np.linalg.norm(T[:3, 3])) for T in (self.T_prev_curr, T_prev_curr))
+        if float(np.linalg.norm(apart)) < max(_CONFLICT_M, _CONFLICT_SHARE * moved_m):
+            return None
+        squared = float(apart @ np.linalg.solve(self.covariance[3:, 3:], apart))
+        return AXES[3 + int(np.abs(apart).argmax())] if squared > _CONFLICT_SQUARED else None
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
         """(6, 6) of the motion: the odometry's own, with its caution, or the configured one."""

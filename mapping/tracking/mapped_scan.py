@@ -26,7 +26,8 @@ class MappedScan:
     status: Status
     message: str = ""
     fit: Fit | None = None  # to the map; None where the scan was not compared with it
-    degenerate: tuple[str, ...] = ()  # names of the directions along which the prediction was kept
+    # names of the directions along which the prediction was kept, or the odometry measures other motions
+    degenerate: tuple[str, ...] = ()
     iterations: int = 0  # of the registration
     added: bool = False  # whether the scan is good enough for the map, and was inserted
     # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
@@ -45,11 +46,12 @@ class MappedScan:
 
 
 def judge(
-    attempt: Attempt, is_unconfirmed: bool, unexpected: bool, adrift: bool, config: TrackingConfig
+    attempt: Attempt, is_unconfirmed: bool, unexpected: bool, adrift: bool, conflict: str | None, config: TrackingConfig
 ) -> tuple[Status, str]:
     """The status of the fit; degraded as well for a pose that is unconfirmed, ambiguous, unexpected or unconstrained.
 
-    Adrift is a map that was begun at an unknown pose in the one before.
+    Adrift is a map that was begun at an unknown pose in the one before; a conflict is the axis along which the odometry
+    has measured other motions for several scans.
     """
     if attempt.status is not Status.OK:
         return attempt.status, attempt.fit.explain(config)
@@ -66,6 +68,7 @@ def judge(
         (adrift, "in a new map; its pose in the map before is unknown"),
         (degenerate, f"degenerate along {', '.join(degenerate)}: the prediction was kept"),
         (attempt.unconstrained, f"hardly constrained along {', '.join(attempt.unconstrained)}: it may slide"),
+        (conflict, f"the odometry measures other motions along {conflict}, as amid people who walk along"),
     )
     message = next((message for applies, message in reservations if applies), "")
     return (Status.DEGRADED if message else Status.OK), message

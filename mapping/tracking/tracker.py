@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from lidarslam.core.geometry import displacement_m, inverse
 from lidarslam.core.state import Stateful
-from lidarslam.core.tracking import Status
+from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.motion.velocity_bias import VelocityBias
@@ -19,6 +19,8 @@ from lidarslam.mapping.tracking.relocalisation import ArchivedMaps, SpreadSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
+# Scans in a row at which odometry and registration conflict: 10 to 20 in crowds that move along, at most 5 elsewhere.
+_LASTING_CONFLICT = 6
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
 
@@ -92,7 +94,7 @@ class Tracker(Stateful):
         if relocalised or jumped or not tracking.velocity_known or prior.inertial is not None:
             bias = VelocityBias()
         elif is_timed:
-            bias = bias.updated(last, state, scan.seen_from_s)
+            bias = bias.updated(last, state, scan.seen_from_s, self._config.method)
             state = bias.corrected(state)
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not relocalised:
@@ -110,7 +112,8 @@ class Tracker(Stateful):
         fits = fits or tracking.odometry_noise.agrees(cautious, motion, self._config) is True
         unexpected = not relocalised and replace(attempt, prediction=prediction).has_jumped
         unconfirmed, adrift = tracking.is_unconfirmed, len(self._archive) > 0
-        status, message = judge(attempt, unconfirmed, unexpected, adrift, self._config.tracking)
+        conflict = prior.conflict(motion) if tracking.conflicts >= _LASTING_CONFLICT else None
+        status, message = judge(attempt, unconfirmed, unexpected, adrift, conflict, self._config.tracking)
         return MappedScan(
             state=state,
             T_world_predicted=attempt.prediction.T_world_lidar,
@@ -119,7 +122,7 @@ class Tracker(Stateful):
             status=status,
             message=message,
             fit=attempt.fit,
-            degenerate=attempt.unconstrained,
+            degenerate=tuple(name for name in AXES if name in (*attempt.unconstrained, conflict)),
             iterations=registration.iterations,
             added=fits and not jumped and not unconfirmed,
             is_connected=not relocalised,

@@ -39,6 +39,7 @@ class TrackingState:
     to_confirm: int = 0  # scans that have to confirm a relocalisation
     relocalised_s: float | None = None  # stamp of a relocalisation until it is confirmed
     usual_quality: float = 0.0
+    conflicts: int = 0  # scans in a row at which odometry and registration measured different motions
     is_measured: bool = False  # whether a proven odometry measured every motion since the sensor was tracked
     prediction_error_m: float = _UNKNOWN_ERROR_M
     process_noise: ProcessNoise = field(default_factory=ProcessNoise)
@@ -130,7 +131,8 @@ class TrackingState:
             variance = np.diag(state.covariance + last.covariance)[6:]
             process_noise = process_noise.updated(state.velocity - last.velocity, interval_s, variance)
         odometry_noise = self.odometry_noise.updated(prior, motion, config)
-        return replace(self, process_noise=process_noise, odometry_noise=odometry_noise)
+        conflicts = 0 if prior.conflict(motion) is None else self.conflicts + 1
+        return replace(self, process_noise=process_noise, odometry_noise=odometry_noise, conflicts=conflicts)
 
     def with_prediction_error(self, error_m: float) -> "TrackingState":
         """With the error of the latest prediction."""

@@ -103,3 +103,21 @@ def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, 
     ended = CliRunner().invoke(main, ["run", str(real_data / "sim_corridor_yard"), "--out", str(out), *options])
     assert ended.exit_code == 3, ended.output
     assert json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.02
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_a_crowd_that_is_followed_is_reported(real_data: Path, tmp_path: Path) -> None:
+    """Played backwards, half of 30 people walk along from the first scan on, and the path is too short."""
+    crowd, backwards = real_data / "sim_office_crowd", tmp_path / "backwards"
+    backwards.mkdir()
+    scans, stamps = sorted(crowd.glob("*.npy")), np.loadtxt(crowd / "times.txt")
+    for number, path in enumerate(reversed(scans)):
+        scan = np.load(path)[::-1].copy()
+        scan["time"] *= -1.0
+        np.save(backwards / f"{number:06d}.npy", scan)
+    np.savetxt(backwards / "times.txt", stamps[-1] - stamps[::-1])
+    ended = CliRunner().invoke(main, ["run", str(backwards), "--out", str(tmp_path / "run")])
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    truth_m = np.linalg.norm(np.diff(np.loadtxt(crowd / "ground_truth.tum")[:, 1:4], axis=0), axis=1).sum()
+    assert ended.exit_code == 3 or abs(summary["length_m"] - truth_m) < 0.3, ended.output

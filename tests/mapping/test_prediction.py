@@ -207,3 +207,14 @@ def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_n
     assert sigmas[[5, 11]].max() < 0.002
     np.testing.assert_allclose(np.delete(sigmas, [5, 11]), np.delete(before, [5, 11]), rtol=1e-6)
     assert np.linalg.eigvalsh(held.covariance).min() > 0.0
+
+
+def test_an_odometry_that_measures_a_clearly_different_motion_conflicts():
+    covariance = np.diag(np.array([0.001] * 3 + [0.01] * 3) ** 2)
+    prior = Prior(exp(np.array([0.0, 0.0, 0.0, 0.1, 0.02, 0.0])), covariance=covariance)
+    still, along, fast = (exp(np.array([0.0, 0.0, 0.0, x, 0.02, 0.0])) for x in (0.0, 0.13, 1.0))
+    assert prior.conflict(still) == "x"
+    assert prior.conflict(along) is None, "within four standard deviations"
+    assert replace(prior, T_prev_curr=fast).conflict(exp(np.array([0.0, 0.0, 0.0, 1.2, 0.0, 0.0]))) is None, "a fifth"
+    assert replace(prior, covariance=None).conflict(still) is None
+    assert Prior().conflict(still) is None
