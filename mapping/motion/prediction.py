@@ -33,8 +33,9 @@ _ODOMETRY_SMOOTHING, _GATE = 0.2, 27.9
 # Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
 _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
 # An odometry conflicts with a registration where their translations differ by more than this squared Mahalanobis
-# distance by its own covariance, by this much, and by this share of the motion.
-_CONFLICT_SQUARED, _CONFLICT_M, _CONFLICT_SHARE = 16.0, 0.03, 0.25
+# distance by its own covariance, by this much, and by this share of the motion, but no faster than people walk: an
+# odometry that is off by more than that is overruled.
+_CONFLICT_SQUARED, _CONFLICT_M, _CONFLICT_SHARE, _WALKING_M_S = 16.0, 0.03, 0.25, 2.0
 # Consistent motions in a row after which an odometry may reject a registration.
 _PROVEN_AFTER = 10
 
@@ -68,17 +69,6 @@ class Prior:
     def without_odometry(self) -> "Prior":
         """The measurement of an IMU alone."""
         return Prior(inertial=self.inertial)
-
-    def conflict(self, T_prev_curr: FloatArray) -> str | None:
-        """The axis along which an odometry alone measured a clearly different motion than (4, 4); None for none."""
-        if self.T_prev_curr is None or self.covariance is None or self.inertial is not None:
-            return None
-        apart = log(inverse(self.T_prev_curr) @ T_prev_curr)[3:]
-        moved_m = max(float(np.linalg.norm(T[:3, 3])) for T in (self.T_prev_curr, T_prev_curr))
-        if float(np.linalg.norm(apart)) < max(_CONFLICT_M, _CONFLICT_SHARE * moved_m):
-            return None
-        squared = float(apart @ np.linalg.solve(self.covariance[3:, 3:], apart))
-        return AXES[3 + int(np.abs(apart).argmax())] if squared > _CONFLICT_SQUARED else None
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
         """(6, 6) of the motion: the odometry's own, with its caution, or the configured one."""
@@ -181,6 +171,18 @@ class OdometryNoise:
     def agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool | None:
         """Whether a registered motion (4, 4) passes the gate of a proven odometry; None where there is none."""
         return _squared_error(prior, T_prev_curr, config) <= _GATE * self.variance if self.is_proven(prior) else None
+
+    def conflict(self, prior: Prior, T_prev_curr: FloatArray, interval_s: float) -> str | None:
+        """The axis along which an odometry alone measured a clearly different motion than (4, 4); None for none."""
+        if prior.T_prev_curr is None or prior.covariance is None or prior.inertial is not None:
+            return None
+        apart = log(inverse(prior.T_prev_curr) @ T_prev_curr)[3:]
+        moved_m = max(float(np.linalg.norm(T[:3, 3])) for T in (prior.T_prev_curr, T_prev_curr))
+        least_m, most_m = max(_CONFLICT_M, _CONFLICT_SHARE * moved_m), _WALKING_M_S * interval_s
+        if not least_m < float(np.linalg.norm(apart)) < most_m:
+            return None
+        squared = float(apart @ np.linalg.solve(self.variance * prior.covariance[3:, 3:], apart))
+        return AXES[3 + int(np.abs(apart).argmax())] if squared > _CONFLICT_SQUARED else None
 
     def is_proven(self, prior: Prior) -> bool:
         """Whether there is an odometry, which was consistent so far."""

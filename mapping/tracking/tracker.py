@@ -112,7 +112,8 @@ class Tracker(Stateful):
         fits = fits or tracking.odometry_noise.agrees(cautious, motion, self._config) is True
         unexpected = not relocalised and replace(attempt, prediction=prediction).has_jumped
         unconfirmed, adrift = tracking.is_unconfirmed, len(self._archive) > 0
-        conflict = prior.conflict(motion) if tracking.conflicts >= _LASTING_CONFLICT else None
+        interval_s, lasts = scan.stamp - last.stamp, tracking.conflicts >= _LASTING_CONFLICT
+        conflict = tracking.odometry_noise.conflict(prior, motion, interval_s) if lasts else None
         status, message = judge(attempt, unconfirmed, unexpected, adrift, conflict, self._config.tracking)
         return MappedScan(
             state=state,

@@ -131,7 +131,7 @@ class TrackingState:
             variance = np.diag(state.covariance + last.covariance)[6:]
             process_noise = process_noise.updated(state.velocity - last.velocity, interval_s, variance)
         odometry_noise = self.odometry_noise.updated(prior, motion, config)
-        conflicts = 0 if prior.conflict(motion) is None else self.conflicts + 1
+        conflicts = 0 if odometry_noise.conflict(prior, motion, interval_s) is None else self.conflicts + 1
         return replace(self, process_noise=process_noise, odometry_noise=odometry_noise, conflicts=conflicts)
 
     def with_prediction_error(self, error_m: float) -> "TrackingState":

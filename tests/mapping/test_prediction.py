@@ -213,8 +213,11 @@ def test_an_odometry_that_measures_a_clearly_different_motion_conflicts():
     covariance = np.diag(np.array([0.001] * 3 + [0.01] * 3) ** 2)
     prior = Prior(exp(np.array([0.0, 0.0, 0.0, 0.1, 0.02, 0.0])), covariance=covariance)
     still, along, fast = (exp(np.array([0.0, 0.0, 0.0, x, 0.02, 0.0])) for x in (0.0, 0.13, 1.0))
-    assert prior.conflict(still) == "x"
-    assert prior.conflict(along) is None, "within four standard deviations"
-    assert replace(prior, T_prev_curr=fast).conflict(exp(np.array([0.0, 0.0, 0.0, 1.2, 0.0, 0.0]))) is None, "a fifth"
-    assert replace(prior, covariance=None).conflict(still) is None
-    assert Prior().conflict(still) is None
+    assert OdometryNoise().conflict(prior, still, 0.1) == "x"
+    assert OdometryNoise().conflict(prior, along, 0.1) is None, "within four standard deviations"
+    assert OdometryNoise().conflict(prior, still, 0.03) is None, "faster than people walk"
+    assert OdometryNoise(variance=10.0).conflict(prior, still, 0.1) is None, "known to be that wrong"
+    faster = exp(np.array([0.0, 0.0, 0.0, 1.2, 0.02, 0.0]))
+    assert OdometryNoise().conflict(replace(prior, T_prev_curr=fast), faster, 0.2) is None, "a fifth"
+    assert OdometryNoise().conflict(replace(prior, covariance=None), still, 0.1) is None
+    assert OdometryNoise().conflict(Prior(), still, 0.1) is None
