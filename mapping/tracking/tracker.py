@@ -19,7 +19,7 @@ from lidarslam.mapping.tracking.relocalisation import ArchivedMaps, SpreadSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
-# Scans in a row at which odometry and registration conflict: 6 to 22 amid what moves along, at most 5 elsewhere.
+# Scans in a row at which odometry and registration conflict: 10 to 22 in crowds that walk along, at most 5 elsewhere.
 _LASTING_CONFLICT = 6
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
