@@ -28,7 +28,6 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -159,14 +158,11 @@ def judged_runs(
         methods.insert(0, REFERENCE)
     for scans in starts_of(len(recording), arguments.every, arguments.scans, step):
         of_length = None if uses_reference else truth
-        for method, yaw_deg in product(methods, arguments.yaws):
-            if method in OPTIONS:
-                ended = run_ours(method, source, scans, yaw_deg)
-            elif yaw_deg == arguments.yaws[0]:
-                ended = run_other(method, recording, scans)
-            else:
-                continue
-            if uses_reference and method == REFERENCE and yaw_deg == arguments.yaws[0]:
+        runs = [(method, yaw_deg) for method in methods for yaw_deg in (arguments.yaws if method in OPTIONS else [0.0])]
+        for method, yaw_deg in runs:
+            is_ours = method in OPTIONS
+            ended = run_ours(method, source, scans, yaw_deg) if is_ours else run_other(method, recording, scans)
+            if method == REFERENCE and of_length is None:
                 of_length = ended.trajectory
             judged = judge(ended, scans, truth, of_length, arguments.shortest)
             _report(f"{recording.name} step {step} start {scans.start} {method}: {_line(judged)} {ended.message}")

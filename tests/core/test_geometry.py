@@ -184,3 +184,12 @@ def test_displacement_bounds_how_far_points_move_and_is_reached(rng):
     moved_m = np.linalg.norm(g.transform_points(g.exp(xi), points) - points, axis=1)
     assert g.displacement_m(xi, 7.0) == pytest.approx(0.0207)
     assert moved_m.max() == pytest.approx(0.0207, rel=1e-6)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.48, -0.6, -0.64), (0.0, 0.0, -1.0)])
+def test_levelling_turns_up_to_z(up):
+    R = g.levelling(np.array(up))
+    np.testing.assert_allclose(R @ np.array(up), [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    assert g.rotation_angle(R) == pytest.approx(np.arccos(up[2]), abs=1e-7)

@@ -235,14 +235,17 @@ def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> 
 @pytest.mark.parametrize("name", ["office", pytest.param("forest", marks=pytest.mark.slow)])
 def test_nothing_drifts_while_the_sensor_stands_still(name):
     """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 50 scans."""
-    recorded = stand(build_world(name, 0), 50)
-    mapper = Mapper(MappingConfig())
-    results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
-    assert {result.status for result in results} == {Status.OK}
-    poses = np.array([result.state.T_world_lidar for result in results])
-    drift = inverse(poses[10]) @ poses[40:]
-    assert np.linalg.norm(drift[:, :3, 3].mean(axis=0)) < 0.01
-    assert np.rad2deg(rotation_angle(drift)).mean() < 0.12  # 0.03 to 0.1, by the seed of the world
+    turned_deg = []
+    for seed in range(3):
+        recorded = stand(build_world(name, seed), 50)
+        mapper = Mapper(MappingConfig())
+        results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
+        assert {result.status for result in results} == {Status.OK}
+        poses = np.array([result.state.T_world_lidar for result in results])
+        drift = inverse(poses[10]) @ poses[40:]
+        assert np.linalg.norm(drift[:, :3, 3].mean(axis=0)) < 0.01
+        turned_deg.append(np.rad2deg(rotation_angle(drift)).mean())
+    assert np.mean(turned_deg) < 0.08
 
 
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
