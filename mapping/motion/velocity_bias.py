@@ -40,9 +40,7 @@ class VelocityBias:
 
     correction: Annotated[FloatArray, Shape(6)] = field(default_factory=lambda: np.zeros(6))  # rotation first
 
-    def updated(
-        self, last: MotionState, state: MotionState, seen_from_s: float, method: str = "surfels"
-    ) -> "VelocityBias":
+    def updated(self, last: MotionState, state: MotionState, seen_from_s: float, method: str) -> "VelocityBias":
         """The bias after another sweep, as a method estimated it, and the corrected one before; none after a gap.
 
         The sweep begins `seen_from_s` before its stamp.

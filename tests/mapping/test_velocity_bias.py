@@ -26,7 +26,7 @@ def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s):
     bias, last = VelocityBias(), swept(0, VELOCITY + BIAS, seen_from_s)
     for number in range(1, 60):
         state = swept(number, VELOCITY + BIAS, seen_from_s)
-        bias = bias.updated(last, state, seen_from_s)
+        bias = bias.updated(last, state, seen_from_s, "surfels")
         last = bias.corrected(state)
     np.testing.assert_allclose(last.velocity, VELOCITY, atol=1e-6)
     np.testing.assert_allclose(bias.correction, -BIAS, atol=1e-6)
@@ -35,14 +35,18 @@ def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s):
 def test_a_sudden_acceleration_is_no_bias():
     """Of 360 deg/s and 30 m/s, 2.4 degrees and 10 cm per second are taken over."""
     sudden = np.array([0.0, 0.0, np.deg2rad(360.0), 30.0, 0.0, 0.0])
-    bias = VelocityBias().updated(swept(0, VELOCITY - sudden, 0.0), swept(1, VELOCITY, 0.0), 0.0)
+    bias = VelocityBias().updated(swept(0, VELOCITY - sudden, 0.0), swept(1, VELOCITY, 0.0), 0.0, "surfels")
     np.testing.assert_allclose(bias.correction[[2, 3]], [np.deg2rad(2.4), 0.1], rtol=1e-6)
 
 
 def test_a_gap_between_sweeps_begins_anew():
     biased = VelocityBias(BIAS)
-    assert np.array_equal(biased.updated(swept(0, VELOCITY, 0.0), swept(2, VELOCITY, 0.0), 0.0).correction, np.zeros(6))
-    assert np.array_equal(biased.updated(swept(1, VELOCITY, 0.0), swept(1, VELOCITY, 0.0), 0.0).correction, np.zeros(6))
+    assert np.array_equal(
+        biased.updated(swept(0, VELOCITY, 0.0), swept(2, VELOCITY, 0.0), 0.0, "surfels").correction, np.zeros(6)
+    )
+    assert np.array_equal(
+        biased.updated(swept(1, VELOCITY, 0.0), swept(1, VELOCITY, 0.0), 0.0, "surfels").correction, np.zeros(6)
+    )
 
 
 def test_the_pose_follows_as_it_is_correlated():
@@ -60,7 +64,7 @@ def test_the_loop_of_correction_and_map_is_damped():
     bias, last, errors = VelocityBias(), swept(0, VELOCITY + BIAS, 0.05), []
     for number in range(1, 30):
         state = swept(number, last.velocity, 0.05)
-        bias = bias.updated(last, state, 0.05)
+        bias = bias.updated(last, state, 0.05, "surfels")
         last = bias.corrected(state)
         errors.append((last.velocity - VELOCITY) / np.where(BIAS == 0.0, np.inf, BIAS))
     assert np.abs(errors[15:]).max() < 0.15
