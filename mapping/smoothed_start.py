@@ -103,8 +103,8 @@ def smoothed_start(
     if not needed or len(taken) < SHOWING:
         return {}
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
-    is_right = sum(one.status is Status.OK for one in known) >= _LEAST_OK * len(known) or _constraint(known) > least
-    if len(known) < _FEWEST_KNOWN or not is_right:
+    is_plausible = sum(one.status is Status.OK for one in known) >= _LEAST_OK * len(known) or _constraint(known) > least
+    if len(known) < _FEWEST_KNOWN or not is_plausible:
         return {}
     end_s = taken[-1].stamp
     reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))

@@ -173,7 +173,10 @@ class OdometryNoise:
         return _squared_error(prior, T_prev_curr, config) <= _GATE * self.variance if self.is_proven(prior) else None
 
     def conflict(self, prior: Prior, T_prev_curr: FloatArray, interval_s: float) -> str | None:
-        """The axis along which an odometry alone measured a clearly different motion than (4, 4); None for none."""
+        """The axis along which the odometry's translation differs most from a registered motion's (4, 4).
+
+        None where the two agree, where the odometry is overruled, and with an IMU.
+        """
         if prior.T_prev_curr is None or prior.covariance is None or prior.inertial is not None:
             return None
         apart = log(inverse(prior.T_prev_curr) @ T_prev_curr)[3:]
