@@ -21,7 +21,7 @@ from lidarslam.mapping.global_map.drawing import DrawnMap, TiledMap, drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.mapping.global_map.tile_store import Tile
+from lidarslam.mapping.global_map.voxels import Tile
 from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.run.elevation import Elevation

@@ -22,7 +22,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.global_map.drawing import DrawnMap
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import GivenLoops
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start

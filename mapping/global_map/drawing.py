@@ -11,7 +11,7 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import NORMALS_MARGIN_M, GlobalMap, VoxelMeans
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.mapping.global_map.tile_store import Tile, Tiling
+from lidarslam.mapping.global_map.voxels import Tile, Tiling
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 logger = logging.getLogger(__name__)

@@ -10,20 +10,21 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
-from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxels import (
     COUNT,
     POSITION,
     VIEW,
     Layout,
     Rows,
+    Tile,
+    TileStore,
+    Tiling,
     Voxels,
     column_cells,
     row_cells,
     write_sums,
 )
-from lidarslam.mapping.surfels.hash_kernels import EMPTY
-from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
+from lidarslam.mapping.surfels.voxel_hash import EMPTY, key_cells, point_keys, reach_m
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000

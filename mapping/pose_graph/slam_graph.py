@@ -22,7 +22,7 @@ from lidarslam.core.state import TRANSFORM
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine

@@ -19,8 +19,14 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
-from lidarslam.mapping.motion.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
-from lidarslam.mapping.motion.velocity_bias import velocity_error
+from lidarslam.mapping.motion.prediction import (
+    LOST_MOTION,
+    UNKNOWN_VELOCITY,
+    MotionState,
+    Prediction,
+    Prior,
+    velocity_error,
+)
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap

@@ -7,8 +7,8 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
 from lidarslam.core.state import decode
-from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE
 from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
+from lidarslam.mapping.loam.features import EDGE, PLANE
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.local_map import LocalMap

@@ -9,8 +9,8 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempt import Attempt
 from lidarslam.mapping.tracking.budget import Budget
+from lidarslam.mapping.tracking.mapped_scan import Attempt
 from lidarslam.mapping.tracking.near_search import NearSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracking_state import TrackingState
