@@ -17,7 +17,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, means_points, vox
 from lidarslam.mapping.loops.detection import KeyframeDatabase
 from lidarslam.mapping.loops.refinement import DenseSubmap
 from lidarslam.mapping.pose_graph.edges import drift_covariance
-from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
 from lidarslam.pipeline.threads import in_order
 from lidarslam.simulation.recorder import Simulation
 

@@ -50,7 +50,7 @@ def _cells(scans: list[Scan]) -> list[str]:
     mapper, grid, rows = Mapper(MappingConfig(method="loam")), None, []
     for scan in scans:
         sampled = mapper.sample(scan)
-        state = mapper.process_sampled(sampled, Prior()).state
+        state = mapper.process(sampled, Prior()).state
         assert sampled.sweep.kinds is not None
         assert sampled.keypoints.kinds is not None
         planes, keypoints = (

@@ -82,7 +82,7 @@ def _register(method: str) -> None:
 
     mapper = Mapper(MappingConfig(method=method))
     for scan in made_up_scans():
-        mapper.process(scan, Prior(_STEP, None))
+        mapper.process(mapper.sample(scan), Prior(_STEP, None))
 
 
 def _surfels() -> None:

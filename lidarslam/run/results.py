@@ -156,7 +156,7 @@ def write_results(
     if drawn.warning is not None:
         log.warn(drawn.warning)
     if drawn.cloud is not None and not len(drawn.cloud):
-        log.warn("the map is empty: min_range_m, max_range_m and min_hits of global_map leave no point")
+        log.warn("the map is empty: min_range_m and max_range_m of global_map leave no point")
     skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out
     contradictions = find_contradictions(scans.slides, log.trajectory.T_world_lidar)
     graph = None if closed is None else closed.summary

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple, Protocol, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,14 +81,6 @@ _LEVEL_COSINE = 0.7
 _FORGET_AFTER = 0.2
 
 
-class Grid(Protocol):
-    """Cells of one size."""
-
-    def __len__(self) -> int: ...
-    def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
-        """Drop the cells farther than `radius_m` from `centre` (3,)."""
-
-
 class LocalMap(Stateful, ABC):
     """Surfaces within a radius of the sensor, in several resolutions."""
 
@@ -106,8 +98,8 @@ class LocalMap(Stateful, ABC):
 
     @property
     @abstractmethod
-    def grids(self) -> Sequence[Grid]:
-        """Its cells of all resolutions."""
+    def grids(self) -> Sequence[Any]:
+        """Its cells of all resolutions, each with `__len__` and `drop_beyond`."""
 
     @property
     def is_young(self) -> bool:

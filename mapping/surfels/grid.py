@@ -23,7 +23,6 @@ from lidarslam.mapping.surfels.surfel_kernels import (
     look_up,
     refresh,
     turn_to_sensor,
-    within,
 )
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC
 from lidarslam.mapping.surfels.voxel_hash import (
@@ -178,9 +177,8 @@ class SurfelGrid(Stateful):
 
     def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the cells farther than `radius_m` from `centre` (3,)."""
-        kept = np.empty(len(self), dtype=np.intp)
-        count = within(self._keys[: len(self)], self.cell_m, np.ascontiguousarray(centre), radius_m, kept)
-        self._keep(kept[:count])
+        away = (key_cells(self._keys[: len(self)]) + 0.5) * self.cell_m - centre
+        self._keep(np.flatnonzero((away**2).sum(axis=1) <= radius_m**2))
 
     def tidy(self) -> None:
         """Recompute all surfels, and drop stray cells.

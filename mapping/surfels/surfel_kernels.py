@@ -124,18 +124,6 @@ def add_moments(
 
 
 @compiled
-def within(keys: Keys, cell_m: float, centre: FloatArray, radius_m: float, rows: NDArray[np.intp]) -> int:
-    """Write which cells (M,) have their centres within a radius of a point (3,), ascending; return their number."""
-    count = 0
-    for n in range(len(keys)):
-        x, y, z = middle_of(keys[n])
-        x, y, z = x * cell_m - centre[0], y * cell_m - centre[1], z * cell_m - centre[2]
-        rows[count] = n
-        count += x * x + y * y + z * z <= radius_m * radius_m
-    return count
-
-
-@compiled
 def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     """Write the rows (N,) of the cells of points (N, 3), else of the nearest around; or `ABSENT`."""
     scale, last = 1.0 / cells.cell_m, len(points) - 1

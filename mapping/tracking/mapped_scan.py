@@ -148,6 +148,7 @@ class MappedScan:
     turn_rate: FloatArray | None = None  # (3,) rad/s within the sweep, in the LiDAR frame; None without point times
     # (6,) body velocity of the first scan as the second shows it, in the result of the second; None in all others
     first_velocity: FloatArray | None = None
+    cell_m: float | None = None  # edge of the finest cells of a local map
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU
 
     @classmethod

@@ -17,8 +17,6 @@ from lidarslam.mapping.tracking.relocalisation import ArchivedMaps, SpreadSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
-# Scans in a row at which odometry and registration conflict: 10 to 22 in crowds that walk along, at most 5 elsewhere.
-_LASTING_CONFLICT = 6
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
 
@@ -110,8 +108,7 @@ class Tracker(Stateful):
         fits = fits or tracking.odometry_noise.agrees(cautious, motion, self._config) is True
         unexpected = not relocalised and replace(attempt, prediction=prediction).has_jumped
         unconfirmed, adrift = tracking.is_unconfirmed, len(self._archive) > 0
-        interval_s, lasts = scan.stamp - last.stamp, tracking.conflicts >= _LASTING_CONFLICT
-        conflict = tracking.odometry_noise.conflict(prior, motion, interval_s) if lasts else None
+        conflict = None if relocalised else tracking.lasting_conflict
         status, message = judge(attempt, unconfirmed, unexpected, adrift, conflict, self._config.tracking)
         return MappedScan(
             state=state,

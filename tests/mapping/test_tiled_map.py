@@ -98,19 +98,17 @@ def in_tiles(built: GlobalMap, views: PlacedViews, config: GlobalMapConfig = CON
     return tiles
 
 
-@pytest.mark.parametrize("min_hits", [1, 2])
-def test_tiles_together_are_the_map_in_one_piece(views, min_hits):
-    config = CONFIG.model_copy(update={"min_hits": min_hits})
+def test_tiles_together_are_the_map_in_one_piece(views):
     whole, built = walked(GlobalMap(VOXEL_M)), walked(GlobalMap(VOXEL_M, MOST))
     assert whole.is_whole
     assert not built.is_whole
-    expected = drawn_map(whole, views, config)
+    expected = drawn_map(whole, views, CONFIG)
     assert expected.tiled is None
-    assert expected.moved > (10 if min_hits == 1 else 0)
-    drawn = drawn_map(built, views, config)
+    assert expected.moved > 10
+    drawn = drawn_map(built, views, CONFIG)
     assert drawn.moved == expected.moved
     assert drawn.tiled.total == len(expected.cloud)
-    tiles = in_tiles(built, views, config)
+    tiles = in_tiles(built, views)
     assert len(tiles) > 8
     for (x, y), cloud in tiles.items():
         low = np.array([x, y]) * drawn.tiled.tiling.edge_m
