@@ -133,7 +133,7 @@ class GlobalMap(Stateful):
     @property
     def tiling(self) -> Tiling:
         """The tiles of the map."""
-        return Tiling.of(self.voxel_size_m)
+        return Tiling(self.voxel_size_m)
 
     def tiles(self) -> list[Tile]:
         """All tiles that have voxels, in memory or not."""

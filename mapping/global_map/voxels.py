@@ -29,6 +29,11 @@ Keys = NDArray[np.int64]
 Rows = NDArray[np.float32]
 
 _reach_m = compiled_part(reach_m)
+# Edge of a tile, as near as a whole number of voxels comes.
+_EDGE_M = 100.0
+_CODE_BITS = 32
+Tile = tuple[int, int]
+"""Number of a tile along x and y: tile (0, 0) begins at the origin of the world."""
 
 
 @dataclass(frozen=True)
@@ -215,9 +220,8 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Rows, summed: int, unique:
         row = order[n]
         if count == 0 or keys[row] != unique[count - 1]:
             unique[count] = keys[row]
-            for column in range(
-                columns
-            ):  # copying a whole row brings the text of its error, which takes 4 s to compile
+            # Copying a whole row brings the text of its error, which takes 4 s to compile.
+            for column in range(columns):
                 totals[count, column] = sums[row, column]
             count += 1
         else:
@@ -258,25 +262,16 @@ def _is_earlier(row: Rows, other: Rows, column: int) -> bool:
     return bool(high < 0.0 or (high == 0.0 and rest < 0.0))
 
 
-# Edge of a tile, as near as a whole number of voxels comes.
-_EDGE_M = 100.0
-_CODE_BITS = 32
-
-Tile = tuple[int, int]
-"""Number of a tile along x and y: tile (0, 0) begins at the origin of the world."""
-
-
 @dataclass(frozen=True)
 class Tiling:
     """Tiles of a whole number of voxels, so that each voxel lies in one."""
 
     voxel_size_m: float
-    cells: int  # voxels along an edge
 
-    @classmethod
-    def of(cls, voxel_size_m: float) -> "Tiling":
-        """Of a map with such voxels."""
-        return cls(voxel_size_m, max(1, round(_EDGE_M / voxel_size_m)))
+    @property
+    def cells(self) -> int:
+        """Number of voxels along an edge."""
+        return max(1, round(_EDGE_M / self.voxel_size_m))
 
     @property
     def edge_m(self) -> float:

@@ -52,6 +52,8 @@ _LEAST_COSINE = 0.1
 _PREFETCHED = 4
 # A voxel with this many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
+# Correspondences are kept over a displacement of this share of a cell.
+_SAME_CELLS = 0.1
 
 
 class Voxels(NamedTuple):
@@ -261,10 +263,6 @@ def _write_line(
     for residual in range(2):
         found.thickness_m[n, residual], found.tilt[n, residual] = thickness_m, tilt
     found.counts[n] = 2
-
-
-# Correspondences are kept over a displacement of this share of a cell.
-_SAME_CELLS = 0.1
 
 
 class VoxelGrid(Stateful):

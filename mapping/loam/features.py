@@ -23,6 +23,23 @@ _APART_M2 = 0.05
 _GAP_M2, _BESIDE = 0.1, 0.1
 # Surfaces nearly parallel to the beam: squared distances of both neighbours per squared range.
 _PARALLEL = 0.0002
+# Largest number of edges that are registered, and their spacing in cells.
+_MOST_EDGES, _EDGE_SPACING = 1000, 1.0
+# Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
+_MOST_SPACING_M = 0.4
+# Curvature above which a point is an edge, square metres: that of the authors' program. All others are planar.
+_CURVATURE_M2 = 0.1
+# An edge needs this many times the median curvature as well. Flat surfaces seen with a range noise of more than one
+# centimetre exceed the published threshold all over, and these edges, on rings that move with the sensor, hold it back.
+_ABOVE_NOISE = 10.0
+# The median is taken over one in this many points.
+_SAMPLED = 4
+# A cloud is stored ring after ring when nearly all azimuths run in one sense, over at least this many rings.
+_SAME_WAY, _FEWEST_RINGS = 0.95, 4
+# Width of the bins of elevation in which rings are peaks, and least height of a peak as a share of the mean.
+_BIN_RAD, _LEAST_PEAK = np.deg2rad(0.05), 0.5
+# Without peaks, rows of this height.
+_ROW_RAD = np.deg2rad(0.5)
 
 
 @compiled
@@ -126,25 +143,6 @@ def _pick_edges(
 @compiled_part
 def _squared_distance(p: FloatArray, q: FloatArray) -> float:
     return float((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
-
-
-# Largest number of edges that are registered, and their spacing in cells.
-_MOST_EDGES, _EDGE_SPACING = 1000, 1.0
-# Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
-_MOST_SPACING_M = 0.4
-# Curvature above which a point is an edge, square metres: that of the authors' program. All others are planar.
-_CURVATURE_M2 = 0.1
-# An edge needs this many times the median curvature as well. Flat surfaces seen with a range noise of more than one
-# centimetre exceed the published threshold all over, and these edges, on rings that move with the sensor, hold it back.
-_ABOVE_NOISE = 10.0
-# The median is taken over one in this many points.
-_SAMPLED = 4
-# A cloud is stored ring after ring when nearly all azimuths run in one sense, over at least this many rings.
-_SAME_WAY, _FEWEST_RINGS = 0.95, 4
-# Width of the bins of elevation in which rings are peaks, and least height of a peak as a share of the mean.
-_BIN_RAD, _LEAST_PEAK = np.deg2rad(0.05), 0.5
-# Without peaks, rows of this height.
-_ROW_RAD = np.deg2rad(0.5)
 
 
 class FeatureSampler(Sampler):

@@ -40,6 +40,32 @@ _SAMPLES = 2000
 # Edge of a cell of the view from above, in surfel cells, and of the parts of the map that are drawn, in such cells,
 # with their overlap.
 _VIEW_SCALE, _VIEW_CELLS, _OVERLAP_CELLS = 4.0, 800, 30
+# Places around a supposed one that are tried: distance, in cells, and turn.
+_NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
+# Radius of the view from above and of the points that are registered, in median ranges; places that are
+# tried, and the largest number with one heading.
+_RANGES, _PLACES, _PEAKS = 3.0, 32, 8
+# Points that are registered first, and the share of the best quality above which all points are.
+_FEW_POINTS, _LIKELY = 500, 0.5
+# Of these, that are registered.
+_PROMISING = 16
+# A region of the map serves several places: it is larger than the scans' reach by this factor. Number of them kept.
+_SPARE, _REGIONS = 1.5, 8
+# Other scans that must fit, and their largest deviation from the recording's own motion: angle and distance.
+_OTHERS = 5
+_MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
+# Standard deviations of a place that may be anywhere near, and of one that follows from another: radians, metres.
+_ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
+_STILL = 1e-3
+# Least averages over the scans: inlier ratio, share of inliers among all points, directional support.
+_LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
+# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it. At
+# 0.8 a wrong place in a row of equal houses was taken.
+_RIVAL = 0.6
+_SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
+# A scan is kept after this distance, in median ranges, or this turn. The latest are kept.
+_APART_RANGES, _APART_RAD = 0.25, np.deg2rad(30.0)
+_MOST = 24
 
 
 class FixedMap:
@@ -116,34 +142,6 @@ class Regions:
         region = self._map.region(position, self._reach_m + self._spare_m, self.cell_m)
         self._drawn = [*self._drawn, (position.copy(), region)][-self._kept :]
         return region
-
-
-# Places around a supposed one that are tried: distance, in cells, and turn.
-_NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
-# Radius of the view from above and of the points that are registered, in median ranges; places that are
-# tried, and the largest number with one heading.
-_RANGES, _PLACES, _PEAKS = 3.0, 32, 8
-# Points that are registered first, and the share of the best quality above which all points are.
-_FEW_POINTS, _LIKELY = 500, 0.5
-# Of these, that are registered.
-_PROMISING = 16
-# A region of the map serves several places: it is larger than the scans' reach by this factor. Number of them kept.
-_SPARE, _REGIONS = 1.5, 8
-# Other scans that must fit, and their largest deviation from the recording's own motion: angle and distance.
-_OTHERS = 5
-_MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
-# Standard deviations of a place that may be anywhere near, and of one that follows from another: radians, metres.
-_ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
-_STILL = 1e-3
-# Least averages over the scans: inlier ratio, share of inliers among all points, directional support.
-_LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
-# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it. At
-# 0.8 a wrong place in a row of equal houses was taken.
-_RIVAL = 0.6
-_SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
-# A scan is kept after this distance, in median ranges, or this turn. The latest are kept.
-_APART_RANGES, _APART_RAD = 0.25, np.deg2rad(30.0)
-_MOST = 24
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,8 @@ from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, Relativ
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap, SubmapFile
 from lidarslam.mapping.loops.verification import GUESS_SIGMAS, MIN_INLIERS, SubmapCloud, Verification, verify
 
+logger = logging.getLogger(__name__)
+
 # Shorter paths back are no loops, in median ranges and in metres.
 _MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0
 # Candidates of either kind that are verified: each costs some 30 ms.
@@ -47,6 +49,24 @@ _ROUGH_RANGES = 0.3
 _AMBIGUOUS = 0.9
 # Standard deviations of drift that a closure may correct: a candidate by appearance may be anywhere.
 _MAX_SIGMAS, _MAX_SIGMAS_BY_APPEARANCE = 3.0, 2.0
+# Distance after a closure before the next is sought: another would repeat it. After many in a row it is the median
+# range: more of them cost time without improving the trajectory.
+_SPACING_M = 2.0
+_MANY = 40
+# A closure near the estimate needs no other while drift is less than this part of the median range.
+_ALONE_RANGES = 0.5
+# Any other needs this many consistent ones, spread over this distance, in median ranges.
+_CONSISTENT, _SPAN_RANGES = 2, 1.0
+# Distance after which a closure that no other is consistent with is rejected.
+_PENDING_M = 100.0
+# A cycle whose standard deviation exceeds this part of the median range closes for any links.
+_SIGNIFICANT_RANGES = 0.25
+# A closure by appearance needs this many times the support of its rivals, of which the last count.
+_OUTVOTED = 3
+_RIVALS = 5
+# A closure is compared with at most this many of those before it.
+_MEMORY = 40
+_ALONE = "no other closure agrees"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +96,7 @@ class KeyframeDatabase(Stateful):
         self._config = config
         self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
         self.submaps = SubmapFile(directory)
-        self._descriptors = np.empty((0, 1, 1), dtype=np.complex64)  # (N, ...), with room for more keyframes
+        self._descriptors: list[NDArray[np.complex64]] = []
 
     def __len__(self) -> int:
         return len(self.submaps)
@@ -97,12 +117,7 @@ class KeyframeDatabase(Stateful):
     def keep(self, points: FloatArray) -> None:
         """Keep the submap (N, 3) of the next keyframe, whose estimate is known or follows."""
         self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))
-        descriptor = BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m)
-        if len(self) > len(self._descriptors):
-            room = np.zeros((max(64, 2 * len(self)), *descriptor.shape), dtype=np.complex64)
-            room[: len(self) - 1] = self._descriptors[: len(self) - 1].reshape(-1, *descriptor.shape)
-            self._descriptors = room
-        self._descriptors[len(self) - 1] = descriptor
+        self._descriptors.append(BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m))
 
     def cloud(self, index: int) -> SubmapCloud:
         """A keyframe with those before and after it in its segment."""
@@ -131,9 +146,7 @@ class KeyframeDatabase(Stateful):
             yield from self._alike(index, others)
 
     def _compare(self, view: BirdEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        is_run = others[-1] - others[0] == len(others) - 1  # as within one segment: a view of them is no copy
-        chosen = self._descriptors[slice(others[0], others[-1] + 1) if is_run else others]
-        return compare(view.descriptor(self.radius_m), chosen)
+        return compare(view.descriptor(self.radius_m), np.array([self._descriptors[k] for k in others]))
 
     def _nearby(self, index: int, others: NDArray[np.intp]) -> Iterator[Candidate]:
         """Earlier keyframes of the segment within reach of the estimate."""
@@ -222,28 +235,6 @@ def _spread(indices: NDArray[np.intp], cost: FloatArray, count: int) -> list[int
         if all(abs(int(indices[k]) - int(indices[c])) >= _APART for c in chosen):
             chosen.append(int(k))
     return chosen
-
-
-logger = logging.getLogger(__name__)
-
-# Distance after a closure before the next is sought: another would repeat it. After many in a row it is the median
-# range: more of them cost time without improving the trajectory.
-_SPACING_M = 2.0
-_MANY = 40
-# A closure near the estimate needs no other while drift is less than this part of the median range.
-_ALONE_RANGES = 0.5
-# Any other needs this many consistent ones, spread over this distance, in median ranges.
-_CONSISTENT, _SPAN_RANGES = 2, 1.0
-# Distance after which a closure that no other is consistent with is rejected.
-_PENDING_M = 100.0
-# A cycle whose standard deviation exceeds this part of the median range closes for any links.
-_SIGNIFICANT_RANGES = 0.25
-# A closure by appearance needs this many times the support of its rivals, of which the last count.
-_OUTVOTED = 3
-_RIVALS = 5
-# A closure is compared with at most this many of those before it.
-_MEMORY = 40
-_ALONE = "no other closure agrees"
 
 
 class LoopDetector(Stateful):

@@ -39,6 +39,15 @@ _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
 _CONFLICT_SQUARED, _CONFLICT_M, _CONFLICT_SHARE, _WALKING_M_S = 16.0, 0.03, 0.25, 2.0
 # Consistent motions in a row after which an odometry may reject a registration.
 _PROVEN_AFTER = 10
+# Share of a difference by which the correction changes with a sweep, rotation first. The map receives the corrected
+# sweeps, and the next velocity is estimated from that: with a gain g, both together swing with a damping ratio of half
+# its square root. With surfels, a third let an office's pitch swing ever wider; in the sparse sweeps of a Mid-360, more
+# is noise. LOAM's features do not swing, and in fields they are noisier.
+_GAINS = {"surfels": np.array([0.8] * 3 + [0.5] * 3), "loam": np.full(6, 0.3)}
+# The largest difference that counts, rad/s and m/s: a sudden acceleration makes a larger one, and is no bias.
+_MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
+# Sweeps follow one another where they cover this share of the interval between their stamps.
+_COVERED = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +75,6 @@ class Prior:
     covariance: FloatArray | None = None
     inertial: "MotionState | None" = None  # the state that an IMU predicts
     caution: float = 10.0  # factor on the odometry's own standard deviations: its errors are correlated in time
-
-    def without_odometry(self) -> "Prior":
-        """The measurement of an IMU alone."""
-        return Prior(inertial=self.inertial)
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
         """(6, 6) of the motion: the odometry's own, with its caution, or the configured one."""
@@ -218,10 +223,6 @@ class Prediction(MotionState):
         away = log(inverse(self.T_world_lidar) @ T_world_lidar)
         return float(away @ np.linalg.solve(self.covariance[:6, :6], away)) < _GATE
 
-    def is_known_along(self, direction: FloatArray, distance_m: float) -> bool:
-        """Whether it is an IMU's, with no larger standard deviation along a direction (3,) of the world."""
-        return self.is_inertial and self.sigma_along(direction) < distance_m
-
     def sigma_along(self, direction: FloatArray) -> float:
         """Standard deviation of the position along a direction (3,) of the world, metres."""
         along = self.T_world_lidar[:3, :3].T @ direction
@@ -331,17 +332,6 @@ def _process_covariance(last: MotionState, interval_s: float, seen_from_s: float
     Q[:6, 6:] = Q[6:, :6] = np.diag(change * ahead_s)
     Q[6:, 6:] = np.diag(change)
     return Q
-
-
-# Share of a difference by which the correction changes with a sweep, rotation first. The map receives the corrected
-# sweeps, and the next velocity is estimated from that: with a gain g, both together swing with a damping ratio of half
-# its square root. With surfels, a third let an office's pitch swing ever wider; in the sparse sweeps of a Mid-360, more
-# is noise. LOAM's features do not swing, and in fields they are noisier.
-_GAINS = {"surfels": np.array([0.8] * 3 + [0.5] * 3), "loam": np.full(6, 0.3)}
-# The largest difference that counts, rad/s and m/s: a sudden acceleration makes a larger one, and is no bias.
-_MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
-# Sweeps follow one another where they cover this share of the interval between their stamps.
-_COVERED = 0.8
 
 
 def velocity_error(last: MotionState, state: MotionState, share: float) -> FloatArray:

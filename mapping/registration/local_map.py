@@ -15,6 +15,26 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.gauss_newton import geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 
+# Resolutions of a map, in cells. A point's correspondence is the plane of the finest one that has one.
+LEVELS = (1, 2, 4)
+# In a map of fewer scans, planes are of few points: their normals are uncertain.
+_YOUNG_SCANS = 5
+# Surfaces within this cosine of the z axis are floors or ceilings.
+_LEVEL_COSINE = 0.7
+# Cells beyond the radius are dropped each time the sensor has moved by this share of it.
+_FORGET_AFTER = 0.2
+# The plane of a point is part of a large one where the coarsest cell has a plane of nearly its normal, no thicker than
+# this share of that cell.
+_SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
+# Large surfaces suffice where they constrain every direction this many times as well as the noise of their normals.
+_SUFFICIENT = 15.0
+# They contradict a pose from which they alone would move this many cells away. On recordings without crowds: below 0.1.
+_CONTRADICTION_CELLS = 0.2
+# Factor by which small surfaces are less certain then.
+INFLATION = 6.0
+_FEWEST = 100
+_RANGE_NOISE_M, _SCALE_PER_MEDIAN = 0.02, 1.5
+
 
 class Surfaces(NamedTuple):
     """The surfaces that N points correspond to, a row for each point."""
@@ -69,16 +89,6 @@ class Matcher(ABC):
         return Correspondences(
             index, found.points[index], found.normals[chosen], found.thickness_m[chosen], found.tilt[chosen]
         )
-
-
-# Resolutions of a map, in cells. A point's correspondence is the plane of the finest one that has one.
-LEVELS = (1, 2, 4)
-# In a map of fewer scans, planes are of few points: their normals are uncertain.
-_YOUNG_SCANS = 5
-# Surfaces within this cosine of the z axis are floors or ceilings.
-_LEVEL_COSINE = 0.7
-# Cells beyond the radius are dropped each time the sensor has moved by this share of it.
-_FORGET_AFTER = 0.2
 
 
 class LocalMap(Stateful, ABC):
@@ -165,18 +175,6 @@ class LocalMap(Stateful, ABC):
                 grid.drop_beyond(sensor, self._radius_m)
         self.scans += 1
 
-    def goes_on(
-        self, points: FloatArray, normals: FloatArray, sensor: FloatArray, cosine: float, thickness: float
-    ) -> NDArray[np.bool_]:
-        """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), extend over the coarsest cell.
-
-        There, the normal has at least this cosine with theirs, and the standard deviation along it is at most this
-        share of the cell.
-        """
-        coarse, spread_m = self.coarse_planes(points, sensor)
-        is_thin = spread_m < thickness * self.cell_m * LEVELS[-1]
-        return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > cosine))
-
 
 def vertical_of(normals: FloatArray) -> FloatArray:
     """Mean unit normal (3,) of the floors and ceilings among surfaces with normals (M, 3); the z axis without any."""
@@ -186,17 +184,11 @@ def vertical_of(normals: FloatArray) -> FloatArray:
     return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
 
 
-# The plane of a point is part of a large one where the coarsest cell has a plane of nearly its normal, no thicker than
-# this share of that cell.
-_SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
-# Large surfaces suffice where they constrain every direction this many times as well as the noise of their normals.
-_SUFFICIENT = 15.0
-# They contradict a pose from which they alone would move this many cells away. On recordings without crowds: below 0.1.
-_CONTRADICTION_CELLS = 0.2
-# Factor by which small surfaces are less certain then.
-INFLATION = 6.0
-_FEWEST = 100
-_RANGE_NOISE_M, _SCALE_PER_MEDIAN = 0.02, 1.5
+def are_large(local_map: LocalMap, points: FloatArray, normals: FloatArray, sensor: FloatArray) -> NDArray[np.bool_]:
+    """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), are part of large ones."""
+    coarse, spread_m = local_map.coarse_planes(points, sensor)
+    is_thin = spread_m < _MOST_THICKNESS * local_map.cell_m * LEVELS[-1]
+    return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > _SAME_COSINE))
 
 
 def inflation_of_small(
@@ -210,7 +202,7 @@ def inflation_of_small(
     """
     matched = np.flatnonzero(surfaces.counts)
     world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]
-    is_large = local_map.goes_on(world, normals, T_world_lidar[:3, 3], _SAME_COSINE, _MOST_THICKNESS)
+    is_large = are_large(local_map, world, normals, T_world_lidar[:3, 3])
     large = matched[is_large]
     if len(large) < _FEWEST:
         return None

@@ -39,6 +39,27 @@ Floats = NDArray[np.float32]
 OTHER = 15
 # A cell with this many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
+# Surfels that are computed together: the data of one is prefetched while another is computed.
+_TOGETHER = 16
+# A surfel is computed again when its cell has grown by this factor.
+_GROWTH = np.float32(1.5)
+# Decrease of the weight of a neighbouring cell's points, for each coordinate in which it differs.
+_LESS_PER_AXIS = 0.2
+# Least number of points of a plane.
+_FEWEST_POINTS = 6
+# Sine of the least angle to a plane at which one of its sides is seen.
+_LEAST_SINE = 0.17
+# Largest ratio of thickness to width, least ratio of width to length, and least width in cells, of a plane (standard
+# deviations): a narrow strip has the tilt of its noise.
+_MOST_THICKNESS = 0.4
+_LEAST_WIDTH = 0.15
+_LEAST_WIDTH_CELLS = 0.2
+Scratch = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
+"""Room for the rows (27,) of cells around one, and for 15, 6 and 3 numbers."""
+# Least squared cosine between the view of a point and those of its cell for one side.
+_SAME_VIEW = 0.5
+# Columns of surfels: where the normal begins, and whether it is one of a plane.
+_NORMAL, _IS_PLANE = 3, 14
 
 
 class Cells(NamedTuple):
@@ -155,26 +176,6 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
                 if squared < least:
                     nearest, least = row, squared
     return nearest
-
-
-# Surfels that are computed together: the data of one is prefetched while another is computed.
-_TOGETHER = 16
-# A surfel is computed again when its cell has grown by this factor.
-_GROWTH = np.float32(1.5)
-# Decrease of the weight of a neighbouring cell's points, for each coordinate in which it differs.
-_LESS_PER_AXIS = 0.2
-# Least number of points of a plane.
-_FEWEST_POINTS = 6
-# Sine of the least angle to a plane at which one of its sides is seen.
-_LEAST_SINE = 0.17
-# Largest ratio of thickness to width, least ratio of width to length, and least width in cells, of a plane (standard
-# deviations): a narrow strip has the tilt of its noise.
-_MOST_THICKNESS = 0.4
-_LEAST_WIDTH = 0.15
-_LEAST_WIDTH_CELLS = 0.2
-
-Scratch = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
-"""Room for the rows (27,) of cells around one, and for 15, 6 and 3 numbers."""
 
 
 @compiled
@@ -332,12 +333,6 @@ def _view_cosine(own: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
     """Cosine between the view directions of two cells, times the length of the first."""
     length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
     return float((own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9))
-
-
-# Least squared cosine between the view of a point and those of its cell for one side.
-_SAME_VIEW = 0.5
-# Columns of surfels: where the normal begins, and whether it is one of a plane.
-_NORMAL, _IS_PLANE = 3, 14
 
 
 @compiled

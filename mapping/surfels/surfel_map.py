@@ -27,6 +27,19 @@ _FEWEST_POINTS = 6
 _SHARED = 120.0
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5
+# Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
+_COMPACT = 0.5
+# Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
+# direction.
+_CERTAIN_TILT = 0.02
+# No cell has this key.
+_NOWHERE = -1
+# Scans between two removals of stray cells.
+_TIDIED_AFTER = 500
+# Spread of the elevations of points that were seen from many places.
+_ANY_HEIGHT_RAD = 0.2
+# A direction that few walls are parallel to.
+_UNEVEN = np.array([0.46, 0.29, 0.84])
 
 
 @compiled
@@ -128,21 +141,6 @@ def _write(found: Surfaces, n: int, surfel: FloatArray, axis: int, u: float, v: 
     normal[0], normal[1], normal[2] = u, v, w
     found.thickness_m[n, residual], found.tilt[n, residual] = _thickness_m(surfel, axis), tilt
     found.counts[n] += 1
-
-
-# Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
-_COMPACT = 0.5
-# Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
-# direction.
-_CERTAIN_TILT = 0.02
-# No cell has this key.
-_NOWHERE = -1
-# Scans between two removals of stray cells.
-_TIDIED_AFTER = 500
-# Spread of the elevations of points that were seen from many places.
-_ANY_HEIGHT_RAD = 0.2
-# A direction that few walls are parallel to.
-_UNEVEN = np.array([0.46, 0.29, 0.84])
 
 
 class SurfelMatcher(Matcher):

@@ -29,6 +29,9 @@ _ABOVE_BITS = 3
 OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 # Number of elements ahead that loops prefetch.
 PREFETCHED = 16
+_STRIDES = np.array([STRIDE_X, STRIDE_Y, 1], dtype=np.int64)
+_LARGEST_LOAD = 0.4
+_FIRST_BITS = 14
 
 
 @compiled_part
@@ -132,12 +135,6 @@ def middle_of(key: int) -> tuple[float, float, float]:
     mask = (1 << BITS) - 1
     i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
     return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5
-
-
-_STRIDES = np.array([STRIDE_X, STRIDE_Y, 1], dtype=np.int64)
-
-_LARGEST_LOAD = 0.4
-_FIRST_BITS = 14
 
 
 def cell_keys(cells: NDArray[np.int64]) -> Keys:

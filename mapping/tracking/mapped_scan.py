@@ -30,6 +30,8 @@ _MEASURED_TURN = np.deg2rad(5.0)
 # share of inliers depends on how much of the view is new.
 _RELIABLE_RATIO, _RELIABLE_SHARE, _RELIABLE_SUPPORT = 0.85, 0.4, 0.6
 _RIVAL_QUALITY, _RIVAL_CELLS = 1.2, 4.0
+# At the end of the messages of scans that are degraded for no other reason.
+NOT_CONFIRMED = "not confirmed yet"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +55,8 @@ class Attempt:
 
     @property
     def quality(self) -> float:
-        """Score among attempts: share of inliers times directional support."""
-        return self.fit.inlier_share * (self.fit.support or 0.0)
+        """Score among attempts."""
+        return self.fit.quality
 
     @property
     def T_world_lidar(self) -> FloatArray:
@@ -122,10 +124,6 @@ class Attempt:
 def best_of(attempts: Iterable[Attempt]) -> Attempt | None:
     """The attempt of highest quality; None of none."""
     return max(attempts, key=lambda attempt: attempt.quality, default=None)
-
-
-# At the end of the messages of scans that are degraded for no other reason.
-NOT_CONFIRMED = "not confirmed yet"
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,7 +125,7 @@ class NearSearch:
         """Where the odometry is contradicted, or the scan fits poorly with it: by the last motion alone."""
         if not self.state.velocity_known or not (self.prediction.contradicted or self._is_poor(near)):
             return near
-        prior = self.prior.without_odometry()
+        prior = Prior(inertial=self.prior.inertial)
         alone = replace(self, prior=prior, prediction=self._predict(prior))
         other = alone.at_prediction()
         other = other if self.matcher.budget.is_spent else alone.with_any_acceleration(other)

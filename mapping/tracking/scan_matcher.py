@@ -77,7 +77,7 @@ class ScanMatcher:
         if attempt.registration is None or attempt.fit.weakest is None:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
-        is_known = evidence < _HELD_EVIDENCE and start.is_known_along(direction, _KNOWN_M)
+        is_known = start.is_inertial and evidence < _HELD_EVIDENCE and start.sigma_along(direction) < _KNOWN_M
         if is_known and (found := self._found_along(prediction, start, direction, keypoints)) is not None:
             return found
         if not is_known and (self.scan.has_rings or not self.local_map.is_young or evidence > _STROKES_EVIDENCE):

@@ -21,6 +21,11 @@ _BEST = 3
 _HALF_CELLS = 2.0
 # Ridge of the information as a share of its trace, so that a direction without constraints is not decided by noise.
 _RIDGE = 0.005
+# Cells of a single scan's surfels, in cells of the map.
+_CELLS = 2.0
+# Points whose leverage exceeds the mean by this factor constrain a direction that few others do.
+_MANIFOLD = 10.0
+_LEVERAGE_RIDGE = 1e-4
 
 
 def turned_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float) -> FloatArray:
@@ -94,13 +99,6 @@ def _distances(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMa
     matches = local_map.match(world, T_world_lidar, len(LEVELS) - 1)
     distances = matches.residuals(world.take(matches.index, axis=0))
     return matches.normals, distances / (_HALF_CELLS * local_map.cell_m)
-
-
-# Cells of a single scan's surfels, in cells of the map.
-_CELLS = 2.0
-# Points whose leverage exceeds the mean by this factor constrain a direction that few others do.
-_MANIFOLD = 10.0
-_LEVERAGE_RIDGE = 1e-4
 
 
 def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: float, most: int) -> NDArray[np.intp]:

@@ -67,7 +67,7 @@ def views() -> PlacedViews:
 
 
 def test_every_voxel_lies_in_one_tile(rng):
-    tiling = Tiling.of(VOXEL_M)
+    tiling = Tiling(VOXEL_M)
     assert tiling.cells == 40
     points = rng.uniform(-30.0, 30.0, (5000, 3))
     points[:200, :2] = 4.0 * rng.integers(-5, 6, (200, 2))  # on the edges
