@@ -26,11 +26,10 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.loam.feature_kernels import PLANE
-from lidarslam.mapping.loam.feature_map import VoxelGrid
-from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, match_features
+from lidarslam.mapping.loam.feature_map import NEIGHBOURS, VoxelGrid, match_features
+from lidarslam.mapping.loam.features import PLANE
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.registration.surfaces import Surfaces
+from lidarslam.mapping.registration.local_map import Surfaces
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.threads import in_order
 
@@ -51,7 +50,7 @@ def _cells(scans: list[Scan]) -> list[str]:
     mapper, grid, rows = Mapper(MappingConfig(method="loam")), None, []
     for scan in scans:
         sampled = mapper.sample(scan)
-        state = mapper.process_sampled(sampled, Prior()).state
+        state = mapper.process(sampled, Prior()).state
         assert sampled.sweep.kinds is not None
         assert sampled.keypoints.kinds is not None
         planes, keypoints = (

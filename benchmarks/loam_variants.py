@@ -24,9 +24,9 @@ from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam import feature_map, features
-from lidarslam.mapping.loam.neighbour_kernels import add_moments
-from lidarslam.mapping.surfels.hash_kernels import Rows
+from lidarslam.mapping.loam.feature_map import add_moments
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC
+from lidarslam.mapping.surfels.voxel_hash import Rows
 from lidarslam.odometry.config import OdometryConfig
 
 

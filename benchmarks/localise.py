@@ -33,8 +33,8 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
-from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
+from lidarslam.mapping.localization.place_search import FixedMap
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.pipeline.estimates import SweepMotion

@@ -44,7 +44,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, PoseGraphConfig
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig

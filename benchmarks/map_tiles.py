@@ -24,7 +24,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.run.results import draw, write_map
 from lidarslam.run.summary import peak_rss_mb
 from lidarslam.run.summary_text import format_map

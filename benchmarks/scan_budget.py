@@ -64,7 +64,7 @@ def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Ite
         with patch.object(scan_matcher, "register", timed):
             for scan in faulty.scans:
                 started = time.thread_time()
-                results.append(mapper.process(scan, Prior()))
+                results.append(mapper.process(mapper.sample(scan), Prior()))
                 ms.append(1e3 * (time.thread_time() - started))
         late, after = np.array(ms[_WARM_UP:]), [result.status for result in results[faulty.after :]]
         back = [next((n for n, one in enumerate(after) if one in these), None) for these in _BACK]

@@ -13,8 +13,8 @@ from lidarslam.core.text import as_typed, command_line, count, joined
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import format_tum
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
+from lidarslam.mapping.localization.place_search import FixedMap
 from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest, describe_run, log_choices, require_possible

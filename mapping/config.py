@@ -100,7 +100,6 @@ class GlobalMapConfig(Settings):
         0.5, ge=0.0, le=10_000.0, description="nearer points, mostly the carrier itself, are left out"
     )
     max_range_m: float = Field(80.0, ge=1.0, le=10_000.0, description="farther points, sparse and noisy, are left out")
-    min_hits: int = Field(1, ge=1, le=1000, description="scans' points a voxel needs before it is written")
     leave_out_moved: bool = Field(
         True, description="leave out what other scans saw through where it was: people and vehicles that passed"
     )
@@ -123,7 +122,7 @@ class GlobalMapConfig(Settings):
 
 
 class KeyframeConfig(Settings):
-    """When a scan becomes a keyframe; see `mapping.pose_graph.keyframes`."""
+    """When a scan becomes a keyframe; see `mapping.pose_graph.keyframe_graph`."""
 
     distance_m: float | None = Field(
         None, ge=0.1, le=100.0, description="way from one to the next; null: a quarter of the median range, 0.5 to 4 m"

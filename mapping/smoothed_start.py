@@ -1,7 +1,7 @@
 """Smoothing of the first scans: their motions by registration backwards in time, to the map of the scans after them."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -37,24 +37,6 @@ _VELOCITIES = [np.zeros(3)] + [
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothedMotion:
-    """The motion since the previous scan."""
-
-    T_prev_curr: FloatArray  # (4, 4)
-    interval_s: float
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(6, 6), as that of an odometry."""
-        return _COVARIANCE
-
-    @property
-    def velocity(self) -> FloatArray:
-        """(6,) body velocity, rotation first."""
-        return body_velocity(self.T_prev_curr, self.interval_s)
-
-
 class _Tracking:
     """A mapper, with an IMU where there is one."""
 
@@ -69,7 +51,7 @@ class _Tracking:
             prior = self._inertial.prior(scan, prior)
         sampled = self._mapper.sample(scan)
         self.has_rings &= sampled.has_rings
-        mapped = self._mapper.process_sampled(sampled, prior)
+        mapped = self._mapper.process(sampled, prior)
         if self._inertial is not None:
             self._inertial.update(scan, mapped)
         self.results.append(mapped)
@@ -78,8 +60,8 @@ class _Tracking:
 
 def smoothed_start(
     scans: Iterable[Scan], config: MappingConfig, inertial: "Inertial | None" = None
-) -> dict[float, SmoothedMotion]:
-    """Motions of the first scans, by stamp; empty where registration in order suffices.
+) -> dict[float, Prior]:
+    """Motions of the first scans, each since the previous one, by stamp; empty where registration in order suffices.
 
     The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
     scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
@@ -112,14 +94,12 @@ def smoothed_start(
     if len(_tracked_at_last(backwards)) < len(backwards):
         return {}
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
-    return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
+    return {now: Prior(T, body_velocity(T, now - before), _COVARIANCE) for (before, now), T in moved}
 
 
 def _quality(results: list[MappedScan]) -> float:
     """How well scans fit: the mean share of inliers times support."""
-    return float(
-        np.mean([0.0 if one.fit is None else one.fit.inlier_share * (one.fit.support or 0.0) for one in results])
-    )
+    return float(np.mean([0.0 if one.fit is None else one.fit.quality for one in results]))
 
 
 def _constraint(results: list[MappedScan]) -> float:

@@ -18,7 +18,7 @@ from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.following import Follower
 from lidarslam.live.receiving import IMU_DEPTH, ImuReceiver, IncomingQueue, find_imu, find_topic
 from lidarslam.live.statistics import LiveCounts
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.pipeline.compile_ahead import made_up_scans
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser

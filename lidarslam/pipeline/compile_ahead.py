@@ -82,7 +82,7 @@ def _register(method: str) -> None:
 
     mapper = Mapper(MappingConfig(method=method))
     for scan in made_up_scans():
-        mapper.process(scan, Prior(_STEP, None))
+        mapper.process(mapper.sample(scan), Prior(_STEP, None))
 
 
 def _surfels() -> None:
@@ -132,16 +132,16 @@ PARTS = {
     "surfels": Part(
         _surfels,
         (
-            *(f"mapping.surfels.{kind}_kernels" for kind in ("hash", "cell", "correspondence", "side", "surfel")),
+            *(f"mapping.surfels.{name}" for name in ("voxel_hash", "surfel_kernels", "surfel_map")),
             "mapping.registration.linear_kernels",
         ),
     ),
     "loam": Part(
         partial(_register, "loam"),
         (
-            *(f"mapping.loam.{kind}_kernels" for kind in ("feature", "neighbour")),
+            *(f"mapping.loam.{name}" for name in ("features", "feature_map")),
             "mapping.registration.linear_kernels",
-            "mapping.surfels.hash_kernels",
+            "mapping.surfels.voxel_hash",
         ),
     ),
     "alignment": Part(_alignment, tuple(f"odometry.alignment.{kind}" for kind in ("point_to_plane", "steps"))),

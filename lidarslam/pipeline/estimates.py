@@ -11,7 +11,7 @@ from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.motion.prediction import GravityDirection
-from lidarslam.mapping.pose_graph.keyframes import GraphScan
+from lidarslam.mapping.pose_graph.edges import GraphScan
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.odometry.interface import Motion
 
@@ -26,7 +26,7 @@ class ScanOdometry:
     motion: Motion  # the estimated motion since the previous scan
     interval_s: float | None  # time between the two stamps; None when no motion was measured
     stage_ms: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far, see `STAGES`
-    sampled: SampledScan | None = None  # thinned for registration; None where the localiser does it
+    sampled: SampledScan | None = None  # thinned for registration; None where the localiser does that
 
     @property
     def velocity(self) -> FloatArray | None:

@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Protocol, runtime_checkable
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.smoothed_start import SmoothedMotion
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import Motion
@@ -43,7 +43,10 @@ class Localiser(Restorable, Protocol):
 class ScanMapper(Restorable, Protocol):
     """A scan-to-map registration: with a local map, or in a map that is given."""
 
-    def process(self, scan: Scan, prior: Prior) -> MappedScan:
+    def sample(self, scan: Scan) -> SampledScan | None:
+        """The next scan, thinned on another thread for `process`; None where that takes the scan as it is."""
+
+    def process(self, scan: Any, prior: Prior) -> MappedScan:
         """Register the next scan to the map."""
 
 
@@ -119,7 +122,7 @@ class ScanToMap(Stateful):
         mapper: ScanMapper,
         inertial: InertialPrediction | None = None,
         elevation: ElevationEstimator | None = None,
-        start: Mapping[float, SmoothedMotion] | None = None,
+        start: Mapping[float, Prior] | None = None,
     ) -> None:
         self._mapper, self._inertial, self._elevation, self._start = mapper, inertial, elevation, start or {}
         self._T_odom_lidar, self._T_world_last = np.eye(4), np.eye(4)
@@ -137,8 +140,8 @@ class ScanToMap(Stateful):
         return state
 
     def sample(self, scan: Scan) -> SampledScan | None:
-        """The points that are registered and inserted; see `Localiser`."""
-        return None if self.mapper is None else self.mapper.sample(scan)
+        """See `ScanMapper`."""
+        return self._mapper.sample(scan)
 
     def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """Refine the odometry's pose; where it measured nothing, the mapper predicts with the last velocity."""
@@ -147,12 +150,10 @@ class ScanToMap(Stateful):
         prior = self._prior(odometry, following)
         if self._inertial is not None:
             prior = self._inertial.prior(odometry.scan, prior)
-        if self.mapper is None or odometry.sampled is None:
-            mapped = self._mapper.process(odometry.scan, prior)
-        else:
-            mapped = self.mapper.process_sampled(odometry.sampled, prior)
-            if self._elevation is not None:
-                self._elevation.add(odometry.sampled, mapped)
+        sampled = self.sample(odometry.scan) if odometry.sampled is None else odometry.sampled
+        mapped = self._mapper.process(odometry.scan if sampled is None else sampled, prior)
+        if self._elevation is not None and sampled is not None:
+            self._elevation.add(sampled, mapped)
         if self._inertial is not None:
             self._inertial.update(odometry.scan, mapped)
         expected = inverse(self._T_world_last) @ mapped.T_world_predicted
@@ -175,17 +176,17 @@ class ScanToMap(Stateful):
             degenerate=mapped.degenerate,
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
-            cell_m=None if self.mapper is None else self.mapper.cell_m,
+            cell_m=mapped.cell_m,
             turn_rate=mapped.turn_rate,
         )
 
     def _prior(self, odometry: ScanOdometry, following: ScanOdometry | None) -> Prior:
-        smoothed = self._start.get(odometry.scan.stamp)
-        before = smoothed or odometry
+        measured = odometry.motion.T_prev_curr if odometry.interval_s is not None else None
+        before = Prior(measured, odometry.velocity, odometry.motion.covariance)
+        before = self._start.get(odometry.scan.stamp, before)
         after = None if following is None else self._start.get(following.scan.stamp) or following
         velocity = SweepMotion(before.velocity, after.velocity if after else None).mean(odometry.scan)
-        motion = smoothed or odometry.motion
-        return Prior(None if before.interval_s is None else motion.T_prev_curr, velocity, motion.covariance)
+        return replace(before, velocity=velocity)
 
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
@@ -205,7 +206,7 @@ def make_localiser(
     config: Config,
     inertial: InertialPrediction | None = None,
     elevation: ElevationEstimator | None = None,
-    start: Mapping[float, SmoothedMotion] | None = None,
+    start: Mapping[float, Prior] | None = None,
 ) -> Localiser:
     """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
 

@@ -13,7 +13,7 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.consistency import ConsistencyCheck
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper

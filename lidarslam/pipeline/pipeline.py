@@ -19,9 +19,9 @@ from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
+from lidarslam.mapping.pose_graph.edges import GraphScan
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
-from lidarslam.mapping.pose_graph.keyframes import GraphScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline import threads

@@ -77,7 +77,7 @@ def with_elevations(
     with suppress(InputError):  # raised again when the scans are read
         for scan in take_in(recording, range(chosen.start, chosen.stop)[:_MOST_SCANS], Faults()):
             sampled = mapper.sample(scan)
-            estimator.add(sampled, mapper.process_sampled(sampled, Prior()))
+            estimator.add(sampled, mapper.process(sampled, Prior()))
             if estimator.stretches == _ENOUGH_STRETCHES:
                 break
     found = Elevation.found(recording, estimator)

@@ -115,7 +115,7 @@ class _Poses:
         with suppress(InputError):  # raised again when the scans are read
             scan = next(self._scans, None)
         if scan is not None:
-            mapped = self._mapper.process(scan, Prior())
+            mapped = self._mapper.process(self._mapper.sample(scan), Prior())
             follows = mapped.registered and mapped.is_connected
             self._poses.append((scan.stamp, mapped.state.T_world_lidar, follows))
         return scan is not None

@@ -21,7 +21,7 @@ from lidarslam.mapping.global_map.drawing import DrawnMap, TiledMap, drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
-from lidarslam.mapping.global_map.tile_store import Tile
+from lidarslam.mapping.global_map.voxels import Tile
 from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.run.elevation import Elevation
@@ -156,7 +156,7 @@ def write_results(
     if drawn.warning is not None:
         log.warn(drawn.warning)
     if drawn.cloud is not None and not len(drawn.cloud):
-        log.warn("the map is empty: min_range_m, max_range_m and min_hits of global_map leave no point")
+        log.warn("the map is empty: min_range_m and max_range_m of global_map leave no point")
     skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out
     contradictions = find_contradictions(scans.slides, log.trajectory.T_world_lidar)
     graph = None if closed is None else closed.summary

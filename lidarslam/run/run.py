@@ -22,10 +22,11 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.global_map.drawing import DrawnMap
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import GivenLoops
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
-from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
+from lidarslam.mapping.smoothed_start import SHOWING, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
@@ -357,9 +358,7 @@ def track(
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 
 
-def _start(
-    config: Config, recording: Recording, chosen: range, inertial: "Inertial | None"
-) -> dict[float, SmoothedMotion]:
+def _start(config: Config, recording: Recording, chosen: range, inertial: "Inertial | None") -> dict[float, Prior]:
     """The motions of the first scans, where they have to be smoothed."""
     if config.mapping.method != "surfels" or len(chosen) < SHOWING:
         return {}

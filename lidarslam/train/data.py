@@ -43,7 +43,7 @@ class MapTeacher:
 
     def follow(self, scan: Scan) -> None:
         """Register the next scan."""
-        mapped = self._mapper.process(scan, Prior())
+        mapped = self._mapper.process(self._mapper.sample(scan), Prior())
         state = mapped.state
         self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * scan.middle_offset_s))
         # When the first scan is registered its velocity is not known, and so neither is the middle of its sweep.

@@ -11,7 +11,7 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import NORMALS_MARGIN_M, GlobalMap, VoxelMeans
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.mapping.global_map.tile_store import Tile, Tiling
+from lidarslam.mapping.global_map.voxels import Tile, Tiling
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 logger = logging.getLogger(__name__)
@@ -66,8 +66,8 @@ def drawn_map(
         return DrawnMap(None, None)
     if not global_map.is_whole:
         return replace(_drawn_in_tiles(global_map, views, config, write_tile), warning=_warning(global_map))
-    moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
-    cloud = global_map.cloud(config.min_hits, moved)
+    moved = seen_through(global_map.points(), views, global_map.voxel_size_m)
+    cloud = global_map.cloud(moved)
     return DrawnMap(_with_fields(cloud, config), global_map.voxel_size_m, int(moved.sum()), None, _warning(global_map))
 
 
@@ -90,15 +90,15 @@ def _drawn_in_tiles(
     points, moved_in_all = {}, 0
     for tile in tiles:
         part = global_map.tile(tile, NORMALS_MARGIN_M)
-        inside = part.lies_in(tile, config.min_hits)
-        moved = seen_through(part.points(config.min_hits), views, part.voxel_size_m)
+        inside = part.lies_in(tile)
+        moved = seen_through(part.points(), views, part.voxel_size_m)
         moved_in_all += int((moved & inside).sum())
         if not (inside & ~moved).any():
             continue
         points[tile] = int((inside & ~moved).sum())
-        overview.add(part.means(config.min_hits, moved | ~inside))
+        overview.add(part.means(moved | ~inside))
         if write_tile is not None:
-            cloud = part.cloud(config.min_hits, moved).select(inside[~moved])
+            cloud = part.cloud(moved).select(inside[~moved])
             write_tile(tile, _with_fields(cloud, config), brightest)
     cloud = _with_fields(overview.merged().cloud(), config)
     return DrawnMap(cloud, overview.voxel_size_m, moved_in_all, TiledMap(global_map.tiling, points, brightest))

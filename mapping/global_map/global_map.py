@@ -10,20 +10,21 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
-from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxels import (
     COUNT,
     POSITION,
     VIEW,
     Layout,
     Rows,
+    Tile,
+    TileStore,
+    Tiling,
     Voxels,
     column_cells,
     row_cells,
     write_sums,
 )
-from lidarslam.mapping.surfels.hash_kernels import EMPTY
-from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
+from lidarslam.mapping.surfels.voxel_hash import EMPTY, key_cells, point_keys, reach_m
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
@@ -109,21 +110,21 @@ class GlobalMap(Stateful):
         is_beyond = np.abs(world).max(axis=1, initial=0.0) >= reach_m(self.voxel_size_m)
         self._wait(Voxels(keys, sums, means.layout), is_beyond if is_beyond.any() else None)
 
-    def means(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> VoxelMeans:
-        """The voxels so far, arguments as in `cloud`."""
-        voxels = self._voxels(min_hits, left_out)
+    def means(self, left_out: NDArray[np.bool_] | None = None) -> VoxelMeans:
+        """The voxels so far, but for some (M,)."""
+        voxels = self._voxels(left_out)
         rows = voxels.sums.copy()
         rows[:, POSITION] = self._mean_points(voxels)
         rows[:, VIEW] = voxels.sums[:, VIEW] / voxels.sums[:, COUNT, None]
         return VoxelMeans(rows, voxels.layout)
 
-    def points(self, min_hits: int = 1) -> FloatArray:
-        """The mean point (M, 3) of every voxel that holds at least `min_hits` points, in the world."""
-        return self._mean_points(self._voxels(min_hits))
+    def points(self) -> FloatArray:
+        """The mean point (M, 3) of every voxel, in the world."""
+        return self._mean_points(self._voxels())
 
-    def cloud(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> PointCloud:
+    def cloud(self, left_out: NDArray[np.bool_] | None = None) -> PointCloud:
         """The map, but for some of `points` (M,); normals are estimated from the nearest, and face the sensor."""
-        voxels = self._voxels(min_hits, left_out)
+        voxels = self._voxels(left_out)
         points = self._mean_points(voxels)
         normals = estimate_normals(points) if len(points) <= _MANY_POINTS else self._normals_by_tiles(voxels)
         normals[np.einsum("ij,ij->i", normals, voxels.sums[:, VIEW]) < 0.0] *= -1.0
@@ -132,7 +133,7 @@ class GlobalMap(Stateful):
     @property
     def tiling(self) -> Tiling:
         """The tiles of the map."""
-        return Tiling.of(self.voxel_size_m)
+        return Tiling(self.voxel_size_m)
 
     def tiles(self) -> list[Tile]:
         """All tiles that have voxels, in memory or not."""
@@ -152,9 +153,9 @@ class GlobalMap(Stateful):
         cut._merged = Voxels.join(parts).reduced()
         return cut
 
-    def lies_in(self, tile: Tile, min_hits: int = 1) -> NDArray[np.bool_]:
+    def lies_in(self, tile: Tile) -> NDArray[np.bool_]:
         """(M,) which of `points` lie in a tile."""
-        keys = self._voxels(min_hits).keys
+        keys = self._voxels().keys
         low, high = self.tiling.bounds(tile)
         x, y = column_cells(keys), row_cells(keys)
         return (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
@@ -195,12 +196,10 @@ class GlobalMap(Stateful):
                 self._merged = self._store.take(self._merged, self.tiling, waiting.keys, self.most_points)
         self._pending, self._pending_size = [], 0
 
-    def _voxels(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> Voxels:
+    def _voxels(self, left_out: NDArray[np.bool_] | None = None) -> Voxels:
         with self._lock:
             self._merge()
             voxels = self._merged
-        if min_hits > 1:
-            voxels = voxels.chosen(voxels.sums[:, COUNT] >= min_hits)
         return voxels if left_out is None else voxels.chosen(~left_out)
 
     def _mean_points(self, voxels: Voxels) -> FloatArray:

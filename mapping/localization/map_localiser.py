@@ -14,14 +14,22 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
-from lidarslam.mapping.localization.local_mapping import LocalMapping
-from lidarslam.mapping.localization.place_search import Found, Place, PlaceSearch
+from lidarslam.mapping.localization.place_search import (
+    FixedMap,
+    Found,
+    KeptScan,
+    KeptScans,
+    Place,
+    PlaceSearch,
+    Regions,
+)
 from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, MappedScan
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.mapping.tracking.tracker import Tracker
+from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +40,72 @@ _RANGES = 5.0
 _SPARE = 0.5
 # The distance, in median ranges, over which the recording's own map places the scans before the first place.
 _BACK_RANGES = 10.0
+# Scans until the first search of the whole map, growth of the intervals, and the longest; and between nearby searches.
+_FIRST_SEARCH, _GROWTH, _LONGEST = 5, 1.5, 40
+_NEARBY_EVERY = 5
+
+
+class LocalMapping:
+    """Maps scans, numbered from `first`, in a frame of its own, and keeps some to search with.
+
+    `T_map_local` (4, 4) is where that frame is supposed in the finished map; None: anywhere.
+    """
+
+    def __init__(self, config: MappingConfig, T_map_local: FloatArray | None, first: int = 0) -> None:
+        self.T_map_local = T_map_local
+        self.kept = KeptScans()
+        self.poses: dict[int, FloatArray] = {}  # (4, 4) in the local frame, by the number of the scan
+        self._followed: list[int] = []  # numbers of the scans that the latest one follows without a break
+        self._mapper = Mapper(config)
+        self._first = first
+        self._count = self._lost = 0
+        self._next_search, self._wait = _FIRST_SEARCH, float(_FIRST_SEARCH)
+
+    def add(self, scan: SampledScan, prior: Prior) -> MappedScan:
+        """Map the next scan."""
+        mapped, number = self._mapper.process(scan, prior), self._first + self._count
+        self.poses[number] = mapped.state.T_world_lidar
+        if mapped.status is not Status.LOST:
+            self._lost = 0
+            self._followed.append(number)
+            T_local_lidar, velocity = mapped.state.T_world_lidar, mapped.state.velocity
+            points, keypoints = scan.sweep.compensated(velocity), scan.keypoints.compensated(velocity)
+            self.kept.add(KeptScan(T_local_lidar, points, keypoints, scan.cell_m, scan.range_m))
+        elif mapped.fit is not None:
+            self._lost += 1
+            if self._lost >= GIVE_UP_AFTER:  # the local map restarts at a pose that is only predicted
+                self.kept, self._followed, self._lost = KeptScans(), [], 0
+        self._count += 1
+        return mapped
+
+    def followed_within(self, ranges: float, before: int) -> list[int]:
+        """Numbers of the scans before one, tracked without a break from there, up to a distance in median ranges."""
+        numbers = [number for number in self._followed if number < before]
+        if not numbers:
+            return []
+        positions = np.array([self.poses[number][:3, 3] for number in [*numbers, before]])
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        ways = np.cumsum(steps[::-1])[::-1]
+        return [number for number, way in zip(numbers, ways, strict=True) if way < ranges * self.kept.latest.range_m]
+
+    @property
+    def up(self) -> FloatArray:
+        """(3,) the vertical, in the local frame."""
+        local_map = self._mapper.local_map
+        return np.array([0.0, 0.0, 1.0]) if local_map is None else local_map.vertical()
+
+    @property
+    def searches_nearby(self) -> bool:
+        """Whether a place that is supposed is to be tried now."""
+        return self._count % _NEARBY_EVERY == 0
+
+    def searches_anywhere(self) -> bool:
+        """Whether the whole map is to be searched now; the next search is postponed."""
+        if self._count < self._next_search:
+            return False
+        self._wait = min(_GROWTH * self._wait, float(_LONGEST))
+        self._next_search = self._count + round(self._wait)
+        return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +143,12 @@ class MapLocaliser(Stateful):
         self.placed_afterwards: list[int] = []
         self.revoked: list[int] = []
 
-    def process(self, scan: Scan, prior: Prior) -> MappedScan:
+    def sample(self, scan: Scan) -> SampledScan:
+        """Thin the next scan; on any thread, while `process` works on an earlier one."""
+        return self._sampler.sample(scan)
+
+    def process(self, sampled: SampledScan, prior: Prior) -> MappedScan:
         """Register the next scan."""
-        sampled = self._sampler.sample(scan)
         # An IMU predicts a pose in the map.
         local = self._local
         own = None if local is None else local.add(sampled, replace(prior, inertial=None))

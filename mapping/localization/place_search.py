@@ -1,6 +1,7 @@
 """Search for the place of a recording in a finished map: bird's-eye correlation, registration, a test of ambiguity.
 
-Some scans that lie apart must fit at one place, and clearly better than at any other.
+The map's points are surfels by region, to register scans to, and all of them a view from above, to search in. Some
+scans that lie apart must fit at one place, and clearly better than at any other.
 """
 
 from collections.abc import Sequence
@@ -8,6 +9,8 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import (
     FloatArray,
@@ -18,17 +21,25 @@ from lidarslam.core.geometry import (
     rotation_angle,
     transform_points,
 )
-from lidarslam.mapping.localization.fixed_map import FixedMap, Regions
-from lidarslam.mapping.localization.local_mapping import KeptScan, KeptScans
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.registration.local_map import vertical_of
 from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
+from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.fit import NO_FIT, Fit
 from lidarslam.mapping.tracking.scan_matcher import measure_fit
 from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
 
+# Least edge of a surfel cell in spacings of the map's points. With fewer points in and around a cell normals are
+# uncertain: at 1.7, roll was found to be degenerate in an office.
+_CELLS_PER_SPACING = 3.5
+_SAMPLES = 2000
+# Edge of a cell of the view from above, in surfel cells, and of the parts of the map that are drawn, in such cells,
+# with their overlap.
+_VIEW_SCALE, _VIEW_CELLS, _OVERLAP_CELLS = 4.0, 800, 30
 # Places around a supposed one that are tried: distance, in cells, and turn.
 _NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
 # Radius of the view from above and of the points that are registered, in median ranges; places that are
@@ -52,6 +63,136 @@ _LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
 # 0.8 a wrong place in a row of equal houses was taken.
 _RIVAL = 0.6
 _SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
+# A scan is kept after this distance, in median ranges, or this turn. The latest are kept.
+_APART_RANGES, _APART_RAD = 0.25, np.deg2rad(30.0)
+_MOST = 24
+
+
+class FixedMap:
+    """Points (M, 3) with unit normals (M, 3) towards the side that was seen, which are never changed."""
+
+    def __init__(self, points: FloatArray, normals: FloatArray) -> None:
+        self._points = points
+        self._normals = normals
+        self._least_cell_m = _CELLS_PER_SPACING * _spacing_m(points)
+        self._up = vertical_of(normals)
+        self._views: tuple[float, list[BirdsEyeMap]] = (0.0, [])
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def cell_m(self, wanted_m: float) -> float:
+        """The edge of surfel cells nearest to the wanted one that the density of the points allows."""
+        return max(wanted_m, self._least_cell_m)
+
+    def region(self, centre: FloatArray, radius_m: float, cell_m: float) -> SurfelMap:
+        """The surfels within a radius of a position (3,)."""
+        offsets = self._points - centre
+        near = np.einsum("ij,ij->i", offsets, offsets) < radius_m**2
+        return SurfelMap.of_cloud(self._points[near], self._normals[near], cell_m, radius_m)
+
+    def views(self, cell_m: float) -> list[BirdsEyeMap]:
+        """The map from above, for surfel cells of an edge, in parts that overlap; kept for the next call."""
+        if self._views[0] != cell_m:
+            pixel_m = _VIEW_SCALE * cell_m
+            require_reach(self._points, cell_m)
+            _, kept = np.unique(point_keys(self._points, 0.5 * pixel_m), return_index=True)
+            points = self._points[kept]
+            parts = _parts(points[:, :2], _VIEW_CELLS * pixel_m, _OVERLAP_CELLS * pixel_m)
+            self._views = cell_m, [BirdsEyeMap.of(points[part], self._up, pixel_m) for part in parts]
+        return self._views[1]
+
+
+def _spacing_m(points: FloatArray) -> float:
+    """Median distance of points (M, 3) from their nearest neighbours."""
+    if len(points) < 2:
+        return 0.0
+    sample = points[:: max(1, len(points) // _SAMPLES)]
+    distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2)
+    return float(np.median(np.asarray(distances)[:, 1]))
+
+
+def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bool_]]:
+    """Which of the points (M, 2) are in each square of a grid or within a margin of it; none of empty squares."""
+    low = xy.min(axis=0)
+    extent = xy.max(axis=0) - low
+    counts = np.maximum(1, np.ceil(extent / edge_m)).astype(int)
+    steps = extent / counts
+    parts = []
+    for i, j in np.ndindex(*counts):
+        corner = low + steps * (i, j)
+        inside = ((xy >= corner) & (xy <= corner + steps)).all(axis=1)
+        if inside.any():
+            parts.append(((xy >= corner - margin_m) & (xy <= corner + steps + margin_m)).all(axis=1))
+    return parts
+
+
+class Regions:
+    """Regions of the map as surfels: all within reach of a position, and a margin; the latest few are kept."""
+
+    def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:
+        self._map, self.cell_m, self._reach_m, self._spare_m, self._kept = fixed_map, cell_m, reach_m, spare_m, kept
+        self._drawn: list[tuple[FloatArray, SurfelMap]] = []
+
+    def around(self, position: FloatArray) -> SurfelMap:
+        """A region with all that is within reach of a position (3,)."""
+        for centre, region in self._drawn:
+            if np.linalg.norm(centre - position) < self._spare_m:
+                return region
+        region = self._map.region(position, self._reach_m + self._spare_m, self.cell_m)
+        self._drawn = [*self._drawn, (position.copy(), region)][-self._kept :]
+        return region
+
+
+@dataclass(frozen=True, eq=False)
+class KeptScan:
+    """A scan at its pose in a local frame of the recording."""
+
+    T_local_lidar: FloatArray  # (4, 4)
+    points: FloatArray  # (N, 3) in the LiDAR frame at the stamp, compensated, as they go into a map
+    keypoints: FloatArray  # (K, 3) those that are registered
+    cell_m: float  # size of cells that suits the scene
+    range_m: float  # median range of the scene
+
+    def is_apart_from(self, other: "KeptScan") -> bool:
+        """Whether the sensor has moved or turned since another scan."""
+        motion = inverse(other.T_local_lidar) @ self.T_local_lidar
+        far = np.linalg.norm(motion[:3, 3]) > _APART_RANGES * self.range_m
+        return bool(far or rotation_angle(motion) > _APART_RAD)
+
+
+class KeptScans:
+    """A bounded number of scans, apart from one another, and the latest; searched once there is one."""
+
+    latest: KeptScan
+
+    def __init__(self) -> None:
+        self._apart: list[KeptScan] = []
+
+    def add(self, scan: KeptScan) -> None:
+        """Add the next scan that was registered in the local frame."""
+        self.latest = scan
+        if not self._apart or scan.is_apart_from(self._apart[-1]):
+            self._apart = [*self._apart, scan][-_MOST:]
+
+    def chosen(self, count: int) -> Sequence[KeptScan]:
+        """The latest scan, and at most `count` others before it, backwards in time, evenly spread."""
+        others = [scan for scan in reversed(self._apart) if scan is not self.latest]
+        if not others:
+            return [self.latest]
+        spread = np.unique(np.linspace(0, len(others) - 1, min(count, len(others))).astype(np.intp))
+        return [self.latest, *(others[index] for index in spread)]
+
+    def points_around(self, reach_m: float) -> FloatArray:
+        """The points (N, 3) of all scans within reach of the latest, in its LiDAR frame."""
+        T_lidar_local, parts = inverse(self.latest.T_local_lidar), [self.latest.points]
+        for scan in self._apart:
+            T = T_lidar_local @ scan.T_local_lidar
+            if scan is not self.latest and np.linalg.norm(T[:3, 3]) < reach_m:
+                parts.append(transform_points(T, scan.points))
+        points = np.concatenate(parts)
+        inside = np.einsum("ij,ij->i", points, points) < reach_m**2
+        return np.asarray(points[inside], dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Measurements of the graph besides loop closures: motion between keyframes, attitude by gravity, GNSS positions."""
+"""Keyframes, and measurements of the graph besides loop closures: motion, attitude by gravity, GNSS positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.georeference import GnssTrack, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe
+from lidarslam.mapping.motion.prediction import GravityDirection
 
 # Drift of scan-to-map registration between keyframes, one standard deviation: a floor, and growth per distance.
 # Compared with true errors of simulated recordings.
@@ -32,6 +32,32 @@ _LEAST_TILT = float(np.deg2rad(0.2))
 _CORRELATED_S = 10.0
 # Standard deviations, metres: where none is stated, and at least. That of the height is larger by the factor.
 _UNKNOWN_M, _LEAST_GNSS_M, _HEIGHT = 3.0, 0.02, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class GraphScan:
+    """A scan with its pose and motion."""
+
+    T_world_lidar: FloatArray  # (4, 4) as registered
+    points: FloatArray  # (N, 3) in the LiDAR frame at the stamp, compensated and thinned
+    # (6, 6) of the pose when it was registered to a map, rotation first; None when it was not
+    covariance: FloatArray | None
+    T_prev_curr: FloatArray | None  # (4, 4) the odometry's motion since the scan before; None without one
+    motion_covariance: FloatArray | None  # (6, 6) of that; None when the odometry has none
+    lost: bool  # whether tracking was lost, so that the motion from the scan before is unknown
+    belongs_in_map: bool  # whether its points are added to the submap
+    gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A keyframe of the pose graph."""
+
+    scan: int  # its index among all scans
+    segment: int  # stretch of continuous tracking, across which no drift model holds
+    path_m: float  # path length from the recording's start
+    # (6, 6) of its registration to the map, rotation first; None when it was not registered
+    covariance: Annotated[FloatArray, Shape(6, 6)] | None
 
 
 @dataclass(frozen=True, eq=False)

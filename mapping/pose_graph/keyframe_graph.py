@@ -1,25 +1,85 @@
 """The keyframes of one recording: their submaps, and edges along the trajectory; loop closures come later.
 
-Scans come with the poses that scan-to-map registration gave them. Some become keyframes; the points seen until the next
-one are the submap of each.
-"""
+Scans come with the poses that scan-to-map registration gave them. Some become keyframes, by distance, by turn, and by
+overlap with the last one; the points seen until the next one are the submap of each."""
 
 import time
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state import TRANSFORM, BlockFile, Stateful
+from lidarslam.core.state import TRANSFORM, BlockFile, Shape, Stateful
 from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.edges import Attitude, MotionSinceKeyframe, measured_attitude, trajectory_edges
-from lidarslam.mapping.pose_graph.keyframes import GraphScan, Keyframe, KeyframeSelector
+from lidarslam.mapping.pose_graph.edges import (
+    Attitude,
+    GraphScan,
+    Keyframe,
+    MotionSinceKeyframe,
+    measured_attitude,
+    trajectory_edges,
+)
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.surfels.voxel_hash import key_steps, point_keys
+
+# The spacing follows the scene: the median range over this, within these limits.
+_RANGES_APART, _LEAST_M, _MOST_M = 4.0, 0.5, 4.0
+# The next keyframe is due when less than this share of a scan lies where the last keyframe saw something.
+_LEAST_OVERLAP = 0.5
+# Cells in which two scans are compared, as a part of the median range; finer ones differ from noise alone.
+_CELL_RANGES = 0.1
+# The overlap's error with this many points is below 2 %.
+_COMPARED_POINTS = 1500
+
+
+class KeyframeSelector(Stateful):
+    """Remembers the last keyframe, and decides when the next is due."""
+
+    _T_world_keyframe: Annotated[FloatArray, TRANSFORM] | None
+    _cells: Annotated[NDArray[np.int64], Shape(None)]
+    _cell_m: float
+    _distance_m: float
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+        self._T_world_keyframe = None
+        self._cells = np.empty(0, dtype=np.int64)
+        self._cell_m, self._distance_m = 1.0, _LEAST_M
+
+    def is_due(self, T_world_lidar: FloatArray, points: FloatArray) -> bool:
+        """Whether a scan with a pose (4, 4) and points (N, 3) in its LiDAR frame becomes one; the first does."""
+        if self._T_world_keyframe is None:
+            return True
+        T_keyframe_lidar = inverse(self._T_world_keyframe) @ T_world_lidar
+        return bool(
+            np.linalg.norm(T_keyframe_lidar[:3, 3]) >= self._distance_m
+            or np.rad2deg(rotation_angle(T_keyframe_lidar)) >= self._config.turn_deg
+            or self._overlap(T_keyframe_lidar, points) < _LEAST_OVERLAP
+        )
+
+    def take(self, T_world_lidar: FloatArray, points: FloatArray) -> None:
+        """Make this scan the last keyframe."""
+        self._T_world_keyframe = T_world_lidar
+        range_m = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 1.0
+        follows = float(np.clip(range_m / _RANGES_APART, _LEAST_M, _MOST_M))
+        self._distance_m = follows if self._config.distance_m is None else self._config.distance_m
+        self._cell_m = max(1e-3, _CELL_RANGES * range_m)
+        # The cells of points and those that share a face with them, so that noise does not count.
+        steps = key_steps(np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]).astype(np.int64))
+        self._cells = np.unique(np.add.outer(point_keys(points, self._cell_m), steps))
+
+    def _overlap(self, T_keyframe_lidar: FloatArray, points: FloatArray) -> float:
+        """The share of a scan's points that lie where the keyframe saw something; 1 for a scan without points."""
+        points = points[:: max(1, len(points) // _COMPARED_POINTS)]
+        if not len(points) or not len(self._cells):
+            return 1.0
+        return float(np.isin(point_keys(transform_points(T_keyframe_lidar, points), self._cell_m), self._cells).mean())
 
 
 class SubmapStore(BlockFile):

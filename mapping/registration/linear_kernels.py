@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.registration.surfaces import Surfaces
+from lidarslam.mapping.registration.local_map import Surfaces
 
 # Columns of a linearised residual: Jacobian (6), residual, standard deviation of the surface, of the normal, seconds.
 RESIDUAL, THICKNESS, TILT, TIME = 6, 7, 8, 9

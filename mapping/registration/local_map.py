@@ -1,17 +1,19 @@
-"""The local map that scans are registered to: surfels, or LOAM's edges and planes."""
+"""The local map that scans are registered to: surfels, or LOAM's edges and planes; and the surfaces found in it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, Protocol, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.registration.gauss_newton import geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.registration.surfaces import Correspondences, Matcher
 
 # Resolutions of a map, in cells. A point's correspondence is the plane of the finest one that has one.
 LEVELS = (1, 2, 4)
@@ -21,14 +23,72 @@ _YOUNG_SCANS = 5
 _LEVEL_COSINE = 0.7
 # Cells beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.2
+# The plane of a point is part of a large one where the coarsest cell has a plane of nearly its normal, no thicker than
+# this share of that cell.
+_SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
+# Large surfaces suffice where they constrain every direction this many times as well as the noise of their normals.
+_SUFFICIENT = 15.0
+# They contradict a pose from which they alone would move this many cells away. On recordings without crowds: below 0.1.
+_CONTRADICTION_CELLS = 0.2
+# Factor by which small surfaces are less certain then.
+INFLATION = 6.0
+_FEWEST = 100
+_RANGE_NOISE_M, _SCALE_PER_MEDIAN = 0.02, 1.5
 
 
-class Grid(Protocol):
-    """Cells of one size."""
+class Surfaces(NamedTuple):
+    """The surfaces that N points correspond to, a row for each point."""
 
-    def __len__(self) -> int: ...
-    def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
-        """Drop the cells farther than `radius_m` from `centre` (3,)."""
+    # (N,) residuals of the point: 1 with a plane, 2 with a line, up to 3 with a compact object; 0 without a surface
+    counts: NDArray[np.int32]
+    points: FloatArray  # (N, 3) on the surface, in the world
+    normals: FloatArray  # (N, 3, 3) unit, in the world, one for each residual
+    thickness_m: FloatArray  # (N, 3) standard deviation of the surface along each, with that of its plane
+    tilt: FloatArray  # (N, 3) standard deviation of each normal, radians
+
+    @classmethod
+    def none(cls, count: int) -> "Surfaces":
+        """No surface for any point."""
+        shape = (count, 3)
+        return cls(
+            np.zeros(count, dtype=np.int32), np.empty(shape), np.empty((*shape, 3)), np.empty(shape), np.empty(shape)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """M residuals of points with surfaces, each along one direction."""
+
+    index: NDArray[np.intp]  # (M,) of the point
+    points: FloatArray  # (M, 3) on the surface, in the world
+    normals: FloatArray  # (M, 3) unit, in the world
+    thickness_m: FloatArray  # (M,) standard deviation of the surface along the normal
+    tilt: FloatArray  # (M,) standard deviation of the normal, radians
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def residuals(self, world: FloatArray) -> FloatArray:
+        """Signed distances (M,) of the matched points, at (M, 3) of the world, from their surfaces."""
+        return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
+
+
+class Matcher(ABC):
+    """Finds the surfaces that N points correspond to, at one pose after another; valid until the map changes."""
+
+    surfaces: Surfaces
+
+    @abstractmethod
+    def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
+        """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
+
+    def correspondences(self, most: int = 3) -> Correspondences:
+        """A residual per row, in the order of the points; of each point at most so many, first the one across it."""
+        found = self.surfaces
+        index, _ = chosen = np.nonzero(np.arange(most) < found.counts[:, None])
+        return Correspondences(
+            index, found.points[index], found.normals[chosen], found.thickness_m[chosen], found.tilt[chosen]
+        )
 
 
 class LocalMap(Stateful, ABC):
@@ -48,8 +108,8 @@ class LocalMap(Stateful, ABC):
 
     @property
     @abstractmethod
-    def grids(self) -> Sequence[Grid]:
-        """Its cells of all resolutions."""
+    def grids(self) -> Sequence[Any]:
+        """Its cells of all resolutions, each with `__len__` and `drop_beyond`."""
 
     @property
     def is_young(self) -> bool:
@@ -115,18 +175,6 @@ class LocalMap(Stateful, ABC):
                 grid.drop_beyond(sensor, self._radius_m)
         self.scans += 1
 
-    def goes_on(
-        self, points: FloatArray, normals: FloatArray, sensor: FloatArray, cosine: float, thickness: float
-    ) -> NDArray[np.bool_]:
-        """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), extend over the coarsest cell.
-
-        There, the normal has at least this cosine with theirs, and the standard deviation along it is at most this
-        share of the cell.
-        """
-        coarse, spread_m = self.coarse_planes(points, sensor)
-        is_thin = spread_m < thickness * self.cell_m * LEVELS[-1]
-        return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > cosine))
-
 
 def vertical_of(normals: FloatArray) -> FloatArray:
     """Mean unit normal (3,) of the floors and ceilings among surfaces with normals (M, 3); the z axis without any."""
@@ -134,3 +182,43 @@ def vertical_of(normals: FloatArray) -> FloatArray:
     mean = (normals * np.sign(normals[:, 2:])).sum(axis=0)
     length = float(np.linalg.norm(mean))
     return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
+
+
+def are_large(local_map: LocalMap, points: FloatArray, normals: FloatArray, sensor: FloatArray) -> NDArray[np.bool_]:
+    """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), are part of large ones."""
+    coarse, spread_m = local_map.coarse_planes(points, sensor)
+    is_thin = spread_m < _MOST_THICKNESS * local_map.cell_m * LEVELS[-1]
+    return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > _SAME_COSINE))
+
+
+def inflation_of_small(
+    points: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, local_map: LocalMap
+) -> FloatArray | None:
+    """Factors (N,) on the standard deviations of the points' surfaces, larger for small ones; None where these agree.
+
+    Relative to a crowd that walks along, a sensor is at rest; only walls, floor and ceiling differ. In a bare
+    corridor or a stairwell, large surfaces do not suffice for a pose, and small ones count in full. The points (N,
+    3) of the LiDAR frame were registered at the pose (4, 4) to all surfaces with equal weight.
+    """
+    matched = np.flatnonzero(surfaces.counts)
+    world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]
+    is_large = are_large(local_map, world, normals, T_world_lidar[:3, 3])
+    large = matched[is_large]
+    if len(large) < _FEWEST:
+        return None
+    world, normals = world[is_large], normals[is_large]
+    residuals = np.einsum("ij,ij->i", world - surfaces.points[large], normals)
+    variances = surfaces.thickness_m[large, 0] ** 2 + _RANGE_NOISE_M**2
+    scale_m = _SCALE_PER_MEDIAN * np.median(np.abs(residuals))
+    weights = geman_mcclure(residuals, scale_m**2 + variances, variances)
+    scale = lever_scale(float(np.sqrt(np.mean(np.sum(points[large] ** 2, axis=1)))))
+    jacobian = point_to_plane_jacobian(points[large], normals @ T_world_lidar[:3, :3]) / scale
+    hessian = (jacobian * weights[:, None]).T @ jacobian
+    if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * float(weights @ surfaces.tilt[large, 0] ** 2):
+        return None
+    step_m = np.linalg.norm(np.linalg.solve(hessian, jacobian.T @ (weights * residuals)))
+    if step_m < _CONTRADICTION_CELLS * local_map.cell_m:
+        return None
+    inflation = np.full(len(points), INFLATION)
+    inflation[large] = 1.0
+    return inflation

@@ -79,49 +79,21 @@ class SampledScan:
         return gap_s < self.seen_from_s + self.seen_until_s
 
 
-class SceneScale(Stateful):
-    """Chooses the size of the map's cells, with hysteresis."""
-
-    range_m: float  # smoothed median range; 0 before the first scan with points
-    _cell_range_m: float
-
-    def __init__(self, config: MappingConfig) -> None:
-        self._config = config
-        self.range_m = 0.0
-        self._cell_range_m = 0.0  # median range of the present cell size
-
-    def update(self, squared: FloatArray) -> float:
-        """The cell size for the latest squared ranges (N,)."""
-        # Fewer points are a covered sensor, not another scene.
-        if np.count_nonzero(squared > self._config.min_range_m**2) >= MIN_POINTS:
-            median_m = float(np.sqrt(np.median(squared[:: max(1, len(squared) // 5000)])))
-            new = self.range_m == 0.0
-            self.range_m = median_m if new else self.range_m + _RANGE_SMOOTHING * (median_m - self.range_m)
-        if self._config.cell_m is not None:
-            return self._config.cell_m
-        low_m, high_m = self._cell_range_m / _RANGE_CHANGE, self._cell_range_m * _RANGE_CHANGE
-        if self.range_m > 0.0 and not low_m <= self.range_m <= high_m:
-            self._cell_range_m = self.range_m
-        if self._cell_range_m < _CLOSE_M:
-            return _CELL_BOUNDS_M[0]
-        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
-
-
 class Sampler(Stateful):
     """Thins scans by the scale of the scene; for surfels, to a point in each half of a cell."""
 
-    _scale: SceneScale
+    _range_m: float  # smoothed median range; 0 before the first scan with points
+    _cell_range_m: float  # median range of the present cell size
     _has_rings: bool | None  # of the first scan of enough points; None before
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
-        self._scale = SceneScale(config)
-        self._has_rings = None
+        self._range_m, self._cell_range_m, self._has_rings = 0.0, 0.0, None
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
         squared = squared_ranges(scan.points)
-        cell_m = self._spacing_m(self._scale.update(squared))
+        cell_m = self._spacing_m(self._cell_m(squared))
         if self._has_rings is None and len(scan) >= _INSTANTS:
             self._has_rings = has_rings(scan)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
@@ -136,7 +108,23 @@ class Sampler(Stateful):
         rings = 0.0 if self._has_rings is False else 1.0
         elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
         keypoints = sweep.take(self._keypoints(sweep, cell_m))
-        return SampledScan(scan.stamp, cell_m, self._scale.range_m, sweep, elevations, keypoints)
+        return SampledScan(scan.stamp, cell_m, self._range_m, sweep, elevations, keypoints)
+
+    def _cell_m(self, squared: FloatArray) -> float:
+        """The size of cells for the latest squared ranges (N,), with hysteresis."""
+        # Fewer points are a covered sensor, not another scene.
+        if np.count_nonzero(squared > self._config.min_range_m**2) >= MIN_POINTS:
+            median_m = float(np.sqrt(np.median(squared[:: max(1, len(squared) // 5000)])))
+            new = self._range_m == 0.0
+            self._range_m = median_m if new else self._range_m + _RANGE_SMOOTHING * (median_m - self._range_m)
+        if self._config.cell_m is not None:
+            return self._config.cell_m
+        low_m, high_m = self._cell_range_m / _RANGE_CHANGE, self._cell_range_m * _RANGE_CHANGE
+        if self._range_m > 0.0 and not low_m <= self._range_m <= high_m:
+            self._cell_range_m = self._range_m
+        if self._cell_range_m < _CLOSE_M:
+            return _CELL_BOUNDS_M[0]
+        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
 
     def _spacing_m(self, cell_m: float) -> float:
         """The edge of the map's finest cells for that of the scene."""

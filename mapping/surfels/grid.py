@@ -14,12 +14,27 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, State, Stateful
-from lidarslam.mapping.surfels import cell_kernels as kernels
-from lidarslam.mapping.surfels.hash_kernels import FIRST_SIDE, OTHER_SIDE
-from lidarslam.mapping.surfels.side_kernels import belong_to_others, turn_to_sensor
-from lidarslam.mapping.surfels.surfel_kernels import refresh
+from lidarslam.mapping.surfels.surfel_kernels import (
+    OTHER,
+    Cells,
+    add_moments,
+    belong_to_others,
+    link_sides,
+    look_up,
+    refresh,
+    turn_to_sensor,
+)
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC
-from lidarslam.mapping.surfels.voxel_hash import ABSENT, Rows, VoxelHash, cell_keys, key_cells, point_keys
+from lidarslam.mapping.surfels.voxel_hash import (
+    ABSENT,
+    FIRST_SIDE,
+    OTHER_SIDE,
+    Rows,
+    VoxelHash,
+    cell_keys,
+    key_cells,
+    point_keys,
+)
 
 # Columns of a cell's sums: number of points, first and second moments about the cell's centre in units of the cell,
 # first and second moment of the elevation, the sum of the view directions, and the link to the other side.
@@ -95,9 +110,9 @@ class SurfelGrid(Stateful):
             keys[turned] |= OTHER_SIDE
             rows[turned] = self._hash.insert(keys[turned])
             self._reserve(len(self))
-            kernels.link_sides(keys[turned], rows[turned], *self._hash.slots, self._sums)
+            link_sides(keys[turned], rows[turned], *self._hash.slots, self._sums)
         seen = np.ascontiguousarray(elevations), views
-        kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums, weight)
+        add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums, weight)
 
     def insert_samples(self, points: FloatArray, elevations: FloatArray, views: FloatArray) -> None:
         """Insert the `samples` of another grid; samples in one cell may be of both its sides."""
@@ -112,7 +127,7 @@ class SurfelGrid(Stateful):
         Of a cell with two sides, the one that faces the sensor (3,), or the first where no sensor is given.
         """
         points, rows = np.ascontiguousarray(points), np.empty(len(points), dtype=np.int32)
-        kernels.look_up(points, self._cells(), rows)
+        look_up(points, self._cells(), rows)
         if sensor is not None:
             sensor = np.ascontiguousarray(sensor)
             turn_to_sensor(points, sensor, self._cells(), self._surfels, self._surfel_counts, rows)
@@ -162,9 +177,8 @@ class SurfelGrid(Stateful):
 
     def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the cells farther than `radius_m` from `centre` (3,)."""
-        kept = np.empty(len(self), dtype=np.intp)
-        count = kernels.within(self._keys[: len(self)], self.cell_m, np.ascontiguousarray(centre), radius_m, kept)
-        self._keep(kept[:count])
+        away = (key_cells(self._keys[: len(self)]) + 0.5) * self.cell_m - centre
+        self._keep(np.flatnonzero((away**2).sum(axis=1) <= radius_m**2))
 
     def tidy(self) -> None:
         """Recompute all surfels, and drop stray cells.
@@ -200,11 +214,11 @@ class SurfelGrid(Stateful):
         if is_lone.any():
             keys[others[is_lone]] = first[is_lone]
             self._hash.rebuild(keys)
-        self._sums[:, kernels.OTHER] = 0.0
-        kernels.link_sides(keys, np.arange(count, dtype=np.int32), *self._hash.slots, self._sums)
+        self._sums[:, OTHER] = 0.0
+        link_sides(keys, np.arange(count, dtype=np.int32), *self._hash.slots, self._sums)
 
-    def _cells(self) -> kernels.Cells:
-        return kernels.Cells(self.cell_m, *self._hash.slots, self._keys, self._sums)
+    def _cells(self) -> Cells:
+        return Cells(self.cell_m, *self._hash.slots, self._keys, self._sums)
 
     def _reserve(self, count: int) -> None:
         if count > len(self._keys):

@@ -1,19 +1,44 @@
-"""Surfels from the moments of a cell and its neighbours: the compiled loops of `SurfelGrid.surfels`.
+"""Surfels and their sums of moments: the compiled loops of `SurfelGrid`.
 
-The columns of surfels are as in `mapping.surfels.grid`.
-"""
+A cell's sums are (15,) float32: number of points, first and second moments about the cell's centre in units of the cell
+(x, y, z, xx, xy, xz, yy, yz, zz), first and second moment of the elevation, and the sum of the view directions (x, y,
+z). They fill a cache line with a sixteenth number, see `other_side`. Keys, and the table of keys and rows, are those of
+`mapping.surfels.voxel_hash`; the columns of surfels are as in `mapping.surfels.grid`.
+
+A cell with a plane holds one side of it. Points of that plane seen from behind belong to another surface and to a cell
+of their own, the cell's other side. Views are directions from a point to the sensor."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, other_side
-from lidarslam.mapping.surfels.hash_kernels import PREFETCHED, find_one, middle_of, neighbour_key, prefetch_around
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
+from lidarslam.mapping.surfels.voxel_hash import (
+    ABSENT,
+    FIRST_SIDE,
+    PREFETCHED,
+    Keys,
+    Rows,
+    cell_of,
+    find_one,
+    key_at,
+    key_of,
+    middle_of,
+    neighbour_key,
+    prefetch_around,
+    prefetch_slot,
+)
 
+Floats = NDArray[np.float32]
+
+# Column of the link to a cell's other side: its row plus one, exact to 16 million cells; zero where there is none.
+OTHER = 15
+# A cell with this many points is frozen, so that drift does not smear it.
+_MOST_POINTS = 60.0
 # Surfels that are computed together: the data of one is prefetched while another is computed.
 _TOGETHER = 16
 # A surfel is computed again when its cell has grown by this factor.
@@ -29,9 +54,128 @@ _LEAST_SINE = 0.17
 _MOST_THICKNESS = 0.4
 _LEAST_WIDTH = 0.15
 _LEAST_WIDTH_CELLS = 0.2
-
 Scratch = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
 """Room for the rows (27,) of cells around one, and for 15, 6 and 3 numbers."""
+# Least squared cosine between the view of a point and those of its cell for one side.
+_SAME_VIEW = 0.5
+# Columns of surfels: where the normal begins, and whether it is one of a plane.
+_NORMAL, _IS_PLANE = 3, 14
+
+
+class Cells(NamedTuple):
+    """The arrays of a grid of M cells."""
+
+    cell_m: float  # edge of a cell
+    bits: int  # binary logarithm of the number of slots
+    # table_keys, table_rows: of the hash
+    table_keys: Keys
+    table_rows: Rows
+    keys: Keys  # (M,) of the cells, by row
+    sums: Floats  # (M, 16) moments, and the link to the other side
+
+
+@compiled_part
+def other_side(row: int, sums: Floats) -> int:
+    """Row of the other side of the cell in a row, `ABSENT` where there is none."""
+    return int(sums[row, OTHER]) - 1
+
+
+@compiled
+def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows, sums: Floats) -> None:
+    """Write the links between both sides of cells into sums (M, 16), for the keys (N,) in rows (N,) of other sides."""
+    for n in range(len(keys)):
+        if keys[n] < 0 and other_side(rows[n], sums) == ABSENT:
+            first = find_one(keys[n] & FIRST_SIDE, bits, table_keys, table_rows)
+            sums[rows[n], OTHER] = first + 1
+            if first != ABSENT:
+                sums[first, OTHER] = rows[n] + 1
+
+
+@compiled
+def write_views(points: FloatArray, sensor: FloatArray, views: Floats) -> None:
+    """Write the unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
+    for n in range(len(points)):
+        x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
+        scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        views[n, 0], views[n, 1], views[n, 2] = x * scale, y * scale, z * scale
+
+
+@compiled
+def add_moments(
+    points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,
+    grid_keys: Keys, sums: Floats, weight: float,
+) -> None:  # fmt: skip
+    """Add points (N, 3) with elevations (N,) and views (N, 3) to the sums of their cells, unless these are frozen.
+
+    Each point counts `weight` times.
+    """
+    scale, w = 1.0 / cell_m, np.float32(weight)
+    is_growing = np.empty(len(rows), dtype=np.bool_)
+    for n in range(len(rows)):
+        ahead = rows[min(n + PREFETCHED, len(rows) - 1)]
+        prefetch(sums, ahead)
+        prefetch(grid_keys, ahead)
+        is_growing[n] = sums[rows[n], 0] < _MOST_POINTS
+        grid_keys[rows[n]] = keys[n]
+    for n in range(len(rows)):
+        if not is_growing[n]:
+            continue
+        sx, sy, sz = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
+        # Within the cell's own frame single precision is enough.
+        x = np.float32(sx - cell_of(sx) - 0.5)
+        y = np.float32(sy - cell_of(sy) - 0.5)
+        z = np.float32(sz - cell_of(sz) - 0.5)
+        elevation = np.float32(elevations[n])
+        cell = sums[rows[n]]
+        cell[0] += w
+        cell[1] += w * x
+        cell[2] += w * y
+        cell[3] += w * z
+        cell[4] += w * x * x
+        cell[5] += w * x * y
+        cell[6] += w * x * z
+        cell[7] += w * y * y
+        cell[8] += w * y * z
+        cell[9] += w * z * z
+        cell[10] += w * elevation
+        cell[11] += w * elevation * elevation
+        cell[12] += w * views[n, 0]
+        cell[13] += w * views[n, 1]
+        cell[14] += w * views[n, 2]
+
+
+@compiled
+def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
+    """Write the rows (N,) of the cells of points (N, 3), else of the nearest around; or `ABSENT`."""
+    scale, last = 1.0 / cells.cell_m, len(points) - 1
+    for n in range(len(points)):
+        ahead = key_at(points[min(n + PREFETCHED, last)], scale)
+        prefetch_slot(ahead, cells.bits, cells.table_keys, cells.table_rows)
+        x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
+        i, j, k = cell_of(x), cell_of(y), cell_of(z)
+        row = find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+        rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
+
+
+@compiled_part
+def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
+    """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells."""
+    nearest, least = ABSENT, np.inf
+    prefetch_around(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+    for a in range(i - 1, i + 2):
+        for b in range(j - 1, j + 2):
+            for c in range(k - 1, k + 2):
+                row = find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                if row == ABSENT:
+                    continue
+                count = cells.sums[row, 0]
+                dx = cells.sums[row, 1] / count + (a + 0.5 - x)
+                dy = cells.sums[row, 2] / count + (b + 0.5 - y)
+                dz = cells.sums[row, 3] / count + (c + 0.5 - z)
+                squared = dx * dx + dy * dy + dz * dz
+                if squared < least:
+                    nearest, least = row, squared
+    return nearest
 
 
 @compiled
@@ -189,3 +333,85 @@ def _view_cosine(own: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
     """Cosine between the view directions of two cells, times the length of the first."""
     length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
     return float((own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9))
+
+
+@compiled
+def belong_to_others(
+    views: NDArray[np.float32], rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
+    chosen: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Write whether points (N,), with views (N, 3), belong to the other sides of their cells, in rows (N,).
+
+    Outdated surfels (M, 15) are updated.
+    """
+    work, asked = scratch(), np.empty(len(rows), dtype=np.int32)
+    count = 0
+    for n in range(len(rows)):
+        prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
+        chosen[n] = False
+        asked[count] = n
+        count += other_side(rows[n], cells.sums) >= 0 or not _is_seen_alike(views[n], cells.sums[rows[n]])
+    for k in range(count):
+        ahead = rows[asked[min(k + PREFETCHED, count - 1)]]
+        prefetch(surfels[:, _IS_PLANE:], ahead)
+        prefetch(surfels[:, _NORMAL:], ahead)
+        n = asked[k]
+        row, x, y, z = rows[n], float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
+        other = other_side(row, cells.sums)
+        if other >= 0:
+            if outdated(row, cells.sums, counts):
+                refresh_one(row, cells, surfels, counts, work)
+            if outdated(other, cells.sums, counts):
+                refresh_one(other, cells, surfels, counts, work)
+            chosen[n] = _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels)
+            continue
+        # An outdated plane is still the same plane; a cell without a plane may have one by now.
+        if not surfels[row, _IS_PLANE] > 0.0 and outdated(row, cells.sums, counts):
+            refresh_one(row, cells, surfels, counts, work)
+        p = surfels[row]
+        behind = -(x * p[_NORMAL] + y * p[_NORMAL + 1] + z * p[_NORMAL + 2])
+        chosen[n] = p[_IS_PLANE] > 0.0 and is_steep(behind, math.sqrt(x * x + y * y + z * z))
+
+
+@compiled_part
+def _is_seen_alike(view: NDArray[np.float32], sums: NDArray[np.float32]) -> bool:
+    """Whether a point's view (3,) is near the mean view of its cell, so that both are of one side."""
+    x, y, z = float(view[0]), float(view[1]), float(view[2])
+    u, v, w = float(sums[12]), float(sums[13]), float(sums[14])
+    along, squared = x * u + y * v + z * w, x * x + y * y + z * z
+    return not (along < 0.0 or along * along < _SAME_VIEW * squared * (u * u + v * v + w * w))
+
+
+@compiled
+def turn_to_sensor(
+    points: FloatArray, sensor: FloatArray, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
+    rows: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Change the rows (N,) of cells, or -1, to those of their other sides where these face the sensor.
+
+    The sensor at (3,) measured points (N, 3).
+    """
+    work = scratch()
+    for n in range(len(rows)):
+        prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
+        row = rows[n]
+        other = other_side(row, cells.sums) if row >= 0 else ABSENT
+        if other == ABSENT:
+            continue
+        if outdated(row, cells.sums, counts):
+            refresh_one(row, cells, surfels, counts, work)
+        if outdated(other, cells.sums, counts):
+            refresh_one(other, cells, surfels, counts, work)
+        x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
+        if _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels):
+            rows[n] = other
+
+
+@compiled_part
+def _facing(row: int, x: float, y: float, z: float, cells: Cells, surfels: FloatArray) -> float:
+    """Cosine of a view with a cell's normal, where it has a plane, else with the cell's mean view."""
+    p, sums = surfels[row], cells.sums[row]
+    if p[14] > 0.0:
+        return float(x * p[3] + y * p[4] + z * p[5])
+    length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
+    return float((x * sums[12] + y * sums[13] + z * sums[14]) / max(length, 1e-9))

@@ -98,6 +98,11 @@ class Fit:
         """Share of inliers among all points, by the worst axis."""
         return self.overlap * (self.inlier_ratio or 0.0)
 
+    @property
+    def quality(self) -> float:
+        """Score among fits: share of inliers times directional support."""
+        return self.inlier_share * (self.support or 0.0)
+
     def status(self, config: TrackingConfig, is_young: bool = False, is_held: bool = False) -> Status:
         """Tracking status of the scan.
 

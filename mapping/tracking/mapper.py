@@ -19,8 +19,14 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
-from lidarslam.mapping.motion.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
-from lidarslam.mapping.motion.velocity_bias import velocity_error
+from lidarslam.mapping.motion.prediction import (
+    LOST_MOTION,
+    UNKNOWN_VELOCITY,
+    MotionState,
+    Prediction,
+    Prior,
+    velocity_error,
+)
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
@@ -85,21 +91,12 @@ class Mapper(Stateful):
         """The map that scans are registered to; None before the first."""
         return self._map
 
-    @property
-    def cell_m(self) -> float | None:
-        """Edge of the map's finest cells; None before the first scan."""
-        return None if self._map is None else self._map.cell_m
-
     def sample(self, scan: Scan) -> SampledScan:
-        """Thin the next scan, for `process_sampled`; on any thread, while that works on an earlier one."""
+        """Thin the next scan; on any thread, while `process` works on an earlier one."""
         return self._sampler.sample(scan)
 
-    def process(self, scan: Scan, prior: Prior) -> MappedScan:
+    def process(self, scan: SampledScan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
-        return self.process_sampled(self.sample(scan), prior)
-
-    def process_sampled(self, scan: SampledScan, prior: Prior) -> MappedScan:
-        """Register the next scan, thinned already, and insert it."""
         self._budget.begin(np.inf if self._last is None else scan.stamp - self._last.stamp)
         self._scans += 1
         velocity = np.zeros(6) if prior.velocity is None else prior.velocity
@@ -112,7 +109,7 @@ class Mapper(Stateful):
         else:
             mapped = self._track(scan, prior, last, self._map)
         self._last = mapped.state
-        return mapped
+        return replace(mapped, cell_m=None if self._map is None else self._map.cell_m)
 
     def _track(self, scan: SampledScan, prior: Prior, last: MotionState, local_map: LocalMap) -> MappedScan:
         """Predict, register, judge, insert."""

@@ -9,9 +9,9 @@ from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.local_map import LocalMap
-from lidarslam.mapping.tracking.attempt import Attempt, best_of
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import Steps, complete
+from lidarslam.mapping.tracking.mapped_scan import Attempt, best_of
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.start_poses import best_starts, turned_poses
 

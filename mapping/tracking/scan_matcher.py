@@ -9,13 +9,12 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.local_map import LocalMap, Matcher
 from lidarslam.mapping.registration.registration import register, with_mean_velocity
 from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.registration.surfaces import Matcher
-from lidarslam.mapping.tracking.attempt import Attempt
 from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import NO_FIT, Fit
+from lidarslam.mapping.tracking.mapped_scan import Attempt
 
 # Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
@@ -78,7 +77,7 @@ class ScanMatcher:
         if attempt.registration is None or attempt.fit.weakest is None:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
-        is_known = evidence < _HELD_EVIDENCE and start.is_known_along(direction, _KNOWN_M)
+        is_known = start.is_inertial and evidence < _HELD_EVIDENCE and start.sigma_along(direction) < _KNOWN_M
         if is_known and (found := self._found_along(prediction, start, direction, keypoints)) is not None:
             return found
         if not is_known and (self.scan.has_rings or not self.local_map.is_young or evidence > _STROKES_EVIDENCE):

@@ -7,8 +7,15 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import MotionState, OdometryNoise, Prediction, Prior, ProcessNoise, predict
-from lidarslam.mapping.motion.velocity_bias import VelocityBias
+from lidarslam.mapping.motion.prediction import (
+    MotionState,
+    OdometryNoise,
+    Prediction,
+    Prior,
+    ProcessNoise,
+    VelocityBias,
+    predict,
+)
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 
 # After a gap of this length between scans the pose is uncertain.
@@ -20,11 +27,13 @@ _ROUNDING_S = 1e-3
 _SEARCHES_AT, _SEARCHES_EVERY = (1, 2, 4, 8, 13), 20
 # A scan fits poorly below this share of the usual quality, which is smoothed over the latest scans.
 _POOR_SHARE, _SMOOTHING = 0.9, 0.2
+# Scans in a row at which odometry and registration conflict: 10 to 22 in crowds that walk along, at most 5 elsewhere.
+_LASTING_CONFLICT = 6
 # Lost scans in a row after which a new map is begun. Scans without points do not count.
 GIVE_UP_AFTER = 20
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
 # error is forgotten by a factor per scan.
-_FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
+_FINE_ERROR_CELLS, ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,7 @@ class TrackingState:
     relocalised_s: float | None = None  # stamp of a relocalisation until it is confirmed
     usual_quality: float = 0.0
     conflicts: int = 0  # scans in a row at which odometry and registration measured different motions
+    lasting_conflict: str | None = None  # its axis, once there are enough of them
     is_measured: bool = False  # whether a proven odometry measured every motion since the sensor was tracked
     prediction_error_m: float = _UNKNOWN_ERROR_M
     process_noise: ProcessNoise = field(default_factory=ProcessNoise)
@@ -131,9 +141,8 @@ class TrackingState:
             variance = np.diag(state.covariance + last.covariance)[6:]
             process_noise = process_noise.updated(state.velocity - last.velocity, interval_s, variance)
         odometry_noise = self.odometry_noise.updated(prior, motion, config)
-        conflicts = 0 if odometry_noise.conflict(prior, motion, interval_s) is None else self.conflicts + 1
-        return replace(self, process_noise=process_noise, odometry_noise=odometry_noise, conflicts=conflicts)
-
-    def with_prediction_error(self, error_m: float) -> "TrackingState":
-        """With the error of the latest prediction."""
-        return replace(self, prediction_error_m=max(_ERROR_DECAY * self.prediction_error_m, error_m))
+        axis = odometry_noise.conflict(prior, motion, interval_s)
+        conflicts = 0 if axis is None else self.conflicts + 1
+        lasting = axis if conflicts >= _LASTING_CONFLICT else None
+        noise = replace(self, process_noise=process_noise, odometry_noise=odometry_noise)
+        return replace(noise, conflicts=conflicts, lasting_conflict=lasting)

@@ -174,7 +174,7 @@ def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:
     for method, kind in (("surfels", SurfelMap), ("loam", FeatureMap)):
         mapper = make_localiser(Config(mapping=MappingConfig(method=method))).mapper
         assert mapper is not None
-        mapper.process(room_scans[0], Prior())
+        mapper.process(mapper.sample(room_scans[0]), Prior())
         assert type(mapper.local_map) is kind
     assert isinstance(make_localiser(Config(mapping=MappingConfig(method="off"))), OdometryAlone)
 

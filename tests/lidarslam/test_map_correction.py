@@ -15,7 +15,7 @@ from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.pose_graph.keyframes import GraphScan
+from lidarslam.mapping.pose_graph.edges import GraphScan
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -136,15 +136,15 @@ def test_an_error_while_drawing_reaches_the_caller(room_scans: list[Scan], room_
 def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
     mapper = Mapper(CONFIG, kept_scans=SCANS_LATER)
     for scan in room_scans[:6]:  # the map begins anew with the second one, when the first one's velocity is known
-        mapper.process(scan, Prior())
-    begun, cell_m = mapper.local_map, mapper.cell_m
+        mapper.process(mapper.sample(scan), Prior())
+    begun, cell_m = mapper.local_map, mapper.local_map.cell_m
     assert cell_m is not None
     assert not mapper.redraw(SurfelMap(cell_m, CONFIG.radius_m), 5)
     assert mapper.local_map is begun
     drawn = SurfelMap(cell_m, CONFIG.radius_m)
     assert mapper.redraw(drawn, 4)
     assert mapper.local_map is drawn
-    assert mapper.process(room_scans[6], Prior()).registered  # to the last four scans, which are in it
+    assert mapper.process(mapper.sample(room_scans[6]), Prior()).registered  # to the last four scans, which are in it
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def drive_by(office: World) -> Simulation:
 def _followed(drive_by: Simulation) -> Mapper:
     mapper = Mapper(MappingConfig())
     for scan in drive_by.scans(0, AT):
-        mapper.process(scan, NOTHING)
+        mapper.process(mapper.sample(scan), NOTHING)
     return mapper
 
 
@@ -78,7 +78,7 @@ def mapper(_followed: Mapper) -> Mapper:
 
 
 def process(mapper: Mapper, recorded: Faulty, first: int = AT) -> list[MappedScan]:
-    return [mapper.process(scan, NOTHING) for scan in recorded.scans[first:]]
+    return [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans[first:]]
 
 
 def errors(results: list[MappedScan], recorded: Faulty, first: int = AT) -> tuple[FloatArray, FloatArray]:
@@ -138,7 +138,7 @@ def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(mapper, drive_by, 
 def test_a_first_scan_of_stray_points_begins_no_map(drive_by):
     recorded = covered(drive_by, 0, 3, "stray")
     mapper = Mapper(MappingConfig())
-    results = [mapper.process(scan, NOTHING) for scan in recorded.scans[:3]]
+    results = [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans[:3]]
     assert [result.status for result in results] == [Status.LOST] * 3
     assert mapper.local_map is None
     assert "only 25 points" in results[0].message
@@ -167,13 +167,13 @@ def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper, drive_by)
     motion = motion_along_route("tracked", tunnel, 0)
     away = Simulation(tunnel, light(), motion, mount_pose("upright", motion.sensor_height_m), 20)
     there = [replace(scan, stamp=0.1 * (AT + k)) for k, scan in enumerate(away.scans())]
-    results = [mapper.process(scan, NOTHING) for scan in there]
+    results = [mapper.process(mapper.sample(scan), NOTHING) for scan in there]
     assert Status.OK not in {result.status for result in results}
     assert "a new map begins here" in results[4].message
     assert "in a new map" in results[-1].message
     assert results[-1].added
     again = [replace(scan, stamp=scan.stamp + 2.0) for scan in drive_by.scans(AT, COUNT)]
-    back = [mapper.process(scan, NOTHING) for scan in again]
+    back = [mapper.process(mapper.sample(scan), NOTHING) for scan in again]
     recorded = Faulty((), drive_by.ground_truth, np.zeros(COUNT, dtype=np.bool_), AT)
     assert Status.OK in {result.status for result in back}
     assert_nothing_wrong_is_believed([r if r.status is Status.OK else replace(r, added=False) for r in back], recorded)
@@ -239,7 +239,7 @@ def test_nothing_drifts_while_the_sensor_stands_still(name):
     for seed in range(3):
         recorded = stand(build_world(name, seed), 50)
         mapper = Mapper(MappingConfig())
-        results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
+        results = [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans]
         assert {result.status for result in results} == {Status.OK}
         poses = np.array([result.state.T_world_lidar for result in results])
         drift = inverse(poses[10]) @ poses[40:]
@@ -252,7 +252,7 @@ def test_nothing_drifts_while_the_sensor_stands_still(name):
 def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office):
     recorded = stand(office, 80, np.array([0.8, -0.8, 0.9, -0.9, 1.0, -1.1, 1.2]))
     mapper = Mapper(MappingConfig())
-    results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
+    results = [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans]
     metres, degrees = errors(results, recorded, 0)
     assert {result.status for result in results} == {Status.OK}
     assert metres.max() < 0.03
@@ -270,7 +270,10 @@ def test_an_even_tunnel_is_told_to_say_nothing_along_it():
     nothing = (x > 33.0) & (x < 39.0)
     assert nothing.sum() > 10
     mapper = Mapper(MappingConfig())
-    results = [mapper.process(scan, NOTHING) for scan in simulation.scans(0, int(np.flatnonzero(nothing)[-1]) + 1)]
+    results = [
+        mapper.process(mapper.sample(scan), NOTHING)
+        for scan in simulation.scans(0, int(np.flatnonzero(nothing)[-1]) + 1)
+    ]
     concerned = [result for result, here in zip(results, nothing[: len(results)], strict=True) if here]
     assert {result.status for result in concerned} == {Status.DEGRADED}
     assert all("x" in result.degenerate for result in concerned)
@@ -289,6 +292,6 @@ def test_a_scan_that_fits_two_places_alike_is_at_neither(rng):
 
     mapper = Mapper(MappingConfig())
     for k in range(10):
-        mapper.process(Scan(walls(8_000), 0.1 * k), NOTHING)
+        mapper.process(mapper.sample(Scan(walls(8_000), 0.1 * k)), NOTHING)
     carried = Scan(walls(8_000) - np.array([2.5, 1.0, 0.0]), 1.0)
-    assert mapper.process(carried, NOTHING).status is Status.LOST
+    assert mapper.process(mapper.sample(carried), NOTHING).status is Status.LOST

@@ -7,11 +7,11 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
 from lidarslam.core.state import decode
-from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE
 from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
+from lidarslam.mapping.loam.features import EDGE, PLANE
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.local_map import LocalMap, are_large
 from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
@@ -241,9 +241,9 @@ def test_large_surfaces_go_on(rng):
     person = np.array([1.0, 1.0, 0.0]) + rng.uniform(-1.0, 1.0, (600, 3)) * [0.2, 0.0, 0.2]
     feature_map = map_of(NONE, np.concatenate([faces, person]))
     floor, board = np.array([[2.0, 0.5, -2.5]]), np.array([[1.0, 1.0, 0.0]])
-    assert feature_map.goes_on(floor, np.array([[0.0, 0.0, 1.0]]), ORIGIN, 0.94, 0.08).all()
-    assert not feature_map.goes_on(floor, np.array([[0.0, 1.0, 0.0]]), ORIGIN, 0.94, 0.08).any()
-    assert not feature_map.goes_on(board, np.array([[0.0, 1.0, 0.0]]), ORIGIN, 0.94, 0.08).any()
+    assert are_large(feature_map, floor, np.array([[0.0, 0.0, 1.0]]), ORIGIN).all()
+    assert not are_large(feature_map, floor, np.array([[0.0, 1.0, 0.0]]), ORIGIN).any()
+    assert not are_large(feature_map, board, np.array([[0.0, 1.0, 0.0]]), ORIGIN).any()
 
 
 def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):

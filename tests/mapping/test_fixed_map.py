@@ -11,8 +11,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap
-from lidarslam.mapping.localization.fixed_map import FixedMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
+from lidarslam.mapping.localization.place_search import FixedMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
@@ -46,7 +46,7 @@ def draw_map(room: Any) -> FixedMap:
 
 def localise(localiser: MapLocaliser, scans: Sequence[Scan]) -> list[MappedScan]:
     """Without an odometry."""
-    return [localiser.process(scan, Prior()) for scan in scans]
+    return [localiser.process(localiser.sample(scan), Prior()) for scan in scans]
 
 
 def errors(poses: FloatArray) -> tuple[FloatArray, FloatArray]:

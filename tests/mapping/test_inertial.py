@@ -14,8 +14,8 @@ from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity
-from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.inertial import UNKNOWN_LEVER_M, Inertial
+from lidarslam.mapping.inertial.window import Preintegration
 from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.motion.prediction import (
     UNKNOWN_VELOCITY,
@@ -146,7 +146,7 @@ def walked(state_after_8_s: State) -> Inertial:
 
 
 def test_integrated_turns_are_those_of_the_motion():
-    gyroscope = Gyroscope(samples(walk, 4.0), T_LIDAR_IMU[:3, :3])
+    gyroscope = Preintegration(samples(walk, 4.0), T_LIDAR_IMU[:3, :3])
     turn = gyroscope.turn(0.513, 3.207, T_LIDAR_IMU[:3, :3] @ BIAS)
     expected = inverse(walk(0.513)) @ walk(3.207)
     assert np.rad2deg(rotation_angle(turn.T @ expected[:3, :3])) < 0.005
@@ -157,14 +157,14 @@ def test_integrated_turns_are_those_of_the_motion():
 def test_clocks_that_count_from_1970_lose_no_digits():
     imu = samples(walk, 4.0)
     late = replace(imu, stamps=imu.stamps + 1.7e9)
-    turns = [Gyroscope(one, np.eye(3)).turn(t, t + 0.1, BIAS) for one, t in ((imu, 2.0), (late, 1.7e9 + 2.0))]
+    turns = [Preintegration(one, np.eye(3)).turn(t, t + 0.1, BIAS) for one, t in ((imu, 2.0), (late, 1.7e9 + 2.0))]
     np.testing.assert_allclose(turns[1], turns[0], atol=1e-6)
 
 
 def test_a_gap_between_samples_is_not_covered():
     imu = samples(walk, 4.0)
     kept = (imu.stamps < 2.0) | (imu.stamps > 2.2)
-    gyroscope = Gyroscope(
+    gyroscope = Preintegration(
         ImuSamples(imu.stamps[kept], imu.angular_velocities[kept], imu.accelerations[kept]), np.eye(3)
     )
     assert gyroscope.covers(1.0, 1.9)
@@ -180,7 +180,7 @@ def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at, rng):
     points = rng.uniform(-10.0, 10.0, (3000, 3))
     R = jerky(np.array(stamp))[:3, :3].T @ jerky(stamp + offsets)[:, :3, :3]
     sweep = Scan(np.einsum("nji,nj->ni", R, points), stamp, offsets)
-    gyroscope = Gyroscope(samples(jerky, 2.0), T_LIDAR_IMU[:3, :3])
+    gyroscope = Preintegration(samples(jerky, 2.0), T_LIDAR_IMU[:3, :3])
     rate = gyroscope.mean_rate(sweep)
     assert rate is not None
     velocity = np.concatenate([rate - T_LIDAR_IMU[:3, :3] @ BIAS, np.zeros(3)])
@@ -193,7 +193,7 @@ def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at, rng):
 
 
 def test_sweeps_without_times_or_samples_stay_as_they_are():
-    gyroscope = Gyroscope(samples(walk, 2.0), np.eye(3))
+    gyroscope = Preintegration(samples(walk, 2.0), np.eye(3))
     points = np.ones((5, 3))
     for scan in (Scan(points, 1.0), Scan(points, 9.0, np.linspace(0.0, 0.1, 5)), Scan(points, 1.0, np.zeros(5))):
         assert gyroscope.evened(scan) is scan

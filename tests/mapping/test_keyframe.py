@@ -5,8 +5,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.mapping.config import KeyframeConfig
-from lidarslam.mapping.pose_graph import keyframes
-from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
+from lidarslam.mapping.pose_graph import keyframe_graph
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def moved(x: float = 0.0, turn_deg: float = 0.0) -> FloatArray:
 
 def test_the_way_to_the_next_follows_the_scene(hall, monkeypatch):
     """A quarter of 8 m; in a hall four times as large it would be 4 m at most, in a shaft 0.5 m at least."""
-    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.0)
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.0)
     for scale, distance_m in ((1.0, 2.05), (4.0, 4.0), (0.1, 0.5)):
         chosen = selector(scale * hall)
         assert not chosen.is_due(moved(0.97 * distance_m), scale * hall)
@@ -37,7 +37,7 @@ def test_the_way_to_the_next_follows_the_scene(hall, monkeypatch):
 
 
 def test_the_way_can_be_set(hall, monkeypatch):
-    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.0)
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.0)
     chosen = selector(hall, distance_m=3.0)
     assert not chosen.is_due(moved(2.9), hall)
     assert chosen.is_due(moved(3.0), hall)
@@ -51,16 +51,16 @@ def test_a_turn_on_the_spot_makes_a_keyframe(hall):
 
 def test_a_scan_that_sees_other_things_is_due(hall, monkeypatch):
     """Half of it elsewhere: through a door, say."""
-    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.6)
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.6)
     chosen = selector(hall)
     beyond = hall + np.where(hall[:, :1] > 0.0, [[10.0, 0.0, 0.0]], 0.0)
     assert not chosen.is_due(moved(0.1), hall)
     assert chosen.is_due(moved(0.1), beyond)
-    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.4)
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.4)
     assert not selector(hall).is_due(moved(0.1), beyond)
 
 
 def test_noise_is_no_new_sight(hall, rng, monkeypatch):
-    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.95)
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.95)
     chosen = selector(hall)
     assert not chosen.is_due(np.eye(4), hall + rng.normal(0.0, 0.05, hall.shape))

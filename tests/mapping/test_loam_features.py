@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE, classify, write_curvatures
-from lidarslam.mapping.loam.features import FeatureSampler, ring_order
+from lidarslam.mapping.loam.features import EDGE, PLANE, FeatureSampler, classify, ring_order, write_curvatures
 from lidarslam.mapping.motion.deskew import Sweep
 
 FINE_M = 0.02  # voxels of single points

@@ -8,10 +8,9 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.config import LoopConfig
-from lidarslam.mapping.loops import candidates, detection
-from lidarslam.mapping.loops.candidates import KeyframeDatabase
+from lidarslam.mapping.loops import detection
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.mapping.loops.detection import LoopDetector
+from lidarslam.mapping.loops.detection import KeyframeDatabase, LoopDetector
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +163,7 @@ def test_segments_are_joined_whatever_their_worlds_and_mounts(hall):
 @pytest.mark.parametrize(("min_way_m", "min_similarity"), [(10.0, 0.35), (1.0, -1.0)])
 def test_rooms_that_are_all_the_same_are_not_taken_for_one(min_way_m, min_similarity, monkeypatch):
     """One room after the other, each exactly like the last: everything fits, and drift explains none of it."""
-    monkeypatch.setattr(candidates, "_MIN_SIMILARITY", min_similarity)
+    monkeypatch.setattr(detection, "_MIN_SIMILARITY", min_similarity)
     rng = np.random.default_rng(0)
     room = box_points([((0, 0, 1.5), (5, 4, 1.5)), ((3, 2, 0.6), (0.6, 1, 0.6)), ((-4, -1, 0.9), (0.7, 0.4, 0.9))], rng)
     stands = make_transform(np.eye(3), np.array([[-2.0, -1.0, 1.3], [0.0, 0.5, 1.3], [2.0, -1.0, 1.3]]))

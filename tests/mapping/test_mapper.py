@@ -23,7 +23,10 @@ SURFELS, LOAM = MappingConfig(), MappingConfig(method="loam")
 
 
 def process(mapper: Mapper, scans: list[Scan], priors: list[Prior] | None = None) -> list[MappedScan]:
-    return [mapper.process(scan, prior) for scan, prior in zip(scans, priors or [NOTHING] * len(scans), strict=True)]
+    return [
+        mapper.process(mapper.sample(scan), prior)
+        for scan, prior in zip(scans, priors or [NOTHING] * len(scans), strict=True)
+    ]
 
 
 def errors(results: list[MappedScan], T_room_lidar: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -104,7 +107,7 @@ def size(mapper: Mapper) -> int:
 @pytest.mark.parametrize("config", [SURFELS, LOAM], ids=["surfels", "loam"])
 def test_the_first_scan_is_the_world(config, ring_scans):
     mapper = Mapper(config)
-    first = mapper.process(ring_scans[0], NOTHING)
+    first = mapper.process(mapper.sample(ring_scans[0]), NOTHING)
     np.testing.assert_array_equal(first.state.T_world_lidar, np.eye(4))
     assert (first.status, first.registered, first.added, first.fit) == (Status.OK, False, True, None)
     assert min(len(grid) for grid in mapper.local_map.grids) > 10
@@ -173,7 +176,7 @@ def test_the_pose_does_not_drift_while_nothing_moves(mapper, room, drive):
 
 
 def test_a_first_scan_of_nothing_is_lost_and_the_next_begins_the_map(mapper, rest_scans, rest_truth):
-    first = mapper.process(empty(0.0), NOTHING)
+    first = mapper.process(mapper.sample(empty(0.0)), NOTHING)
     assert first.status is Status.LOST
     assert first.message == "no points within range"
     assert mapper.local_map is None
@@ -182,7 +185,7 @@ def test_a_first_scan_of_nothing_is_lost_and_the_next_begins_the_map(mapper, res
 
 def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothing(settled, rest_scans, rest_truth):
     held = size(settled)
-    lost = settled.process(empty(rest_scans[15].stamp), NOTHING)
+    lost = settled.process(settled.sample(empty(rest_scans[15].stamp)), NOTHING)
     assert lost.status is Status.LOST
     assert lost.message == "no points within range"
     assert not lost.registered
@@ -190,14 +193,14 @@ def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothi
     np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_predicted)
     truth = inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar
     assert np.linalg.norm(lost.state.T_world_lidar[:3, 3] - truth[15, :3, 3]) < 0.02, "it goes on as it did"
-    after = settled.process(rest_scans[16], NOTHING)
+    after = settled.process(settled.sample(rest_scans[16]), NOTHING)
     assert after.status is Status.OK
     assert np.linalg.norm(after.state.T_world_lidar[:3, 3] - truth[16, :3, 3]) < 0.006
 
 
 def test_a_scan_of_another_place_is_lost_and_stays_out_of_the_map(settled, rest_scans, rest_truth):
     held = size(settled)
-    lost = settled.process(garbage(rest_scans[15].stamp), NOTHING)
+    lost = settled.process(settled.sample(garbage(rest_scans[15].stamp)), NOTHING)
     assert lost.status is Status.LOST
     assert "% of the scan" in lost.message
     assert size(settled) == held
@@ -210,14 +213,14 @@ def test_a_scan_of_another_place_is_lost_and_stays_out_of_the_map(settled, rest_
 @pytest.mark.parametrize(("earlier", "is_inserted"), [(1, True), (6, False)])
 def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_a_map_that_is_not_young(rest_scans, earlier, is_inserted):
     mapper = Mapper(MappingConfig(tracking=TrackingConfig(degraded_below=1.0)))
-    mapper.process(rest_scans[0], Prior(velocity=np.zeros(6)))
+    mapper.process(mapper.sample(rest_scans[0]), Prior(velocity=np.zeros(6)))
     for scan in rest_scans[1:earlier]:
-        mapper.process(scan, NOTHING)
+        mapper.process(mapper.sample(scan), NOTHING)
     held = size(mapper)
     # A quarter of its points stand before the walls, as people do.
     crowded = rest_scans[earlier].points.copy()
     crowded[::4] *= 0.8
-    placed = mapper.process(replace(rest_scans[earlier], points=crowded), NOTHING)
+    placed = mapper.process(mapper.sample(replace(rest_scans[earlier], points=crowded)), NOTHING)
     assert placed.registered
     assert placed.status is Status.DEGRADED
     assert "fits the map" in placed.message
@@ -227,7 +230,7 @@ def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_a_map_that_is_not_yo
 @pytest.mark.parametrize("turned_deg", [-100.0, 180.0])
 def test_turned_on_the_spot_it_finds_its_way_back(settled, room, rest_truth, turned_deg):
     T_turned = rest_truth.T_world_lidar[14] @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
-    found = settled.process(snapshot(room, T_turned, float(rest_truth.stamps[15]) + 1.0, 7), NOTHING)
+    found = settled.process(settled.sample(snapshot(room, T_turned, float(rest_truth.stamps[15]) + 1.0, 7)), NOTHING)
     truth = inverse(rest_truth.T_world_lidar[0]) @ T_turned
     error = inverse(truth) @ found.state.T_world_lidar
     assert np.linalg.norm(error[:3, 3]) < 0.01
@@ -240,7 +243,10 @@ def test_a_place_that_no_motion_leads_to_is_not_taken_until_driving_decides(sett
     """Turned within a tenth of a second: another room that looks alike is as probable, for a second."""
     T_turned = rest_truth.T_world_lidar[14] @ exp([0.0, 0.0, np.deg2rad(150.0), 0.0, 0.0, 0.0])
     stamps = rest_truth.stamps[14] + 0.1 * np.arange(1, 26)
-    found = [settled.process(snapshot(room, T_turned, float(stamp), 7 + k), NOTHING) for k, stamp in enumerate(stamps)]
+    found = [
+        settled.process(settled.sample(snapshot(room, T_turned, float(stamp), 7 + k)), NOTHING)
+        for k, stamp in enumerate(stamps)
+    ]
     assert [one.status for one in found[:4]] == [Status.LOST] * 4
     assert found[-1].status is Status.OK
     truth = inverse(rest_truth.T_world_lidar[0]) @ T_turned
@@ -252,7 +258,7 @@ def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans, monkeypatch):
     mapper = Mapper(MappingConfig())
     process(mapper, rest_scans[:10])
     stamps = rest_scans[9].stamp + 0.1 * np.arange(1, 4)
-    lost = [mapper.process(garbage(float(stamp), seed), NOTHING) for seed, stamp in enumerate(stamps)]
+    lost = [mapper.process(mapper.sample(garbage(float(stamp), seed)), NOTHING) for seed, stamp in enumerate(stamps)]
     assert [result.status for result in lost] == [Status.LOST] * 3
     assert ["a new map begins here" in result.message for result in lost] == [False, False, True]
 
@@ -262,7 +268,7 @@ def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(rest_scans, rest
     monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 1)
     mapper = Mapper(MappingConfig())
     process(mapper, [garbage(0.0)])
-    restarted = mapper.process(rest_scans[0], NOTHING)
+    restarted = mapper.process(mapper.sample(rest_scans[0]), NOTHING)
     assert "a new map begins here" in restarted.message
     results = process(mapper, rest_scans[1:])
     assert [result.status for result in results] == [Status.OK] * 19
@@ -297,7 +303,7 @@ def test_a_sensor_that_was_carried_away_is_relocalised_in_loams_map(ring_scans, 
     """Covered for a second and turned by 100 degrees in the meantime."""
     mapper = Mapper(LOAM)
     process(mapper, ring_scans[:10], true_priors(room_truth)[:10])
-    assert mapper.process(empty(ring_scans[10].stamp), NOTHING).status is Status.LOST
+    assert mapper.process(mapper.sample(empty(ring_scans[10].stamp)), NOTHING).status is Status.LOST
     turn = exp([0.0, 0.0, np.deg2rad(100.0), 0.0, 0.0, 0.0])
     turned = [replace(scan, points=scan.points @ turn[:3, :3], stamp=scan.stamp + 1.0) for scan in ring_scans[11:20]]
     results = process(mapper, turned)

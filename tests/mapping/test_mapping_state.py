@@ -8,7 +8,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import KeyframeConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
@@ -43,16 +43,16 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
 def test_a_mapper_goes_on(through_disk, request, method, recording, resumed_after):
     config, scans = MappingConfig(keypoints=600, method=method), request.getfixturevalue(recording)[:12]
     whole = Mapper(config)
-    expected = [whole.process(scan, Prior()) for scan in scans]
+    expected = [whole.process(whole.sample(scan), Prior()) for scan in scans]
     assert Status.OK in {mapped.status for mapped in expected}
     assert any("a new map" in mapped.message for mapped in expected) == (method == "surfels")
     for after in resumed_after:
         first, second = Mapper(config), Mapper(config)
         for scan in scans[:after]:
-            first.process(scan, Prior())
+            first.process(first.sample(scan), Prior())
         second.restore(through_disk(first.state()))
         for scan, mapped in zip(scans[after:], expected[after:], strict=True):
-            assert_same(second.process(scan, Prior()), mapped)
+            assert_same(second.process(second.sample(scan), Prior()), mapped)
 
 
 @pytest.mark.parametrize("tidied_after", [1_000, 3])

@@ -10,7 +10,7 @@ from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
-from lidarslam.mapping.localization.fixed_map import FixedMap
+from lidarslam.mapping.localization.place_search import FixedMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -44,9 +44,11 @@ def test_points_up_to_the_reach_are_in_the_map(rng):
 @pytest.mark.parametrize("method", ["surfels", "loam"])
 def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(method, room, drive):
     tracker = Mapper(MappingConfig(method=method, cell_m=0.05, max_range_m=30.0))
-    tracker.process(room.ring_sweep(drive, 0.1), Prior(T_prev_curr=np.eye(4)))
+    tracker.process(tracker.sample(room.ring_sweep(drive, 0.1)), Prior(T_prev_curr=np.eye(4)))
     T_prev_curr = exp([0.0, 0.0, 0.0, 1e7, 0.0, 0.0])
-    mapped = tracker.process(room.ring_sweep(drive, 0.2), Prior(T_prev_curr=T_prev_curr, covariance=1e-12 * np.eye(6)))
+    mapped = tracker.process(
+        tracker.sample(room.ring_sweep(drive, 0.2)), Prior(T_prev_curr=T_prev_curr, covariance=1e-12 * np.eye(6))
+    )
     assert mapped.status is Status.LOST
     assert mapped.message == "beyond the reach of a map with cells of 0.05 m, 52 km"
 

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.mapping.pose_graph.keyframes import Keyframe
+from lidarslam.mapping.pose_graph.edges import Keyframe
 from lidarslam.mapping.pose_graph.submap_placement import Drawn, SubmapPlacement
 
 SIGMA = np.array([1e-3] * 3 + [5e-3] * 3)

@@ -43,7 +43,7 @@ def truth(at_speed: Simulation, scans: list[Scan]) -> FloatArray:
 def process(scans: list[Scan], motions: list[FloatArray | None]) -> list[MappedScan]:
     mapper = Mapper(MappingConfig())
     priors = [Prior() if motion is None else Prior(motion, covariance=STATED) for motion in motions]
-    return [mapper.process(scan, prior) for scan, prior in zip(scans, priors, strict=True)]
+    return [mapper.process(mapper.sample(scan), prior) for scan, prior in zip(scans, priors, strict=True)]
 
 
 def worst_m(results: list[MappedScan], truth: FloatArray) -> float:

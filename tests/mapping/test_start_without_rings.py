@@ -28,7 +28,7 @@ def test_a_drone_takes_off(seed):
     for scan in scans:
         motion = smoothed.get(scan.stamp)
         prior = Prior() if motion is None else Prior(motion.T_prev_curr, motion.velocity, motion.covariance)
-        results.append(mapper.process(scan, prior))
+        results.append(mapper.process(mapper.sample(scan), prior))
     T_map_lidar = simulation.ground_truth.at(np.array([scan.stamp for scan in scans]), 0.2)
     estimated = np.array([result.state.T_world_lidar for result in results])
     steps = inverse(inverse(T_map_lidar[:-1]) @ T_map_lidar[1:]) @ inverse(estimated[:-1]) @ estimated[1:]

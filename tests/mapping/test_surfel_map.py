@@ -6,8 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.local_map import LEVELS
-from lidarslam.mapping.registration.surfaces import Correspondences
+from lidarslam.mapping.registration.local_map import LEVELS, Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 CELL = 0.4

@@ -8,11 +8,10 @@ import pytest
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.surfaces import Correspondences
+from lidarslam.mapping.registration.local_map import Correspondences
 from lidarslam.mapping.surfels.grid import MEAN, NORMAL, SurfelGrid
-from lidarslam.mapping.surfels.hash_kernels import OTHER_SIDE
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
+from lidarslam.mapping.surfels.voxel_hash import OTHER_SIDE, VoxelHash, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005

@@ -9,13 +9,13 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.config import GlobalMapConfig
-from lidarslam.mapping.global_map import drawing, tile_store
+from lidarslam.mapping.global_map import drawing, voxels
 from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
+from lidarslam.mapping.global_map.voxels import Tile, TileStore, Tiling
 from lidarslam.mapping.surfels.voxel_hash import cell_keys, key_cells, point_keys
 
 VOXEL_M, MOST = 0.1, 6_000
@@ -24,7 +24,7 @@ CONFIG = GlobalMapConfig(voxel_size_m=VOXEL_M, most_points=MOST, fields=("intens
 
 @pytest.fixture(autouse=True)
 def _small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tile_store, "_EDGE_M", 4.03)  # no whole number of voxels
+    monkeypatch.setattr(voxels, "_EDGE_M", 4.03)  # no whole number of voxels
     monkeypatch.setattr(drawing, "NORMALS_MARGIN_M", 1.5)
     monkeypatch.setattr(module, "NORMALS_MARGIN_M", 1.5)
 
@@ -67,7 +67,7 @@ def views() -> PlacedViews:
 
 
 def test_every_voxel_lies_in_one_tile(rng):
-    tiling = Tiling.of(VOXEL_M)
+    tiling = Tiling(VOXEL_M)
     assert tiling.cells == 40
     points = rng.uniform(-30.0, 30.0, (5000, 3))
     points[:200, :2] = 4.0 * rng.integers(-5, 6, (200, 2))  # on the edges
@@ -98,19 +98,17 @@ def in_tiles(built: GlobalMap, views: PlacedViews, config: GlobalMapConfig = CON
     return tiles
 
 
-@pytest.mark.parametrize("min_hits", [1, 2])
-def test_tiles_together_are_the_map_in_one_piece(views, min_hits):
-    config = CONFIG.model_copy(update={"min_hits": min_hits})
+def test_tiles_together_are_the_map_in_one_piece(views):
     whole, built = walked(GlobalMap(VOXEL_M)), walked(GlobalMap(VOXEL_M, MOST))
     assert whole.is_whole
     assert not built.is_whole
-    expected = drawn_map(whole, views, config)
+    expected = drawn_map(whole, views, CONFIG)
     assert expected.tiled is None
-    assert expected.moved > (10 if min_hits == 1 else 0)
-    drawn = drawn_map(built, views, config)
+    assert expected.moved > 10
+    drawn = drawn_map(built, views, CONFIG)
     assert drawn.moved == expected.moved
     assert drawn.tiled.total == len(expected.cloud)
-    tiles = in_tiles(built, views, config)
+    tiles = in_tiles(built, views)
     assert len(tiles) > 8
     for (x, y), cloud in tiles.items():
         low = np.array([x, y]) * drawn.tiled.tiling.edge_m

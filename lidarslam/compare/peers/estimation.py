@@ -20,7 +20,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
-from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
