@@ -46,6 +46,8 @@ _DISPLACED_CELLS = 3.0
 _MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells.
 _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
+# Distance of another optimum, cells.
+_APART_CELLS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,7 @@ class NearSearch:
             self.with_any_acceleration,
             self.without_odometry,
             self.at_any_speed,
+            self.from_odometry,
             self.along_weakest,
         ):
             if self.matcher.budget.is_spent:
@@ -175,6 +178,24 @@ class NearSearch:
             prediction = predict(moving, scan.stamp, Prior(), ProcessNoise(), self.matcher.config, scan.seen_from_s)
             attempts.append(self.matcher.attempt(prediction, prediction, patient=True))
         return [attempt for attempt in attempts if attempt.status is Status.OK]
+
+    def from_odometry(self, near: Attempt) -> Attempt:
+        """Where the prediction is uncertain along the weakest direction: from the odometry's motion.
+
+        Of several optima, as on stairs, the prediction's may be the next step's.
+        """
+        prior, prediction = self.prior, near.prediction
+        if prior.T_prev_curr is None or prediction.is_inertial or not near.fit.is_constrained:  # an IMU's is better
+            return near
+        if near.fit.weakest is None:
+            return near
+        direction, apart_m = np.array(near.fit.weakest), _APART_CELLS * self.matcher.local_map.cell_m
+        T_world_lidar = self.matcher.last.T_world_lidar @ prior.T_prev_curr
+        away_m = abs(float(direction @ (T_world_lidar - near.T_world_lidar)[:3, 3]))
+        if prediction.sigma_along(direction) < apart_m or away_m < apart_m:
+            return near
+        start = replace(prediction, T_world_lidar=T_world_lidar)
+        return _clearly_best(near, [self.matcher.attempt(prediction, start, coarse_first=False)])
 
     def along_weakest(self, near: Attempt) -> Attempt:
         """Where the scan fits poorly: a few cells away along its weakest direction.
