@@ -141,7 +141,7 @@ def _featureless(kind: str, seed: int) -> Case:
     """From structure through nothing to structure."""
     begin_m, end_m, length_m = 20.0, 95.0, 120.0
     world = (even_tunnel if kind == "tunnel" else open_plain)(begin_m, end_m, length_m, seed)
-    motion = motion_along(straight_drive(length_m, 5.0, 1.5), world, on_ground=False)
+    motion = motion_along(straight_drive(length_m, 5.0, 1.5))
     sensor = find_sensor("vlp-16")
     reach_m = 25.0  # dust, or dark walls: no end in view
     sensor = replace(sensor, ranging=replace(sensor.ranging, max_range_m=reach_m))

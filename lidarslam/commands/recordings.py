@@ -55,17 +55,12 @@ def info(source: Path, as_json: bool, **options: Any) -> None:
 @opt.command(
     """lidarslam simulate
     lidarslam simulate -o recordings/street --world street --sensor hdl-64e --motion car --format kitti
-    lidarslam simulate -o recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
-    lidarslam simulate -o recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000"""
+    lidarslam simulate -o recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25"""
 )
 @opt.out_option("Folder of the recording.", "recordings/WORLD_TIME")
 @click.option("--world", type=_WORLD, default="office", show_default=True, help="Scene.")
 @click.option("--sensor", type=_SENSOR, default="vlp-16", show_default=True, help="LiDAR model.")
-@click.option(
-    "--motion",
-    type=_CARRIER,
-    help="Carrier of the LiDAR.  [default: handheld; car with --trajectory]",
-)
+@click.option("--motion", type=_CARRIER, default="handheld", show_default=True, help="Carrier of the LiDAR.")
 @click.option(
     "--speed",
     "speed_mps",
@@ -73,29 +68,20 @@ def info(source: Path, as_json: bool, **options: Any) -> None:
     metavar="M/S",
     help="Speed on straight stretches.  [default: that of the carrier, within the limit of the route]",
 )
-@click.option(
-    "--trajectory",
-    type=opt.FILE,
-    metavar="FILE",
-    help="TUM or KITTI file to follow, KITTI's smoothed over 0.25 s. The street is built around it; in other worlds it"
-    " must keep clear of obstacles.",
-)
 @click.option("--mount", type=_MOUNT, default="upright", show_default=True, help="Mounting of the LiDAR.")
-@click.option("--scans", type=click.IntRange(min=1), help="Number of scans.  [default: 300, or all of the trajectory]")
+@click.option("--scans", type=click.IntRange(min=1), default=300, show_default=True, help="Number of scans.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
 @click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
 @click.option("--imu/--no-imu", default=False, show_default=True, help="Record an IMU of 200 Hz on the LiDAR too.")
 @opt.jobs_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
-def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
+def simulate(out: Path | None, **options: Any) -> None:
     """Simulate a recording, with exact trajectory and map."""
     from lidarslam.run.progress import show_count
     from lidarslam.simulation.record import RecordRequest, format_summary, record
 
-    motion = motion or ("handheld" if trajectory is None else "car")
     out = out or opt.default_out("recordings", options["world"])
-    where = opt.take_where(options)
-    request = RecordRequest(out, where=where, motion=motion, trajectory=trajectory, **options)
+    request = RecordRequest(out, where=opt.take_where(options), **options)
     with show_count(out.name) as progress:
         summary = record(request, progress)
     say(format_summary(request, summary))

@@ -115,7 +115,7 @@ def make_recordings(
                 record(one, counter)
         return
     with counting(f"{len(wanted)} recordings side by side") as counter, open_tasks(request.where) as tasks:
-        scans = [one.scans or 0 for one in wanted]
+        scans = [one.scans for one in wanted]
         for number, _ in enumerate(tasks.run(_record, wanted), start=1):
             counter(sum(scans[:number]), sum(scans))
 

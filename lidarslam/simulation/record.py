@@ -10,22 +10,19 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write
-from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import as_typed, command_line, count, joined, small_length
-from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.simulation.mesh import world_mesh
-from lidarslam.simulation.motion import Carrier, Motion, find_carrier, motion_along, mount_pose
+from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_s
 from lidarslam.simulation.reference_map import KeyArray, SeenSurfaces, sample_seen
 from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import Sensor, find_sensor
-from lidarslam.simulation.world import World, build_world
-from lidarslam.simulation.worlds.along import build_along
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import build_world
 from lidarslam.simulation.writers import FORMATS, as_records, find_format, write_ply
 
 
@@ -38,10 +35,9 @@ class RecordRequest:
     sensor: str
     motion: str
     mount: str
-    scans: int | None  # None: 300, or as many as the trajectory lasts
+    scans: int
     seed: int  # of the world, the motion and the noise
     format: str
-    trajectory: Path | None = None  # TUM or KITTI file that `motion` moves along instead of the world's route
     speed_mps: float | None = None  # unless a bend slows it down, instead of the carrier's own and the route's limit
     imu: bool = False  # whether an IMU is recorded too
     overwrite: bool = False  # whether an earlier recording in `out` is replaced
@@ -49,9 +45,7 @@ class RecordRequest:
 
     @property
     def moved(self) -> str:
-        """The carrier, and its path or speed where it is not the default."""
-        if self.trajectory is not None:
-            return f"{self.motion} along {self.trajectory.name}"
+        """The carrier, and its speed where it is not the default."""
         return self.motion + (f" at {self.speed_mps:g} m/s" if self.speed_mps is not None else "")
 
 
@@ -173,7 +167,6 @@ def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
     """The README as Markdown; its command makes the same recording again."""
     made = find_format(request.format)
     words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
-    words += ["--trajectory", str(request.trajectory)] if request.trajectory is not None else []
     words += ["--motion", request.motion]
     words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
     words += ["--mount", request.mount, "--scans", str(summary.scans), "--seed", str(request.seed)]
@@ -206,155 +199,16 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
     return joined(lines)
 
 
-_TIME_STEP_S = 0.02
-_LOWEST_M = 0.3  # kerbs and bumps under a carrier are no obstacles
-
-
-def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None:
-    """Refuse a trajectory on which the carrier's body meets a static surface, from the first scan to the last.
-
-    The body is a ball of the carrier's half width round the sensor; on the ground, one above the wheels as well.
-
-    Raises:
-        InputError: the path leads through something solid or off the world's ground; the message has the trajectory's
-            name, place and time.
-    """
-    world = simulation.world
-    times = np.arange(0.0, simulation.scan_count / simulation.sensor.rate_hz + _TIME_STEP_S, _TIME_STEP_S)
-    positions = simulation.motion.pose_at(times)[:, :3, 3]
-    is_blocked = np.zeros(len(times), dtype=bool)
-    on_ground = (carrier.half_width_m + _LOWEST_M, carrier.sensor_height_m)
-    for height in on_ground if carrier.leans_with_ground else (0.0,):
-        body = positions + np.array([0.0, 0.0, height])
-        is_blocked |= simulation.distance_to_surfaces(body) < carrier.half_width_m
-        # A surface cannot be crossed without coming near it, so that only the start can be deep inside something.
-        is_blocked[0] |= _is_inside(world, body[0])
-    is_off = _is_off_ground(world, positions)
-    for refused, whither in ((is_blocked, "through something solid"), (is_off, "off the ground")):
-        if refused.any():
-            x, y, z = positions[refused.argmax()]
-            raise InputError(
-                f"{name}: leads {whither} in {world.name}, seed {world.seed}, at x {x:.1f}, y {y:.1f}, z {z:.1f} m,"
-                f" {times[refused.argmax()]:.1f} s after its start; only --world street is built around a trajectory"
-            )
-
-
-def _is_inside(world: World, point: FloatArray) -> bool:
-    """Whether a point (3,) is inside a box or a cylinder, under the ground, or above the ceiling of a tunnel."""
-    boxes, cylinders = world.boxes, world.cylinders
-    local = np.einsum("nji,nj->ni", boxes.R_world_box, point - boxes.centres)
-    in_box = (np.abs(local) < boxes.half_sizes).all(axis=1).any()
-    axis = cylinders.ends - cylinders.starts
-    along = np.einsum("ni,ni->n", point - cylinders.starts, axis) / np.einsum("ni,ni->n", axis, axis)
-    aside = np.linalg.norm(point - cylinders.starts - along[:, None] * axis, axis=1)
-    in_cylinder = ((along > 0.0) & (along < 1.0) & (aside < cylinders.radii)).any()
-    levels = [float(field.height_at(point[None, :2])[0]) for field in world.height_fields]
-    is_in_rock = bool(levels) and (point[2] < levels[0] or any(point[2] > level for level in levels[1:]))
-    return bool(in_box or in_cylinder or is_in_rock)
-
-
-def _is_off_ground(world: World, positions: FloatArray) -> NDArray[np.bool_]:
-    if not world.height_fields:
-        return np.zeros(len(positions), dtype=bool)
-    ground = world.height_fields[0]
-    far = ground.origin_xy + ground.cell_m * (np.array(ground.heights.shape) - 1.0)
-    return np.asarray(((positions[:, :2] < ground.origin_xy) | (positions[:, :2] > far)).any(axis=1))
-
-
-_SCANS = 300
-_KITTI_RATE_HZ = 10.0
-# KITTI's poses jump by centimetres, as the GPS behind them did: at 10 Hz more than a car's acceleration.
-_KITTI_SMOOTHING_S = 0.25
-_KITTI_COLUMNS = 12
-_PATH_STEP_S = 0.05
-# KITTI's pose files are in the frame of a camera: x to the right, y down, z forward.
-_T_CAM_BODY = make_transform([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], np.zeros(3))
-
-
-def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[Motion, int]:
-    """The motion and the number of scans: as many as asked for, else 300 or as long as the trajectory lasts.
-
-    Carriers that lean with the ground follow a trajectory on the ground, the others take its poses as they are.
-
-    Raises:
-        InputError: there is no such carrier, it cannot follow the route, or the trajectory cannot be followed, is too
-            short, or comes with a speed.
-    """
-    if request.trajectory is None:
-        motion = motion_along_route(request.motion, world, request.seed, request.speed_mps)
-        return motion, request.scans or _SCANS
-    if request.speed_mps is not None:
-        raise InputError(f"{request.trajectory}: a trajectory has its own speed; leave out --speed")
-    trajectory = read_trajectory(request.trajectory)
-    motion = _along(request.trajectory, trajectory, world, find_carrier(request.motion))
-    most = int(trajectory.duration_s * sensor.rate_hz + 1e-6)  # the last sweep has to end before the trajectory does
-    if not 1 <= (request.scans or most) <= most:
-        raise InputError(
-            f"{request.trajectory}: lasts {trajectory.duration_s:.1f} s, enough for {most} scans of a {sensor.name},"
-            f" got --scans {request.scans or 1}"
-        )
-    return motion, request.scans or most
-
-
-def _along(path: Path, trajectory: Trajectory, world: World | None, carrier: Carrier) -> Motion:
-    on_ground = carrier.leans_with_ground and world is not None
-    return motion_along(trajectory, world, on_ground, carrier.name, _KITTI_SMOOTHING_S if _is_kitti(path) else 0.0)
-
-
-def given_path(path: Path, motion: str) -> FloatArray:
-    """Path of a carrier along a trajectory: (N, 2), or for carriers that do not follow the ground (N, 3).
-
-    The third column is the height of the ground that fits the trajectory: as far below it as the carrier holds or
-    flies the sensor. Raises InputError as `plan_motion` does.
-    """
-    trajectory, carrier = read_trajectory(path), find_carrier(motion)
-    given = _along(path, trajectory, None, carrier)
-    steps = max(1, int(np.ceil(given.duration_s / _PATH_STEP_S)))
-    positions = given.pose_at(np.linspace(0.0, given.duration_s, steps + 1))[:, :3, 3]
-    if carrier.leans_with_ground:
-        return np.asarray(positions[:, :2])
-    return positions - [0.0, 0.0, carrier.sensor_height_m + carrier.flight_height_m]
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """A TUM file, or a KITTI pose file with the poses of a camera at 10 Hz; x forwards, z up.
-
-    Raises:
-        InputError: it is neither.
-    """
-    if not _is_kitti(path):
-        return read_tum(path)
-    T_cam0_cam = read_kitti_poses(path)
-    stamps = np.arange(len(T_cam0_cam)) / _KITTI_RATE_HZ
-    return Trajectory(stamps, inverse(_T_CAM_BODY) @ T_cam0_cam @ _T_CAM_BODY)
-
-
-def _is_kitti(path: Path) -> bool:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from error
-    words = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
-    return next((len(found) for found in words if found), 0) == _KITTI_COLUMNS
-
-
 # Scans of a task.
 _CHUNK = 10
 
 
 def make_simulation(request: RecordRequest) -> Simulation:
-    """The simulation that was asked for; a street is built along the trajectory, if there is one."""
-    sensor = find_sensor(request.sensor)
-    if request.world == "street" and request.trajectory is not None:
-        world = build_along(given_path(request.trajectory, request.motion), request.seed)
-    else:
-        world = build_world(request.world, request.seed)
-    motion, scans = plan_motion(request, world, sensor)
+    """The simulation that was asked for."""
+    sensor, world = find_sensor(request.sensor), build_world(request.world, request.seed)
+    motion = motion_along_route(request.motion, world, request.seed, request.speed_mps)
     T_body_lidar = mount_pose(request.mount, motion.sensor_height_m)
-    simulation = Simulation(world, sensor, motion, T_body_lidar, scans, request.seed)
-    if request.trajectory is not None:
-        check_clearance(simulation, find_carrier(request.motion), str(request.trajectory))
-    return simulation
+    return Simulation(world, sensor, motion, T_body_lidar, request.scans, request.seed)
 
 
 def make_scans(request: RecordRequest, simulation: Simulation, seen: SeenSurfaces) -> Iterator[SimulatedScan]:
@@ -394,8 +248,8 @@ def record(request: RecordRequest, progress: Callable[[int, int], None]) -> Reco
     After every scan `progress` is called with its number from 1 and how many there will be.
 
     Raises:
-        InputError: no world, sensor, motion, mount or format has that name, the format holds no IMU, or the
-            trajectory cannot be followed or leads through something solid.
+        InputError: no world, sensor, motion, mount or format has that name, the motion cannot follow the world's
+            route, or the format holds no IMU.
         OutputError: the folder holds something already, or cannot be written.
     """
     chosen = find_format(request.format)

@@ -208,7 +208,7 @@ def test_sudden_turns_on_the_spot_are_followed(turn):
     turn = np.zeros((len(times), 6))
     turn[1:, 2] = np.deg2rad(np.cumsum(0.01 * (rates[1:] + rates[:-1])))
     T_world_first = make_transform(np.eye(3), [0.0, 0.0, route.sensor_height_m]) @ route.pose_at(np.zeros(1))[0]
-    motion = motion_along(Trajectory(times, T_world_first @ exp(turn)), world, on_ground=False)
+    motion = motion_along(Trajectory(times, T_world_first @ exp(turn)))
     simulation = Simulation(world, light("os1-64"), motion, mount_pose("upright", 0.0), 58)
     recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, np.zeros(58, dtype=np.bool_), 0)
     results = process(Mapper(MappingConfig()), recorded, 0)
@@ -262,7 +262,7 @@ def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office):
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
 def test_an_even_tunnel_is_told_to_say_nothing_along_it():
     world = even_tunnel(12.0, 60.0, 65.0)
-    motion = motion_along(straight_drive(65.0, 4.0, 1.5), world, on_ground=False)
+    motion = motion_along(straight_drive(65.0, 4.0, 1.5))
     sensor = light()
     sensor = replace(sensor, ranging=replace(sensor.ranging, max_range_m=20.0))
     simulation = Simulation(world, sensor, motion, mount_pose("upright", 0.0), 140)

@@ -68,7 +68,7 @@ def test_a_start_and_an_end_at_speed_are_no_blows(carrier, yard):
         stamps = np.linspace(0.0, 10.0, 101)
         poses = np.tile(np.eye(4), (101, 1, 1))
         poses[:, 0, 3] = 5.0 * stamps
-        motion = motion_along(Trajectory(stamps, poses), None, on_ground=False)
+        motion = motion_along(Trajectory(stamps, poses))
     else:
         motion = motion_along_route(carrier, yard, seed=3)
     simulated = Simulation(yard, find_sensor("vlp-16"), motion, np.eye(4), 100, imu_model=EXACT_IMU)

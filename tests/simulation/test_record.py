@@ -7,12 +7,12 @@ from scipy.spatial import cKDTree
 
 from lidarslam.cli import main
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.geometry import make_transform, transform_points
-from lidarslam.core.trajectory import Trajectory, format_kitti, read_tum, write_tum
+from lidarslam.core.geometry import transform_points
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.datasets.point_table import coordinates
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.record import RecordRequest, read_trajectory, record
+from lidarslam.simulation.record import RecordRequest, record
 from lidarslam.simulation.world import Boxes, HeightField, Route, World
 from lidarslam.simulation.writers import FORMATS
 
@@ -172,68 +172,12 @@ def test_unknown_names(kind, told, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.fixture
-def given():
-    """A second: straight on, then a gentle turn, x forwards."""
-    stamps = 100.0 + 0.1 * np.arange(11)
-    yaw = np.concatenate([np.zeros(5), np.linspace(0.0, 0.2, 6)])
-    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(11)
-    R = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=-1).reshape(-1, 3, 3)
-    step = 0.15 * np.stack([c, s, zero], axis=-1)
-    return Trajectory(stamps, make_transform(R, np.cumsum(step, axis=0) - [5.0, 3.0, -0.8]))
-
-
-@pytest.fixture
-def given_file(tmp_path, given):
-    write_tum(tmp_path / "given.tum", given)
-    return tmp_path / "given.tum"
-
-
-def along(out, trajectory, **changes):
-    return record(request(out, trajectory=trajectory, mount="upright", **changes), silently)
-
-
-def test_along_a_tum_trajectory(tmp_path, given, given_file):
-    # What is carried by hand takes the poses as they are.
-    assert along(tmp_path / "a", given_file, motion="handheld", format="kitti", scans=None).scans == 10
-    truth = open_recording(tmp_path / "a").ground_truth
-    np.testing.assert_allclose(truth.stamps, given.stamps[:-1] - 100.0, atol=1e-6)
-    np.testing.assert_allclose(truth.T_world_lidar, given.T_world_lidar[:-1], atol=1e-6)
-    text = (tmp_path / "a" / "README.md").read_text()
-    assert f"--trajectory {given_file} --motion handheld" in text
-    assert "handheld along given.tum" in text
-
-
 def test_a_speed_is_kept_and_written_down(tmp_path):
     summary = record(request(tmp_path / "a", motion="car", speed_mps=0.4, scans=40, sensor="livox"), silently)
     assert 0.2 < summary.length_m / summary.duration_s < 0.4
     text = (tmp_path / "a" / "README.md").read_text()
     assert "--motion car --speed 0.4 --mount" in text
     assert "car at 0.4 m/s" in text
-
-
-def test_a_car_follows_a_trajectory_on_the_ground(tmp_path, given, given_file):
-    along(tmp_path / "a", given_file, motion="car", scans=5, format="ply")
-    positions = open_recording(tmp_path / "a").ground_truth.positions
-    np.testing.assert_allclose(positions[:, :2], given.positions[:5, :2], atol=1e-6)
-    np.testing.assert_allclose(positions[:, 2], 1.73, atol=1e-3)
-
-
-def test_kitti_pose_files_are_those_of_a_camera(tmp_path, given):
-    # A car that drives along x and turns left: in camera axes it goes along z and turns about -y.
-    yaw = 0.3
-    T_cam0_cam = np.tile(np.eye(4), (2, 1, 1))
-    T_cam0_cam[1, :3, :3] = [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
-    T_cam0_cam[1, :3, 3] = [-0.2, -0.1, 2.0]
-    path = tmp_path / "00.txt"
-    path.write_text(format_kitti(T_cam0_cam))
-    trajectory = read_trajectory(path)
-    np.testing.assert_allclose(trajectory.stamps, [0.0, 0.1])
-    np.testing.assert_allclose(trajectory.positions[1], [2.0, 0.2, 0.1], atol=1e-9)
-    np.testing.assert_allclose(trajectory.T_world_lidar[1, :2, 0], [np.cos(yaw), np.sin(yaw)], atol=1e-8)
-    (tmp_path / "odd.txt").write_text("1 2 3\n")
-    with pytest.raises(InputError, match="expected 8 numbers, got 3"):
-        read_trajectory(tmp_path / "odd.txt")
 
 
 def test_command(tmp_path):

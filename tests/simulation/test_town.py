@@ -11,7 +11,6 @@ from lidarslam.simulation.mesh import Caster
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds import town
-from lidarslam.simulation.worlds.along import FREE_SIDE_M
 from lidarslam.simulation.worlds.paths import subdivide_loop
 
 SEEDS = range(2)
@@ -56,10 +55,23 @@ def small() -> World:
 @pytest.mark.slow
 def test_nothing_stands_in_the_way_of_the_car(small):
     lane = subdivide_loop(small.route.waypoints, 1.0)
-    clear = Caster(small).distances(lane + np.array([0.0, 0.0, FREE_SIDE_M]))
-    assert clear.min() > FREE_SIDE_M - 0.6  # over the ground's own unevenness
+    clear = Caster(small).distances(lane + np.array([0.0, 0.0, town.FREE_SIDE_M]))
+    assert clear.min() > town.FREE_SIDE_M - 0.6  # over the ground's own unevenness
     assert len(small.boxes) > 1000
-    assert len(small.cylinders) > 20
+    assert (small.cylinders.radii == 0.33).sum() > 20  # wheels
+    assert small.movers
+
+
+@pytest.mark.slow
+def test_both_sides_are_built_up(small):
+    lane = subdivide_loop(small.route.waypoints, 1.0)[:, :2]
+    ahead = np.roll(lane, -1, axis=0) - lane
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    eyes = np.column_stack([lane, small.ground_at(lane) + 2.5])
+    caster = Caster(small)
+    for side in (left, -left):
+        rays = np.column_stack([side, np.zeros(len(side))])
+        assert (caster.cast(eyes, rays, np.zeros(len(eyes)), 100.0).ranges < 17.0).mean() > 0.6
 
 
 @pytest.mark.slow
