@@ -1,8 +1,5 @@
 """Evaluation of a run directory or a trajectory file: metrics.json, and files of the errors."""
 
-import io
-import json
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +17,7 @@ from lidarslam.assessment.inputs import (
     read_reference,
 )
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.files import make_directory, written
+from lidarslam.core.files import written
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory, read_transform
 from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult
@@ -38,11 +35,9 @@ from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, al
 from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, common_instants
 from lidarslam.evaluation.trajectory.metrics import (
     TrajectoryMetrics,
-    absolute_errors,
     disagreement,
     evaluate_trajectory,
     metrics_json,
-    relative_errors,
 )
 from lidarslam.simulation.writers import write_ply
 from lidarslam.storage import directory as files
@@ -130,7 +125,6 @@ class EvaluateRequest:
     errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
     out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
     needs_reference: bool = True  # whether it is an error that there is no reference
-    evo: Path | None = None  # folder for the errors as files of evo; None: nowhere
     write: bool = True  # whether the figures are written
     report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
 
@@ -180,11 +174,6 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         entropy = map_entropy(estimate.map_points())
     out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
     saved = [*([] if out is None else [out]), *request.errors]
-    if request.evo is not None:
-        if metrics is None:
-            raise InputError("--evo saves the errors of a trajectory, and there is no reference for it")
-        name = "estimate" if isinstance(request.run, Trajectory) else request.run.resolve().stem
-        saved += write_evo_files(request.evo, name, metrics)
     label = None if reference is None else reference.label
     evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, saved)
     if out is not None:
@@ -324,53 +313,3 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, c
         vertices[name] = column
     with written(path) as partial:
         write_ply(partial, vertices)
-
-
-def write_evo_files(folder: Path, name: str, metrics: TrajectoryMetrics) -> list[Path]:
-    """Write NAME_ape.zip, the positions' errors after alignment, and NAME_rpe.zip, those from scan to scan.
-
-    Both hold `info.json`, `stats.json` and the arrays of a result of evo's. The files; none without an error.
-    """
-    association = metrics.association
-    estimate, reference, rows = association.estimate, association.reference, np.arange(len(association))
-    aligned = {"se3": "with SE(3) Umeyama alignment", "first_pose": "with origin alignment", "none": "not aligned"}
-    ape = f"APE w.r.t. translation part (m)\n({aligned[metrics.alignment]})"
-    rpe = "RPE w.r.t. translation part (m)\nfor delta = 1 (frames) using consecutive pairs\n(not aligned)"
-    results = {
-        "ape": (ape, absolute_errors(association, metrics.T_reference_estimate)[0], rows),
-        "rpe": (rpe, relative_errors(association)[0], rows[1:][np.diff(association.rows) == 1]),
-    }
-    make_directory(folder)
-    paths = []
-    for kind, (title, errors, chosen) in results.items():
-        info = {"title": title, "ref_name": "reference", "est_name": name, "label": f"{kind.upper()} (m)"}
-        arrays = {
-            "error_array": errors,
-            "seconds_from_start": estimate.stamps[chosen] - estimate.stamps[0],
-            "timestamps": estimate.stamps[chosen],
-            "distances_from_start": reference.distances[chosen],
-            "distances": estimate.distances[chosen],
-        }
-        if not len(errors):
-            continue
-        paths.append(folder / f"{name}_{kind}.zip")
-        with written(paths[-1]) as partial, zipfile.ZipFile(partial, "w") as archive:
-            archive.writestr("info.json", json.dumps(info))
-            archive.writestr("stats.json", json.dumps(_statistics(errors)))
-            for array, values in arrays.items():
-                content = io.BytesIO()
-                np.save(content, values, allow_pickle=False)
-                archive.writestr(f"{array}.npy", content.getvalue())
-    return paths
-
-
-def _statistics(errors: FloatArray) -> dict[str, float]:
-    return {
-        "rmse": float(np.sqrt(np.mean(errors**2))),
-        "mean": float(np.mean(errors)),
-        "median": float(np.median(errors)),
-        "std": float(np.std(errors)),
-        "min": float(np.min(errors)),
-        "max": float(np.max(errors)),
-        "sse": float(np.sum(errors**2)),
-    }

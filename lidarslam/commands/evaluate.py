@@ -67,7 +67,6 @@ _SECONDS = click.FloatRange(min=0.0)
     show_default=True,
     help="Error of the brightest colour, m.",
 )
-@click.option("--evo", type=PATH, metavar="DIR", help="Save ATE and RPE for evo_res: RUN_ape.zip, RUN_rpe.zip.")
 @click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.  [default: report]")
 @gate_options(with_method=False)
 @click.option("-o", "--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
