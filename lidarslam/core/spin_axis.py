@@ -6,7 +6,7 @@ on its side, lie across the rows and over the poles.
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.geometry import FloatArray, levelling
 
 # Points spread over less than this about z lie in rows, and about another axis the spread must be less by as much.
 _WIDE, _NARROWER = np.deg2rad(60.0), np.deg2rad(30.0)
@@ -38,7 +38,7 @@ def image_axes(points: FloatArray) -> FloatArray:
     own = _spreads(fine, np.eye(3))
     if own.min() < spread + _SAME:
         axis, spread = np.eye(3)[int(np.argmin(own))], float(own.min())
-    return np.eye(3) if spread > about_z - _NARROWER else _to_z(_upwards(axis, fine))
+    return np.eye(3) if spread > about_z - _NARROWER else levelling(_upwards(axis, fine))
 
 
 def _upwards(axis: FloatArray, directions: FloatArray) -> FloatArray:
@@ -77,13 +77,3 @@ def _hemisphere(count: int) -> FloatArray:
     z, azimuth = numbers / count, np.pi * (1.0 + np.sqrt(5.0)) * numbers
     across = np.sqrt(1.0 - z**2)
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
-
-
-def _to_z(axis: FloatArray) -> FloatArray:
-    """The smallest rotation (3, 3) that takes a unit vector (3,) to z."""
-    normal = np.array([axis[1], -axis[0], 0.0])
-    sine = float(np.linalg.norm(normal))
-    if sine < 1e-9:
-        return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
-    turn = np.concatenate([normal / sine * np.arctan2(sine, axis[2]), np.zeros(3)])
-    return exp(turn)[:3, :3]
