@@ -4,7 +4,7 @@ Values become trees of arrays, numbers and texts, driven by type hints; never co
 enumerations, `T | None`, `NDArray[dtype]` (with `Annotated[..., Shape(None, 3)]` the shape too), `list[T]`,
 `tuple[T, ...]`, `tuple[A, B]`, `dict[K, V]`, dataclasses and `Stateful` classes, nested at will. Lists are stored by
 columns: a list of a thousand (4, 4) arrays is one array (1000, 4, 4), a list of dataclasses a list for each field.
-Values that are read back have the types and shapes of their hints.
+Arrays that are read back have the types and shapes of their hints; else the file is taken as this program wrote it.
 """
 
 import dataclasses
@@ -44,12 +44,11 @@ TRANSFORM = Shape(4, 4)
 
 
 class Saved:
-    """A tree read back from a file; the place in it, and the remedy where it cannot be used, are for errors."""
+    """A tree read back from a file."""
 
-    def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:
+    def __init__(self, values: Mapping[str, Any], place: str = "the state") -> None:
         self._values = values
-        self.place = place
-        self.remedy = remedy
+        self.place = place  # for errors
 
     def value(self, name: str) -> Any:
         """The tree under a name; InputError where there is none."""
@@ -63,26 +62,15 @@ class Saved:
 
     def part(self, name: str) -> "Saved":
         """The branch under a name."""
-        return self.at(name).branch(self.value(name))
+        return self.branch(self.value(name))
 
     def branch(self, tree: Any) -> "Saved":
-        """A branch at this place; InputError where it is a value."""
-        if not isinstance(tree, dict):
-            raise self.unfit("a tree", tree)
-        return Saved(tree, self.place, self.remedy)
-
-    def at(self, name: str) -> "Saved":
-        """The same tree, for errors about the value under a name."""
-        return Saved(self._values, f"{self.place}, {name}", self.remedy)
+        """A branch at this place."""
+        return Saved(tree, self.place)
 
     def refuse(self, reason: str) -> InputError:
-        """The error for a tree of another program."""
-        return InputError(f"{self.place}: is not what this program saves ({reason}); {self.remedy}")
-
-    def unfit(self, wanted: str, found: Any) -> InputError:
-        """The error for a value of another type or shape."""
-        what = f"{found.dtype} {found.shape}" if isinstance(found, np.ndarray) else type(found).__name__
-        return self.refuse(f"expected {wanted}, got {what}")
+        """The error for a tree of another version of the program."""
+        return InputError(f"{self.place}: is not what this program saves ({reason}); begin again with --overwrite")
 
 
 @typing.runtime_checkable
@@ -115,7 +103,7 @@ class Stateful:
             if tree is not None and isinstance(present, Restorable):
                 present.restore(saved.part(name))
             else:
-                setattr(self, name, decode(kind, tree, saved.at(name)))
+                setattr(self, name, decode(kind, tree, saved))
         self._after_restore()
 
     def _after_restore(self) -> None:
@@ -148,7 +136,7 @@ def _encode_plain(kind: Any, value: Any) -> Any:
 
 
 def decode(kind: Any, tree: Any, saved: Saved) -> Any:
-    """The value of that type that a tree of `encode` stands for; InputError where the tree is another one."""
+    """The value of that type that a tree of `encode` stands for; InputError where an array of it is another one."""
     kind, shape = _bare(kind)
     if (inner := _optional(kind)) is not None:
         return None if tree is None else decode(inner, tree, saved)
@@ -156,14 +144,13 @@ def decode(kind: Any, tree: Any, saved: Saved) -> Any:
     if origin is np.ndarray:
         return _decode_array(items[1], shape, tree, saved)
     if origin is dict:
-        part = saved.branch(tree)
-        keys, values = (_decode_list(item, part.value(name), saved) for item, name in zip(items, _DICT, strict=True))
+        keys, values = (
+            _decode_list(item, tree[name], saved) for item, name in zip(items, ("keys", "values"), strict=True)
+        )
         return dict(zip(keys, values, strict=True))
     if origin is list or Ellipsis in items:
         return origin(_decode_list(items[0], tree, saved))
     if origin is tuple:
-        if not isinstance(tree, list) or len(tree) != len(items):
-            raise saved.unfit(f"{len(items)} values", tree)
         return tuple(decode(item, one, saved) for item, one in zip(items, tree, strict=True))
     return _decode_plain(origin, tree, saved)
 
@@ -174,38 +161,29 @@ def _decode_plain(kind: Any, tree: Any, saved: Saved) -> Any:
         made = kind.__new__(kind)
         made.restore(saved.branch(tree))
         return made
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+    if dataclasses.is_dataclass(kind):
         part = saved.branch(tree)
-        return kind(**{name: decode(hint, part.value(name), part.at(name)) for name, hint in _hints(kind).items()})
-    if issubclass(kind, Enum):
-        if not isinstance(tree, str) or tree not in kind.__members__:
-            raise saved.unfit(f"one of {', '.join(kind.__members__)}", tree)
-        return kind[tree]
-    if type(tree) is not kind and not (kind is float and type(tree) is int):  # a bool is an int otherwise
-        raise saved.unfit(kind.__name__, tree)
-    return kind(tree)
+        return kind(**{name: decode(hint, part.value(name), saved) for name, hint in _hints(kind).items()})  # type: ignore[operator]
+    return kind[tree] if issubclass(kind, Enum) else kind(tree)
 
 
 def _concrete(kind: Any, tree: Any) -> Any:
     """The class itself, or of an abstract one the subclass whose attributes a tree has."""
     if not inspect.isabstract(kind):
         return kind
-    names = set(tree) if isinstance(tree, dict) else set()
-    return next((one for one in kind.__subclasses__() if set(_hints(one)) == names), kind.__subclasses__()[0])
+    return next(one for one in kind.__subclasses__() if set(_hints(one)) == set(tree))
 
 
 def _decode_array(dtype: Any, shape: Shape | None, tree: Any, saved: Saved, of_list: bool = False) -> Any:
     """An array, or of a list of arrays the one that they are rows of."""
     (wanted,) = typing.get_args(dtype)
-    is_array = isinstance(tree, np.ndarray) and tree.dtype.isnative
-    if not is_array or not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted):
-        raise saved.unfit(f"an array of {getattr(wanted, '__name__', wanted)}", tree)
-    if shape is not None and not shape.fits(tree.shape[1:] if of_list else tree.shape):
-        raise saved.unfit(f"an array of shape {shape.lengths}", tree)
+    lengths = tree.shape[1:] if of_list else tree.shape
+    if not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted) or not (shape is None or shape.fits(lengths)):
+        expected = getattr(wanted, "__name__", wanted)
+        raise saved.refuse(f"expected an array of {expected}, got {tree.dtype} {tree.shape}")
     return tree if tree.flags.writeable and tree.flags.c_contiguous else tree.copy()
 
 
-_DICT = ("keys", "values")
 # Plain values of a list become one array of this type.
 _COLUMNS: dict[Any, type] = {float: np.float64, int: np.int64, bool: np.bool_}
 
@@ -229,24 +207,16 @@ def _encode_list(kind: Any, values: list[Any]) -> Any:
 def _decode_list(kind: Any, tree: Any, saved: Saved) -> Any:
     bare, shape = _bare(kind)
     if (inner := _optional(bare)) is not None:
-        part = saved.branch(tree)
-        known = _decode_list(bool, part.value("known"), part.at("known"))
-        present = iter(_decode_list(inner, part.value("values"), part.at("values")))
-        return [next(present) if one else None for one in known]
+        present = iter(_decode_list(inner, tree["values"], saved))
+        return [next(present) if one else None for one in tree["known"]]
     if bare in _COLUMNS:
-        if not isinstance(tree, np.ndarray) or tree.ndim != 1 or tree.dtype != _COLUMNS[bare]:
-            raise saved.unfit(f"an array of {bare.__name__}", tree)
         return tree.tolist()
-    if isinstance(tree, np.ndarray) and typing.get_origin(bare) is np.ndarray and tree.ndim:
+    if isinstance(tree, np.ndarray):
         return list(_decode_array(typing.get_args(bare)[1], shape, tree, saved, of_list=True))
     if _is_columnar(bare):
         part = saved.branch(tree)
-        columns = [_decode_list(hint, part.value(name), part.at(name)) for name, hint in _hints(bare).items()]
-        if any(len(column) != part.value("count") for column in columns):
-            raise saved.refuse(f"columns of {bare.__name__} differ in length")
+        columns = [_decode_list(hint, part.value(name), saved) for name, hint in _hints(bare).items()]
         return [bare(*row) for row in zip(*columns, strict=True)]
-    if not isinstance(tree, list):
-        raise saved.unfit("a list", tree)
     return [decode(kind, one, saved) for one in tree]
 
 
@@ -303,7 +273,7 @@ class BlockFile(Stateful):
         is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
         for index, checksum in enumerate(self._checksums):
             if is_short or zlib.crc32(self.read(index)) != checksum:
-                raise InputError(f"{self._path}: is damaged (block {index}); {saved.remedy}")
+                raise InputError(f"{self._path}: is damaged (block {index}); begin again with --overwrite")
 
     def __len__(self) -> int:
         return len(self._checksums)
