@@ -72,26 +72,6 @@ def test_chain_inverts_relative_motions(random_trajectory):
     np.testing.assert_array_equal(chain(np.eye(4), np.zeros((0, 4, 4))), [np.eye(4)])
 
 
-def test_another_world_changes_no_motion(random_trajectory):
-    trajectory = random_trajectory()
-    T_new_world = exp([0.5, -1.0, 2.0, 10.0, 20.0, 30.0])
-    moved = trajectory.transformed(T_new_world)
-    np.testing.assert_allclose(moved.relative_motions(), trajectory.relative_motions(), atol=1e-9)
-    np.testing.assert_allclose(moved.T_world_lidar[3], T_new_world @ trajectory.T_world_lidar[3])
-    assert moved.length_m == pytest.approx(trajectory.length_m)
-
-
-def test_select_takes_masks_indices_and_slices(random_trajectory):
-    trajectory = random_trajectory(6)
-    mask = np.array([True, False, True, False, True, False])
-    for chosen in (mask, np.array([0, 2, 4]), slice(None, None, 2)):
-        part = trajectory.select(chosen)
-        np.testing.assert_array_equal(part.stamps, trajectory.stamps[::2])
-        np.testing.assert_array_equal(part.T_world_lidar, trajectory.T_world_lidar[::2])
-    with pytest.raises(ValueError, match="must increase"):
-        trajectory.select(np.array([2, 0]))
-
-
 def test_interpolation_is_exact_for_constant_body_velocity():
     trajectory = moving([0.0, 0.1, 0.35, 0.4, 1.0])
     stamps = np.array([0.72, 0.0, 0.05, 1.0, 0.1, 0.39])
@@ -190,13 +170,6 @@ def test_tum_dialects(text, written):
 def test_what_is_wrong_with_a_tum_file(text, words, written):
     with pytest.raises(InputError, match=words):
         read_tum(written(text))
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.tum: cannot be read"):
-        read_tum(tmp_path / "absent.tum")
-    with pytest.raises(InputError, match=r"absent\.txt: cannot be read"):
-        read_kitti_poses(tmp_path / "absent.txt")
 
 
 def test_rounded_kitti_rotations_are_mended(written, random_trajectory):
