@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.published.kitti_raw import oxts_poses
 from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
@@ -187,16 +186,6 @@ def test_truth_without_oxts_stamps_uses_those_of_the_scans(tmp_path, rng):
     np.testing.assert_allclose(truth.T_world_lidar, inverse(T_enu_lidar[0]) @ T_enu_lidar, atol=1e-6)
 
 
-def test_oxts_rows_that_run_backwards_are_left_out(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
-    times = _oxts_times(8)
-    times[4] = times[1]
-    (drive / "oxts" / "timestamps.txt").write_text(_stamp_lines(times))
-    recording = open_recording(drive)
-    np.testing.assert_allclose(recording.ground_truth.stamps, FIRST_STAMP + np.delete(times, 4), rtol=0.0, atol=3e-7)
-    assert any("1 oxts rows" in note for note in recording.describe().notes)
-
-
 def test_scan_stamps_that_repeat_are_interpolated(tmp_path, rng):
     drive = _write_drive(tmp_path, rng)
     stamps = MID_S * np.arange(8)
@@ -280,17 +269,6 @@ def test_damaged_and_foreign_files_are_named(tmp_path, rng):
     (extract / "velodyne_points" / "data" / "0000000000.txt").write_text("1 2 3 0.5\n")
     with pytest.raises(InputError, match=r"use the \.\.\._sync drive"):
         open_recording(extract)
-
-
-def test_mercator_metres_are_metres():
-    rows = np.zeros((2, 30))
-    rows[:, :2] = [[49.0, 8.4], [49.0 + 1e-4, 8.4 + 2e-4]]
-    rows[1, 5] = np.pi / 2
-    T = oxts_poses(rows)
-    step = T[1, :3, 3] - T[0, :3, 3]
-    expected = 6378137.0 * np.deg2rad([2e-4 * np.cos(np.deg2rad(49.0)), 1e-4])
-    np.testing.assert_allclose(step[:2], expected, rtol=1e-5)
-    np.testing.assert_allclose(T[1, :3, 0], [0.0, 1.0, 0.0], atol=1e-12)  # heading north
 
 
 def test_one_stray_stamp_costs_no_other():

@@ -82,13 +82,6 @@ def test_json_has_all_facts(tmp_path: Path) -> None:
     assert one["on_disk"] == []
 
 
-def test_unknown_names_are_one_line() -> None:
-    result = _datasets("newercollege")
-    assert result.exit_code == 1
-    hint = "did you mean newer_college_2021 or newer_college_2020?"
-    assert f"neither a known data set nor a folder; {hint}" in result.output
-
-
 def test_the_page_has_the_same_table() -> None:
     page = (Path(__file__).parents[3] / "docs" / "data_sets.md").read_text(encoding="utf-8")
     for one in CATALOGUE:
