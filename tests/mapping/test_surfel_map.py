@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
-from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS
 from lidarslam.mapping.registration.surfaces import Correspondences
@@ -85,15 +84,6 @@ def test_coarse_grids_reach_farther(rng, first_level):
     assert len(local_map.match(beyond, make_transform(np.eye(3), [0.0, 0.0, 9.0]), first_level)) == 0
 
 
-def test_finer_grids_are_left_out_on_request(rng):
-    """Of floors half a coarse cell apart, fine cells show each, coarse ones something between."""
-    low, high = floor_points(rng, 30_000, z=-1.0), floor_points(rng, 5_000, z=-1.0 + 3.2 * CELL)
-    local_map = map_of(np.concatenate([low, high]))
-    asked = floor_points(rng, 200, half_size=2.0)
-    assert distances(asked, local_map.match(asked, HERE, 0)).max() < 1e-5
-    assert distances(asked, local_map.match(asked, HERE, len(LEVELS) - 1)).min() > 0.01
-
-
 @pytest.mark.parametrize(("elevation_deg", "z"), [(-4.0, None), (0.5, None), (8.0, None), (-5.7, -1.0)])
 def test_a_ring_bent_around_a_corner_or_on_the_ground_is_no_plane(elevation_deg, z):
     points = ring(elevation_deg, walls=(4.0, 5.0) if z is None else None, z=z)
@@ -149,24 +139,6 @@ def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_
     assert np.linalg.norm(vertical) == pytest.approx(1.0)
     wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
     np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])  # without a floor the world's
-
-
-def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(monkeypatch, rng):
-    monkeypatch.setattr("lidarslam.mapping.surfels.surfel_map._TIDIED_AFTER", 3)
-    tidied: list[float] = []
-    monkeypatch.setattr("lidarslam.mapping.surfels.grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
-
-    def add(local_map: SurfelMap) -> int:
-        tidied.clear()
-        local_map.insert(rng.uniform(-1.0, 1.0, (50, 3)), np.zeros(50), np.zeros(3))
-        return len(tidied)
-
-    local_map = SurfelMap(0.1, 30.0)
-    assert [add(local_map) for _ in range(5)] == [0, 0, 3, 0, 0]
-    restored = SurfelMap(0.1, 30.0)
-    restored.restore(Saved(local_map.state()))
-    assert [add(restored) for _ in range(4)] == [3, 0, 0, 3]
-    assert [add(local_map.resized(0.2)), add(local_map)] == [3, 3]
 
 
 def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):

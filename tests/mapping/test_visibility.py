@@ -134,28 +134,6 @@ def test_between_lasers_that_are_far_apart_nothing_is_seen():
         assert seen_through(at(10.0, 5.0, 1.0 + above_deg), seen, VOXEL_M).tolist() == [expected]
 
 
-def test_only_what_is_farther_all_around_is_seen_through():
-    """The pixel of the point is (8, 45): its direction is 1 degree up, the centre of row 8."""
-    point = at(45.3)
-    for row, column, is_beside in ((8, 45, True), (7, 44, True), (9, 46, True), (6, 45, False), (8, 47, False)):
-        nearer, same = wall(10.0), wall(10.0)
-        nearer[row, column], same[row, column] = 3.0, 5.2
-        assert seen_through(point, placed([nearer] * 9), VOXEL_M).tolist() == [not is_beside]
-        assert seen_through(point, placed([same] * 9), VOXEL_M).tolist() == [not is_beside]
-
-
-def test_where_nothing_returns_nothing_is_seen():
-    """Glass, the sky; and beams that are too few."""
-    point = at(45.3)
-    alone, none_here, few = wall(0.0), wall(10.0), wall(10.0)
-    alone[8, 45], none_here[8, 45], few[7:9, 44:46] = 10.0, 0.0, 0.0
-    few[8, 45] = 10.0  # six of nine
-    for image, expected in ((wall(0.0), False), (alone, False), (none_here, False), (few, True)):
-        assert seen_through(point, placed([image] * 9), VOXEL_M).tolist() == [expected]
-    few[9, 46] = 0.0
-    assert not seen_through(point, placed([few] * 9), VOXEL_M).any()
-
-
 def test_far_away_and_outside_the_rows_nothing_is_seen():
     images = [wall(60.0)] * 9
     reach_m = 3.0 * 0.1 * 360.0 / (2.0 * np.pi)
@@ -200,26 +178,6 @@ def _says(point: FloatArray, image: NDArray[np.float32]) -> int:
     if (np.abs(seen) <= margin).any():
         return -1
     return int(image[row, column] > 0.0 and len(seen) >= 6 and bool((seen > 0.0).all()))
-
-
-def test_a_view_keeps_the_nearest_of_each_pixel():
-    points = np.concatenate([at(a + 0.5, 1.0, e) for a in range(360) for e in (-15.0, 15.0)])
-    views = Views(every=1)
-    views.add(np.concatenate([points, at(45.3, 7.0), at(45.7, 6.0), at(45.4, 8.0), [[0.0, 0.0, 0.0]]]), 0)
-    (image,) = views.placed(np.eye(4)[None]).images
-    assert image[8, 45] == 6.0
-    assert (image[[0, 15]] == 1.0).all()
-    assert np.count_nonzero(image) == 2 * COLUMNS + 1
-
-
-def test_of_many_points_a_part_is_enough_and_has_all_lasers_in_it():
-    """128 lasers, column by column, as many sensors send them."""
-    elevations, azimuths = np.meshgrid(np.linspace(-15.0, 15.0, 128), np.arange(1024) * (360.0 / 1024))
-    points = np.concatenate([at(a, 5.0, e) for a, e in zip(azimuths.ravel(), elevations.ravel(), strict=True)])
-    views = Views(every=1)
-    views.add(points, 0)
-    (image,) = views.placed(np.eye(4)[None]).images
-    np.testing.assert_allclose(image, 5.0, rtol=1e-3)
 
 
 def test_views_are_of_every_second_scan_and_where_these_are_in_the_end():
