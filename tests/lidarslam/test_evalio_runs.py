@@ -133,23 +133,7 @@ def test_info_as_json(sequence: Path) -> None:
     assert known["point_time"]["last_s"] == pytest.approx(0.1, abs=1e-3)
 
 
-@pytest.mark.long
-def test_compare_names_folders_without_slashes(sequence: Path, tmp_path: Path) -> None:
-    _invoke("compare", SOURCE, "--methods", "kiss-icp", "--out", "compared")
-    assert (tmp_path / "compared" / "hilti_2022_basement_2" / "kiss-icp" / "trajectory.tum").is_file()
-
-
 def test_python_opens_the_name(sequence: Path) -> None:
     recording = lidarslam.open(SOURCE, stop=2)
     assert len(list(recording)) == len(recording) == 2
     assert recording.ground_truth is not None
-
-
-def test_what_is_missing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("evalio")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("EVALIO_DATA", raising=False)
-    done = CliRunner().invoke(main, ["run", SOURCE, "--out", "run"])
-    assert done.exit_code == 1
-    (line,) = done.output.strip().splitlines()
-    assert line.endswith(f"is not downloaded: evalio -D {tmp_path / 'evalio_data'} dl hilti_2022/basement_2")

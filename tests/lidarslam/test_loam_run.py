@@ -1,7 +1,6 @@
 """LOAM's mapping from the command line: a run, a pose graph, a comparison."""
 
 import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from click.testing import CliRunner
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, read_tum
-from lidarslam.mapping.loam.features import find_features
 
 from ..conftest import write_recording
 
@@ -53,36 +51,3 @@ def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
     assert all(0 < int(row["points_used"]) < int(row["points"]) for row in rows[1:])
     assert (out / "map.ply").stat().st_size > 10_000
     assert (out / "pose_graph.g2o").exists() == bool(more)
-
-
-@pytest.mark.long
-def test_a_comparison_with_loam(source: Path, tmp_path: Path) -> None:
-    lidarslam("compare", source, "--out", tmp_path / "out", "--methods", "constant-velocity+loam")
-    (method,) = json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"].items()
-    assert method[0] == "constant-velocity+loam"
-    assert (method[1]["status"], method[1]["lost_scans"]) == ("ok", 0)
-    assert method[1]["metrics"]["trajectory"]["ate_rmse_m"] < 0.02
-
-
-def test_an_interrupted_run_comes_to_the_same_results(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arguments = ["--odometry", "constant-velocity", "--mapping", "loam", "--set", "checkpoints.every_scans=3"]
-    whole, out, left = tmp_path / "whole", tmp_path / "run", 5
-    lidarslam("run", source, "--out", whole, *arguments)
-
-    def interrupted(*given: Any) -> Any:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise KeyboardInterrupt
-        return find_features(*given)
-
-    monkeypatch.setattr("lidarslam.mapping.loam.features.find_features", interrupted)
-    command = ["run", str(source), "--out", str(out), *arguments]
-    assert CliRunner().invoke(main, command).exit_code == 1
-    assert (out / "unfinished" / "state.npz").exists()
-    monkeypatch.undo()
-    lidarslam("run", source, "--out", out, *arguments, "--resume")
-    for name in ("trajectory.tum", "odometry.tum", "map.ply"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name

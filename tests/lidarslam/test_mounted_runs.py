@@ -180,15 +180,3 @@ def test_localisation(recordings, upright, tmp_path):
         assert "found at scan" in call("localise", recordings[name], "--map", upright, "-o", out, *CONSTANT)
         found[name] = poses(out)
     np.testing.assert_allclose(found["rolled again"], found["upright again"], atol=1e-6)
-
-
-@pytest.mark.long
-def test_exports(upright, rolled, tmp_path):
-    written = []
-    for one in (rolled, upright):
-        folder = tmp_path / f"of_{one.name}"
-        folder.mkdir()
-        for command, file in (("export-bag", "run.mcap"), ("export-mesh", "mesh.ply"), ("export-grid", "grid.yaml")):
-            call(command, one, "-o", folder / file)
-        written.append({path.name: path.read_bytes() for path in folder.iterdir()})
-    assert written[0] == written[1]

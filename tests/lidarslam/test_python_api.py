@@ -184,12 +184,6 @@ def test_arrays_are_corrected_as_the_settings_of_the_reader_say(room_scans: list
         np.testing.assert_allclose(as_it_is.T_world_lidar, plain.register_frame(room_scans[4]).T_world_lidar, atol=1e-6)
 
 
-def test_only_a_pose_graph_changes_earlier_poses(room_scans: list[Scan]) -> None:
-    for settings, is_final in ((SETTINGS, True), (GRAPH, False)):
-        with Slam(settings) as slam:
-            assert slam.register_frame(room_scans[0]).is_final is is_final
-
-
 def test_clouds_of_open3d_go_in_and_out(slam: Slam, room_scans: list[Scan]) -> None:
     import open3d as o3d
 
