@@ -484,27 +484,3 @@ def test_a_run_begins_without_libraries_that_few_runs_need():
 )
 def test_a_planted_breach_is_told(rule, planted, told):
     assert rule(parse_planted(**planted)) == [told]
-
-
-def test_what_is_allowed_is_not_told():
-    allowed = parse_planted(
-        lidarslam='"""SLAM."""\nif TYPE_CHECKING:\n  from lidarslam.core.scan import Scan\n__all__ = ["Scan"]',
-        lidarslam__core='"""Docstring."""',
-        lidarslam__core__geometry="import numpy, scipy.linalg, typing_extensions, math",
-        lidarslam__core__scan="from . import geometry",
-        lidarslam__core__compiled="import numba",
-        lidarslam__cli="import click\nfrom lidarslam.commands.run import run",
-        lidarslam__commands__options="import click\nfrom lidarslam.commands import terminal",
-        lidarslam__commands__run="import lidarslam.commands.options\ndef f():\n  import lidarslam.run",
-        lidarslam__commands='"""Docstring."""',
-        lidarslam__commands__terminal="import click",
-        lidarslam__run="from lidarslam.mapping.pose_graph import optimizer\nimport lidarslam.viewer.rerun_viewer",
-        lidarslam__viewer__rerun_viewer="import rerun.blueprint",
-        lidarslam__mapping='"""Docstring."""',
-        lidarslam__mapping__pose_graph__optimizer="import gtsam\nfrom lidarslam.core.geometry import exp",
-        lidarslam__mapping__config="import pydantic\ndef f():\n  import open3d",
-        lidarslam__odometry__methods__kiss_worker="import kiss_icp.kiss_icp",
-        lidarslam__datasets__bag_file="import rosbags.rosbag1",
-        lidarslam__simulation__bag_writer="import rosbags.rosbag2",
-    )
-    assert {rule.__name__: rule(allowed) for rule in RULES} == {rule.__name__: [] for rule in RULES}
