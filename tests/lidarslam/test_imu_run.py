@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 from scipy.spatial.transform import Rotation
 
 import lidarslam
-from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
 from lidarslam.core.trajectory import Trajectory, read_tum
@@ -22,6 +21,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 
+from ..conftest import lidarslam as command
 from ..conftest import write_recording
 
 SCANS = 20
@@ -65,7 +65,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
 def _run(tmp_path: Path) -> Callable[..., tuple[Result, Path]]:
     def run(source: Path, *arguments: str, name: str = "run") -> tuple[Result, Path]:
         out = tmp_path / name
-        return CliRunner().invoke(main, ["run", str(source), "--out", str(out), *FAST, *arguments]), out
+        return command("run", source, "--out", out, *FAST, *arguments), out
 
     return run
 
@@ -178,7 +178,7 @@ def test_in_a_finished_map_the_imu_takes_part(longer: Path, tmp_path: Path, run:
     assert result.exit_code == 0, result.output
     found = tmp_path / "found"
     arguments = ["--map", str(out), "--out", str(found), "--odometry", "imu", "--guess", "0", "0", "0", *FAST]
-    result = CliRunner().invoke(main, ["localise", str(longer), *arguments])
+    result = command("localise", longer, *arguments)
     assert result.exit_code == 0, result.output
     assert rotation_error_deg(found, longer) < 0.15
 

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, read_tum
 
-from ..conftest import write_recording
+from ..conftest import succeeds, write_recording
 
 SCANS = 8
 
@@ -26,12 +24,6 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[
     return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, truth, is_timed=True)
 
 
-def lidarslam(*arguments: object) -> str:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
 def position_errors(run: Path, source: Path) -> FloatArray:
     """Distances (N,) of the run's positions from the truth, whose world is the first scan's frame."""
     truth, found = read_tum(source / "ground_truth.tum"), read_tum(run / "trajectory.tum")
@@ -42,7 +34,7 @@ def position_errors(run: Path, source: Path) -> FloatArray:
 @pytest.mark.parametrize("more", [[], ["--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2"]])
 def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
     out = tmp_path / "run"
-    lidarslam("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
+    succeeds("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
     assert position_errors(out, source).max() < 0.03
     assert "method: loam" in (out / "config.yaml").read_text()
     with (out / "scans.csv").open() as file:

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.storage.directory import MAPS
 from lidarslam.storage.finished_run import load_map, load_run
+
+from ..conftest import lidarslam
 
 SCANS = 10
 WITHOUT = (0, 3, 4)  # scans that lack the fields
@@ -66,7 +66,7 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[
 def run(source: Path, out: Path, *arguments: str) -> str:
     """Run a recording; what it printed."""
     given = [one.format(source) for one in arguments]
-    result = CliRunner().invoke(main, ["run", str(source), "--out", str(out), *SETTINGS, *given])
+    result = lidarslam("run", source, "--out", out, *SETTINGS, *given)
     assert result.exit_code == 0, result.output
     return result.output
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory, write_tum
+
+from ..conftest import lidarslam
 
 SCANS = 60
 PASSES_UNTIL = 15
@@ -68,7 +68,7 @@ def source(tmp_path_factory: pytest.TempPathFactory, scans: list[FloatArray]) ->
 def run(source: Path, out: Path, *arguments: str) -> str:
     given = ["run", str(source), "--out", str(out), "--no-mapping", "--set", "odometry.method=external"]
     given += ["--prior", str(source.parent / "truth.tum"), "--set", "global_map.voxel_size_m=0.1", *arguments]
-    ended = CliRunner().invoke(main, given)
+    ended = lidarslam(*given)
     assert ended.exit_code == 0, ended.output
     return ended.output
 
@@ -121,7 +121,7 @@ def test_moved_points_are_removed_again_with_other_settings(source: Path, tmp_pa
     kept = {}
     for views in (0, 3, 1000):
         out = tmp_path / f"{views}.ply"
-        ended = CliRunner().invoke(main, ["map", str(tmp_path / "run"), "--out", str(out), "--moved", str(views)])
+        ended = lidarslam("map", tmp_path / "run", "--out", out, "--moved", views)
         assert ended.exit_code == 0, ended.output
         kept[views] = len(of_person(np.asarray(o3d.io.read_point_cloud(out).points)))
     assert kept[0] == kept[1000] > 300

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
@@ -33,6 +32,8 @@ from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulate
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
 from lidarslam.train.settings import load_train_config
 from lidarslam.train.train import TrainRequest, execute
+
+from ..conftest import lidarslam
 
 SIZES = ("images.columns=96", "batch=2", "steps=8", "warmup_steps=2", "hold_out=0.3")
 TINY = [f"training.{size}" for size in SIZES]
@@ -273,7 +274,7 @@ def test_of_the_simulated_recordings_some_kinds_can_be_chosen():
 
 
 def train(*arguments: object) -> Result:
-    return CliRunner().invoke(main, ["train", *map(str, arguments)], catch_exceptions=False)
+    return lidarslam("train", *arguments)
 
 
 def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):

@@ -5,11 +5,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.datasets.published.catalogue import CATALOGUE
 from lidarslam.datasets.registry import READERS
+
+from ...conftest import lidarslam
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +21,7 @@ def nothing_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _datasets(*arguments: str) -> Result:
-    return CliRunner().invoke(main, ["datasets", *arguments])
+    return lidarslam("datasets", *arguments)
 
 
 def _line(result: Result, name: str) -> str:
