@@ -29,6 +29,14 @@ def test_equals_the_hash_with_arrays(rng: np.random.Generator, cell_m: float) ->
     np.testing.assert_array_equal(one_per_cell(points[::7], cell_m), by_arrays(points[::7], cell_m))
 
 
+def test_nearly_every_cell_keeps_one(rng: np.random.Generator) -> None:
+    points = rng.uniform(-10.0, 10.0, (20_000, 3))
+    cells = np.floor(points)
+    kept = one_per_cell(points, 1.0)
+    assert len(np.unique(cells[kept], axis=0)) == len(kept)
+    assert len(kept) > 0.98 * len(np.unique(cells, axis=0))
+
+
 def test_what_is_no_place_does_no_harm() -> None:
     points = np.array([[np.nan, 0.0, 0.0], [np.inf, 1e300, -np.inf], [1e30, 1e30, 1e30], [5.0, 5.0, 5.0]])
     with np.errstate(over="ignore"):

@@ -84,6 +84,15 @@ def test_angles_between_the_lasers_of_one_firing_are_removed_by_rings():
     np.testing.assert_allclose(found, (times - times.min()) * PERIOD_S / np.ptp(times), atol=2 * PERIOD_S / COLUMNS)
 
 
+def test_places_without_a_return_have_no_time():
+    points, _, rings = sweep(0.0)
+    points[::5], points[1::5] = 0.0, np.nan
+    found = offsets_from_order(RawCloud(points, rings=rings), PERIOD_S)
+    assert np.isnan(found[::5]).all()
+    assert np.isnan(found[1::5]).all()
+    assert np.isfinite(found[2::5]).all()
+
+
 @pytest.mark.parametrize("order", ["firing", "rings"])
 def test_a_recording_as_measured_gets_times(tmp_path, order):
     recording = open_recording(record(tmp_path / "raw", order=order))

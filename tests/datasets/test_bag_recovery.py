@@ -1,11 +1,15 @@
 """Bags without an index, cut short or damaged in the middle: what there is is read, and the rest is told."""
 
+import bz2
 import shutil
 import sqlite3
+from bz2 import BZ2Decompressor
 from contextlib import closing
 
+import lz4.frame
 import numpy as np
 import pytest
+from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
@@ -15,7 +19,7 @@ from rosbags.rosbag2.storage_mcap import zstd
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.ros.bag_file import BagFile, recover
+from lidarslam.datasets.ros.bag_file import BagFile, recover, unpacked
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -64,6 +68,13 @@ def test_a_bag_that_was_cut_short_is_read_up_to_there(write_drive, kind, part):
     assert "breaks off at byte" in warning
     assert "\n" not in warning
     assert warning in recording.describe().notes
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_bag_of_which_only_the_end_is_missing_is_read_whole(write_drive, kind):
+    file, _, points = write_drive(kind)
+    file.write_bytes(file.read_bytes()[:-9])
+    assert_first_scans(open_recording(file), points, 6)
 
 
 @pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])
@@ -315,6 +326,17 @@ def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
     assert_first_scans(recording, points, len(recording))
 
 
+@pytest.mark.parametrize("pack", [zstd.compress, lz4.frame.compress, bz2.compress], ids=["zstd", "lz4", "bz2"])
+def test_frames_are_unpacked_one_after_the_other(pack, rng):
+    make = {zstd.compress: zstd.ZstdDecompressor, lz4.frame.compress: LZ4FrameDecompressor}.get(pack, BZ2Decompressor)
+    parts = rng.bytes(100_000), bytes(50_000)
+    packed = b"".join(map(pack, parts))
+    assert unpacked(packed, make) == b"".join(parts)
+    assert unpacked(b"", make) == b""
+    with pytest.raises(ValueError, match="cut short"):
+        unpacked(packed[:-10], make)
+
+
 @pytest.mark.parametrize("kind", ["bag lz4", "bag bz2", "mcap", "db3"])
 @pytest.mark.parametrize("is_indexed", [True, False])
 def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, monkeypatch, kind, is_indexed):
@@ -358,3 +380,10 @@ def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_wh
         )
     with pytest.raises(InputError, match="cannot be opened"):
         open_recording(folder if is_whole else file)
+
+
+def test_an_mcap_of_another_name_is_told(write_drive, tmp_path):
+    file, _, _ = write_drive("mcap")
+    renamed = shutil.copy(file, tmp_path / "drive.bag")
+    with pytest.raises(InputError, match=r"is an MCAP file, by its first bytes; name it drive\.mcap"):
+        open_recording(renamed)

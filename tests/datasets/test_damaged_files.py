@@ -274,3 +274,10 @@ def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, e
         (tmp_path / name).write_bytes(lie)
         with pytest.raises(InputError, match=r"1,000,000,000,000 other elements .* truncated"):
             next(open_recording(tmp_path).scans())
+
+
+def test_an_empty_scan_is_none_of_them(tmp_path):
+    (tmp_path / "a.ply").write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n\n"
+    )
+    assert len(next(open_recording(tmp_path).scans())) == 0

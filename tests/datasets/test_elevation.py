@@ -26,3 +26,18 @@ def test_raises_elevation_and_keeps_range_and_azimuth(rng):
     np.testing.assert_allclose(np.linalg.norm(raised, axis=1), np.linalg.norm(points, axis=1), rtol=1e-12)
     azimuth = [np.arctan2(p[:, 1], p[:, 0]) for p in (points, raised)]
     np.testing.assert_allclose(azimuth[1], azimuth[0], atol=1e-12)
+
+
+def test_leaves_its_input_alone_and_computes_in_double_precision(rng):
+    points = _cloud(rng).astype(np.float32)
+    before = points.copy()
+    raised = correct_elevation(points, 0.205)
+    assert raised.dtype == np.float64
+    np.testing.assert_array_equal(points, before)
+    np.testing.assert_allclose(raised, correct_elevation(points.astype(np.float64), 0.205), atol=1e-12)
+
+
+def test_invalid_points_stay_recognisable():
+    raised = correct_elevation(np.array([[0.0, 0.0, 0.0], [np.nan, 1.0, 2.0], [np.inf, 1.0, np.inf]]), 0.205)
+    np.testing.assert_array_equal(raised[0], 0.0)
+    assert not np.isfinite(raised[1:]).all(axis=1).any()

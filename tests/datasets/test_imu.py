@@ -123,6 +123,11 @@ def test_accelerations_in_g(ros2_kit, make_sweep, rng):
     assert "are in g" in describe_source(path, ReaderConfig())
 
 
+def test_accelerations_without_gravity(rng):
+    imu = usable_samples(np.arange(50.0), np.zeros((50, 3)), rng.normal(0.0, 0.1, (50, 3)), None)
+    assert "gravity in no known unit" in imu.notes[0]
+
+
 @pytest.mark.parametrize(
     ("names", "expected"),
     [

@@ -23,6 +23,11 @@ def test_a_usual_scan_is_left_as_it_is(rng):
     assert faults.warnings() == ()
 
 
+@pytest.mark.parametrize("points", [np.empty((0, 3)), np.ones((1, 3)), np.full((50, 3), 900.0)])
+def test_a_few_points_say_nothing_about_their_unit(points):
+    assert seen(points)[1].warnings() == ()
+
+
 def test_a_scan_of_two_million_points_is_thinned_and_said(rng):
     points = rng.uniform(-40.0, 40.0, (2_000_000, 3))
     offsets = points[:, 0] / 1000.0

@@ -9,6 +9,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.mounting import MountedRecording
+from lidarslam.datasets.published.kitti_odometry import KittiOdometryRecording
 from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 
 # The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.
@@ -83,6 +85,11 @@ def test_gaps_in_the_numbers_keep_stamps_and_truth_in_step(tmp_path, rng, uncorr
     assert len(recording.ground_truth) == 7
     np.testing.assert_allclose(recording.ground_truth.at(np.array([scans[2].stamp]))[0], _truth(7)[4], atol=1e-8)
     assert any("only 3" in note for note in recording.describe().notes)
+
+
+def test_more_poses_than_stamps_are_cut_off(tmp_path, rng):
+    _write_sequence(tmp_path, rng, poses=11)
+    assert len(open_recording(tmp_path).ground_truth) == 6
 
 
 def test_the_correction_raises_every_point(tmp_path, rng):
@@ -175,6 +182,19 @@ def test_a_damaged_times_file_is_an_error(tmp_path, rng, content, message):
     (tmp_path / "sequences" / "04" / "times.txt").write_text(content)
     with pytest.raises(InputError, match=message):
         open_recording(tmp_path)
+
+
+def test_missing_stamps_continue_at_the_rate_and_are_told_once(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    (tmp_path / "sequences" / "04" / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    recording = open_recording(tmp_path)
+    assert isinstance(recording, MountedRecording)
+    assert isinstance(recording.recorded, KittiOdometryRecording)
+    assert recording.recorded.stamps[-1] == pytest.approx(0.5)
+    (warning,) = [line for line in recording.warnings if "times.txt" in line]
+    assert (
+        warning == "times.txt has only 4 lines for the scans up to number 5; the missing stamps continue at its rate."
+    )
 
 
 @pytest.mark.parametrize("line", ["Tr: 1 2 3", "P0: 1", "Tr: 1 0 0 0 0 2 0 0 0 0 1 0", "Tr: 1 0 0 0 0 1 0 0 0 0 -1 0"])

@@ -186,6 +186,16 @@ def test_truth_without_oxts_stamps_uses_those_of_the_scans(tmp_path, rng):
     np.testing.assert_allclose(truth.T_world_lidar, inverse(T_enu_lidar[0]) @ T_enu_lidar, atol=1e-6)
 
 
+def test_oxts_rows_that_run_backwards_are_left_out(tmp_path, rng):
+    drive = _write_drive(tmp_path, rng)
+    times = _oxts_times(8)
+    times[4] = times[1]
+    (drive / "oxts" / "timestamps.txt").write_text(_stamp_lines(times))
+    recording = open_recording(drive)
+    np.testing.assert_allclose(recording.ground_truth.stamps, FIRST_STAMP + np.delete(times, 4), rtol=0.0, atol=3e-7)
+    assert any("1 oxts rows" in note for note in recording.describe().notes)
+
+
 def test_scan_stamps_that_repeat_are_interpolated(tmp_path, rng):
     drive = _write_drive(tmp_path, rng)
     stamps = MID_S * np.arange(8)

@@ -22,6 +22,25 @@ def test_padded_rows_and_big_endian(driver, make_sweep, ros2_kit):
     assert cloud.rings.dtype.isnative
 
 
+def test_the_result_does_not_hold_on_to_the_message(make_sweep, ros2_kit):
+    sweep = make_sweep("ouster", STAMP_NS)
+    message = ros2_kit.cloud(sweep.records, STAMP_NS)
+    cloud = decode_point_cloud2(message)
+    message.data[:] = 0
+    np.testing.assert_array_equal(cloud.points, sweep.points)
+    np.testing.assert_array_equal(cloud.times, sweep.times)
+    np.testing.assert_array_equal(cloud.rings, sweep.rings)
+
+
+def test_coordinates_alone_are_enough(ros2_kit, rng):
+    records = np.zeros((1, 9), [("z", "f8"), ("x", "f8"), ("y", "f8")])
+    for axis in "xyz":
+        records[axis] = rng.normal(size=(1, 9))
+    cloud = decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS))
+    np.testing.assert_array_equal(cloud.points, np.stack([records[axis][0] for axis in "xyz"], axis=1))
+    assert cloud.time_field is cloud.times is cloud.rings is None
+
+
 def test_fields_with_a_count(ros2_kit, make_sweep):
     sweep = make_sweep("velodyne", STAMP_NS)
     message = ros2_kit.cloud(sweep.records, STAMP_NS)
@@ -41,6 +60,12 @@ def test_an_unknown_datatype_matters_only_where_it_is_read(ros2_kit, make_sweep)
     message.fields[0].datatype = 11
     with pytest.raises(InputError, match="'x' has the unknown datatype 11"):
         decode_point_cloud2(message)
+
+
+def test_rings_stored_as_floats(ros2_kit):
+    records = np.zeros((1, 3), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "f4")])
+    records["ring"] = [5.0, np.nan, 31.0]
+    np.testing.assert_array_equal(decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS)).rings, [5, np.nan, 31])
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (1, 0), (0, 5)])

@@ -160,6 +160,15 @@ def test_a_first_cloud_without_times_is_no_fault_of_the_recording():
     assert learn_point_time(clouds) == LearnedTime(PointTimeModel("t", "s", "relative"))
 
 
+def test_nan_values_do_not_disturb():
+    values = np.r_[np.nan, SWEEP, np.nan]
+    model = inferred("time", values, STAMP)
+    assert model == PointTimeModel("time", "s", "relative")
+    offsets = model.offsets(values, STAMP)
+    assert np.isnan(offsets[[0, -1]]).all()
+    np.testing.assert_array_equal(offsets[1:-1], SWEEP)
+
+
 def test_missing_returns_of_a_clock_read_zero():
     values = np.r_[np.zeros(1500, dtype="i8"), STAMP_NS + SWEEP_NS]
     model = inferred("timestamp", values, STAMP)

@@ -18,6 +18,7 @@ from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.stored_recording import find_truth_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
@@ -148,6 +149,32 @@ def test_file_of_compressed_messages_asks_for_the_folder(make_bag_kit, make_swee
         next(open_recording(kit.storage_file(path)).scans())
 
 
+def test_skipped_messages_are_not_decoded(drive, monkeypatch):
+    decoded = []
+    decode = BagFile.decode
+
+    def spy(self, message, time_field=None):
+        decoded.append(message.header_ns)
+        return decode(self, message, time_field)
+
+    recording = open_recording(drive[0])
+    next(recording.scans())  # the time field has been looked at
+    monkeypatch.setattr(BagFile, "decode", spy)
+    assert len(list(recording.scans(1, None, 2))) == 3
+    assert decoded == stamps_ns(6)[1::2]
+    decoded.clear()
+    assert len(recording) == 6
+    next(recording.scans(0))
+    assert decoded == stamps_ns(1)
+
+
+def test_scans_can_be_read_twice_and_side_by_side(drive):
+    recording = open_recording(drive[0])
+    pairs = list(zip(recording.scans(), recording.scans(), strict=True))
+    assert len(pairs) == 6
+    assert all(one.stamp == other.stamp for one, other in pairs)
+
+
 def test_description(drive):
     path, sweeps = drive
     info = open_recording(path).describe()
@@ -168,6 +195,13 @@ def test_description(drive):
     )
     assert info.fields[4:] == (PointField("ring", "uint16"), PointField("time", "float32"))
     assert info.notes == ()
+
+
+def test_a_cloud_topic_that_ends_early_has_its_own_duration(ros2_kit, make_sweep):
+    clouds = recorded(ros2_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(4)])
+    late = (STAMP_NS + 500 * 10**9, ros2_kit.header(STAMP_NS))
+    info = open_recording(ros2_kit.write({"/points": clouds, "/late": [late]})).describe()
+    assert info.duration_s == pytest.approx(0.3, abs=1e-6)
 
 
 def test_several_cloud_topics_are_listed(ros2_kit, make_sweep):

@@ -252,6 +252,14 @@ def test_names_that_are_no_stamps(stems):
     assert stamps_from_names(stems) is None
 
 
+def test_without_stamps_the_rate_gives_them(formats, tmp_path, rng):
+    _write_numbered(formats, tmp_path, rng, ["000000.bin", "000001.bin", "000002.bin"])
+    recording = open_recording(tmp_path, ReaderConfig(rate_hz=20.0))
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [0.0, 0.05, 0.1])
+    assert any("20 scans a second are assumed, as set." in warning for warning in recording.warnings)
+    assert "at an assumed 20.00 Hz" in describe_source(tmp_path, ReaderConfig(rate_hz=20.0))
+
+
 def test_an_assumed_rate_is_a_warning_that_says_how_to_give_it(formats, tmp_path, rng):
     _write_numbered(formats, tmp_path, rng, ["000000.bin", "000001.bin"])
     warnings = open_recording(tmp_path).warnings
@@ -382,6 +390,13 @@ def test_organised_and_plain_npy(tmp_path, rng):
             next(open_recording(tmp_path).scans())
     np.save(tmp_path / "0.npy", np.array([{"x": 1}]), allow_pickle=True)
     with pytest.raises(InputError, match=r"0\.npy: cannot be read"):
+        next(open_recording(tmp_path).scans())
+
+
+def test_ply_with_lists_before_the_vertices_is_refused(formats, tmp_path, rng):
+    before = "element face 1\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "0.ply").write_bytes(formats.ply(_rich(rng), "ascii", before, b"3 0 1 2\n"))
+    with pytest.raises(InputError, match="plain type"):
         next(open_recording(tmp_path).scans())
 
 

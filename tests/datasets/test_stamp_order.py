@@ -78,6 +78,18 @@ def test_no_more_is_read_ahead_than_tells_a_stray_stamp():
         assert len(read) <= max(6, count + 1)
 
 
+def test_an_error_of_the_source_comes_after_the_scans_before_it():
+    def source():
+        yield from clock(3)
+        raise InputError("the bag breaks off")
+
+    taken = []
+    with pytest.raises(InputError, match="breaks off"):
+        for stamp in in_stamp_order(source(), float, Faults()):
+            taken.append(stamp)
+    assert taken == clock(3)
+
+
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.lists(st.floats(-1e10, 1e10), max_size=40))
 def test_whatever_comes_what_is_taken_increases_and_the_rest_is_counted(stamps):

@@ -67,6 +67,11 @@ def test_recordings_in_a_folder_are_named(tmp_path: Path) -> None:
     assert f"holds the recording {inner} (scan-folder); name that" in refused(tmp_path / "outer")
 
 
+def test_a_bag_beside_it_is_not_what_a_folder_belongs_to(tmp_path: Path) -> None:
+    write(tmp_path / "other.mcap", tmp_path / "images" / "0.png")
+    assert "images" in refused(tmp_path / "images").split(": ", 1)[1]
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -95,3 +100,10 @@ def test_a_name_that_is_misspelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "is an address; download" in refused(Path("https://example.org/a.bag"))
     monkeypatch.chdir(tmp_path)
     assert refused(Path("record")).startswith("record: no such file or folder; did you mean recordings?")
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_an_empty_bag(tmp_path: Path, suffix: str) -> None:
+    write(tmp_path / f"drive{suffix}", content=b"")
+    with pytest.raises(InputError, match="is empty, 0 bytes; copy the bag again"):
+        open_recording(tmp_path / f"drive{suffix}")

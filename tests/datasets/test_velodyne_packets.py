@@ -112,6 +112,16 @@ def test_points_times_rings_and_intensities_of_a_capture(capture):
     assert 384 * len(sent) - sum(len(scan) for scan in scans) in (0, 1)  # the library may drop one at azimuth zero
 
 
+def test_a_part_of_a_capture(capture):
+    path, _ = capture
+    recording = open_recording(path)
+    stamps = [scan.stamp for scan in recording.scans()]
+    assert [scan.stamp for scan in recording.scans(1, None, 2)] == stamps[1::2]
+    untimed = open_recording(path, ReaderConfig(time_reference="none"))
+    assert next(untimed.scans()).time_offsets is None
+    assert untimed.describe().point_time is None
+
+
 def scan_message(kit, sent, stamp_ns):
     header = kit.header(stamp_ns)
     stamps = [round(1e9 * (times[0])) + round(STAMP_S * 1e9) for _, times, _, _ in sent]

@@ -97,6 +97,11 @@ def test_a_sensor_that_is_mounted_askew_is_seen_where_positions_are_certain(axis
     assert rotation_error_deg(estimate, reference) == pytest.approx(3.0, abs=1e-3)
 
 
+def test_trajectories_that_are_equal_have_no_error(random_drive, straight_drive):
+    for drive in (random_drive(14), straight_drive(50), straight_drive(50, (0.0,) * 6)):
+        assert rotation_error_deg(drive.transformed(exp(MOTIONS[2])), drive) < 1e-4
+
+
 @pytest.mark.parametrize("method", ["first_pose", "none"])
 def test_an_alignment_that_is_asked_for_holds_for_the_rotations_too(method, random_drive, noisy):
     reference = random_drive(15)

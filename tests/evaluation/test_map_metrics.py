@@ -8,6 +8,8 @@ import pytest
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.map.entropy import map_entropy
 from lidarslam.evaluation.map.metrics import compare_maps
+from lidarslam.evaluation.map.voxel_thinning import thin
+from lidarslam.evaluation.report.error_colours import error_colours
 
 UTM = np.array([5e5, 5e6, 300.0])
 
@@ -77,6 +79,30 @@ def test_without_points_nothing_is_computed(plane: FloatArray, empty: str) -> No
     values = [metrics.accuracy_mean_m, metrics.completeness_mean_m, metrics.chamfer_m, metrics.coverage_percent[1.0]]
     assert [*values, metrics.deviation_percent[1.0], metrics.f_score_percent[0.1]] == [None] * 6
     json.dumps(metrics.to_json(), allow_nan=False)
+
+
+def test_distances_belong_to_their_points(plane: FloatArray) -> None:
+    compared = compare_maps(np.concatenate([plane, [[5.0, 5.0, 0.7]]]) + UTM, plane + UTM)
+    worst = int(compared.map_errors.distances_m.argmax())
+    np.testing.assert_allclose(compared.map_errors.points[worst], UTM + np.array([5.0, 5.0, 0.7]), atol=1e-6)
+    assert compared.map_errors.distances_m[worst] == pytest.approx(0.7, abs=1e-6)
+    assert compared.map_gap_m == pytest.approx(0.1, abs=1e-6)
+
+
+def test_thinning_keeps_one_actual_point_a_cell(rng: np.random.Generator) -> None:
+    points = rng.uniform(-3.0, 3.0, (5_000, 3))
+    thinned = thin(points, 0.5)
+    cells = {tuple(cell) for cell in np.floor((points - points.min(axis=0)) / 0.5).astype(int)}
+    assert len(thinned) == len(cells)
+    assert {tuple(p) for p in thinned} <= {tuple(p) for p in points}
+
+
+def test_colours_run_from_dark_to_bright_and_stay_there() -> None:
+    colours = error_colours(np.array([0.0, 0.25, 0.5, 3.0, np.inf])).astype(int)
+    np.testing.assert_array_equal(colours[0], [68, 1, 84])
+    np.testing.assert_array_equal(colours[2:], [[253, 231, 37]] * 3)
+    lightness = error_colours(np.linspace(0.0, 0.5, 50)) @ [0.299, 0.587, 0.114]
+    assert (np.diff(lightness) > 0.0).all()
 
 
 def _slab(rng: np.random.Generator, sigma_m: float) -> FloatArray:

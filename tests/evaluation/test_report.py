@@ -107,6 +107,34 @@ def test_the_best_of_each_column_is_bold_and_starred(comparison):
     assert f"**{ate:.3f}** ★" in render_markdown(comparison)
 
 
+def test_what_ended_early_wins_nothing(comparison):
+    sequence = comparison.sequences[1]
+    first, second, _ = sequence.methods
+    methods = [replace(first, status="stopped"), replace(second, status="ok"), MethodResult("x", "failed")]
+    changed = replace(sequence, methods=methods)
+    rows = table_rows(page_of(replace(comparison, sequences=[changed])), "corridor: all methods")
+    assert not any("★" in text_of(cell) for cell in rows["kiss-icp"])
+
+
+def test_means_over_fewer_recordings_say_so_and_published_rows_their_source(comparison):
+    page = page_of(comparison)
+    rows = table_rows(page, f"Means {HOSTILE}")
+    assert text_of(rows["learned"][1]) == "0.11 over 1 of 2"
+    assert text_of(rows["kiss-icp"][0]) == "0.57 ★"
+    assert text_of(rows["DeLORA"][1]) == "NA"
+    assert "published: Nubert et al., ICRA 2021" in text_of(page)
+
+
+def test_lost_intervals_and_failures_are_listed_with_reasons_in_a_folded_table(comparison):
+    page = page_of(comparison)
+    folded = [table for details in page.iter("details") for table in details.iter("table")]
+    (table,) = (t for t in folded if text_of(t.find("caption")).endswith("tracking lost") and "street" in text_of(t))
+    rows = [[text_of(cell) for cell in row] for row in table.find("tbody").findall("tr")]
+    assert [row[2:5] for row in rows[:2]] == [["20", "100", "119"], ["1", "500", "500"]]
+    assert rows[0][5:7] == ["10.0", "11.9"]
+    assert "ended with signal 11" in rows[2][-1]
+
+
 def test_a_method_keeps_its_colour_and_name_in_every_figure_and_recording(comparison):
     page = page_of(comparison)
     names, colours = {}, {}

@@ -40,6 +40,7 @@ OUTSIDE = """
   }).map(t => `${plot.getAttribute('aria-label')}: ${t.textContent}`);
 })
 """
+TEXT_COLOUR = "getComputedStyle(document.querySelector('.plot .xtick text')).fill"
 TRACES_SHOWN = """
 [...document.querySelectorAll('.plot')].map(plot => plot.data.filter(trace => trace.visible).map(trace => trace.name))
 """
@@ -183,6 +184,24 @@ def test_the_legend_hides_a_method_in_all_plots_and_the_axis_turns_logarithmic(p
     before = browser.evaluate(kind)
     browser.evaluate("document.querySelector('button.log').click()")
     assert {before, browser.evaluate(kind)} == {"linear", "log"}
+
+
+@pytest.mark.parametrize(("width", "theme"), [(1600, "dark"), (420, "light")])
+def test_on_paper_plots_have_the_width_of_the_page_and_dark_text(width, theme, page, browser):
+    browser.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
+    browser.visit(page, width)
+    browser.evaluate("dispatchEvent(new Event('beforeprint'))")
+    right = "Math.max(...[...document.querySelectorAll('svg.main-svg')].map(s => s.getBoundingClientRect().right))"
+    assert browser.evaluate(right) == pytest.approx(182 / 25.4 * 96, abs=2.0)
+    assert browser.evaluate("document.querySelectorAll('details.table:not([open])').length") == 0
+    assert browser.evaluate("document.querySelectorAll('.plot:not([data-drawn])').length") == 0
+    browser.send("Emulation.setEmulatedMedia", media="print")
+    browser.evaluate("new Promise(done => setTimeout(done, 600))")
+    assert browser.evaluate(TEXT_COLOUR) == "rgb(92, 92, 92)"
+    browser.send("Emulation.setEmulatedMedia", media="")
+    assert browser.evaluate(DRAW_ALL)[0] > 30
+    assert browser.evaluate(right) <= width
+    assert (browser.evaluate(right) > 1000) is (width > 1000)
 
 
 def test_an_injected_script_is_refused(page, browser):

@@ -77,6 +77,15 @@ def test_steps_across_unmatched_scans_are_left_out_of_the_rpe(straight_drive):
     assert metrics.errors.rpe_translation_rmse_m == pytest.approx(0.01, rel=1e-9)
 
 
+def test_without_successive_scans_there_is_no_rpe(straight_drive):
+    estimate = straight_drive(100)
+    metrics = evaluate_trajectory(estimate, estimate.select(slice(None, None, 10)))
+    written = metrics.to_json()["trajectory"]
+    assert written["rpe_translation_rmse_m"] is None
+    assert written["rpe_rotation_rmse_deg"] is None
+    assert written["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_json_has_the_promised_keys_and_no_nan(random_drive, noisy):
     drift, short = {"translation_percent", "rotation_deg_per_100m"}, {"translation_percent", "rotation_deg_per_10m"}
     reference = random_drive(4, scans=950)

@@ -109,6 +109,13 @@ def test_the_imu_comes_with_its_calibration(hilti: SimpleNamespace) -> None:
     np.testing.assert_allclose(imu.T_lidar_imu @ HILTI_T_IMU_LIDAR, np.eye(4), atol=1e-6)
 
 
+def test_some_of_the_scans(hilti: SimpleNamespace) -> None:
+    recording = open_recording(hilti.folder)
+    assert [scan.stamp for scan in recording.scans(1, None, 1)] == [scan.stamp for scan in recording.scans()][1:]
+    assert len(list(recording.scans(0, 9, 2))) == 2
+    assert not list(recording.scans(3))
+
+
 def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
     """Organised clouds with holes; the truth is of a frame of its own, in a table with seconds and nanoseconds."""
     folder, kit = make_sequence("newer_college_2021/stairs")

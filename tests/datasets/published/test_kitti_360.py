@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, make_transform, transform_points
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import choose_reader, open_recording
@@ -102,3 +103,9 @@ def test_without_calibration_there_is_no_truth(root):
     recording = open_recording(root / "data_3d_raw" / DRIVES[0])
     assert recording.ground_truth is None
     assert any("no calibration folder" in note for note in recording.describe().notes)
+
+
+def test_a_damaged_calibration(root):
+    (root / "calibration" / "calib_cam_to_velo.txt").write_text("1 2 3\n")
+    with pytest.raises(InputError, match="expected 12 numbers"):
+        _ = open_recording(root / "data_3d_raw" / DRIVES[0]).ground_truth
