@@ -75,6 +75,12 @@ def test_the_points_on_the_faces_have_the_leverage(rng):
     assert len(constraining_points(points, elevations(points), 0.5 * CELL, 50)) == 50
 
 
+def test_where_everything_constrains_no_point_does_more_than_others(rng):
+    points = rng.uniform(-3.0, 3.0, (40_000, 3))
+    points[np.arange(40_000), rng.integers(0, 3, 40_000)] = rng.choice([-3.0, 3.0], 40_000)
+    assert len(constraining_points(points, elevations(points), 0.5 * CELL, 1_000)) < 40
+
+
 @pytest.mark.parametrize("off_m", [-0.2, -0.12, 0.12, 0.2])
 def test_faces_hold_the_length_although_walls_fit_anywhere(corridor, keypoints, off_m):
     """The few residuals along the corridor are no outliers while the prediction leaves its length open."""

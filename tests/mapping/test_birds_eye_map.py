@@ -1,6 +1,7 @@
 """A scan laid on a map from above: the right place, turn and height among the first."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -45,3 +46,11 @@ def test_in_a_tilted_world_the_lean_is_kept(rng, l_shaped_room, points):
 def test_what_shows_nothing_upright_lies_nowhere(points):
     floor = np.column_stack([np.random.default_rng(0).uniform(-3.0, 3.0, (500, 2)), np.full(500, -1.0)])
     assert complete(BirdsEyeMap.of(points, UP, 0.4).find(floor, np.eye(4), 12.0, 5)).shape == (0, 4, 4)
+
+
+def test_no_two_places_are_the_same(rng, l_shaped_room, points):
+    poses = complete(BirdsEyeMap.of(points, UP, 0.4).find(l_shaped_room(rng, 4_000), np.eye(4), 12.0, 20))
+    assert len(poses) == 20
+    for one, other in pairwise(poses):
+        apart = np.linalg.norm(one[:3, 3] - other[:3, 3])
+        assert apart > 1.0 or rotation_angle(inverse(one) @ other) > np.deg2rad(11.0)

@@ -7,6 +7,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.pose_graph.correction import corrected
 
+FAR = exp([0.2, -0.3, 2.0, 5e5, -3e5, 100.0])
+
 
 @pytest.fixture
 def trajectory(rng: np.random.Generator) -> FloatArray:
@@ -19,6 +21,14 @@ def along_x(positions: list[float]) -> FloatArray:
     T = np.tile(np.eye(4), (len(positions), 1, 1))
     T[:, 0, 3] = positions
     return T
+
+
+def test_where_the_world_lies_does_not_matter(trajectory, rng):
+    keyframes = np.array([5, 12, 33])
+    poses = trajectory[keyframes] @ exp(rng.normal(size=(3, 6)) * 0.3)
+    here = corrected(trajectory, keyframes, poses)
+    there = corrected(FAR @ trajectory, keyframes, FAR @ poses)
+    np.testing.assert_allclose(there, FAR @ here, atol=1e-8)
 
 
 def test_keyframes_get_exactly_their_poses(trajectory, rng):
@@ -53,6 +63,12 @@ def test_what_is_missing_is_spread_by_the_path():
 def test_standing_still_it_is_spread_by_the_scans():
     moved = corrected(along_x([3.0] * 5), np.array([0, 4]), along_x([3.0, 4.0]))
     np.testing.assert_allclose(moved, along_x([3.0, 3.25, 3.5, 3.75, 4.0]), atol=1e-12)
+
+
+def test_stretches_between_keyframes_do_not_mix():
+    """Still in the first, driving in the second."""
+    moved = corrected(along_x([0.0, 0.0, 0.0, 1.0, 4.0]), np.array([0, 2, 4]), along_x([0.0, 1.0, 7.0]))
+    np.testing.assert_allclose(moved, along_x([0.0, 0.5, 1.0, 2.5, 7.0]), atol=1e-12)
 
 
 def test_a_turn_that_was_missed_is_made_up_for_evenly():

@@ -47,6 +47,14 @@ def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map, scan_po
     assert fit.inlier_share == pytest.approx(0.5)
 
 
+def test_points_at_corners_count_once_each(box_map, rng):
+    """Whatever a point there is held against, planes or bodies."""
+    points = transform_points(inverse(T_WORLD_LIDAR), on_sides(rng, HALF, 4_000))
+    fit = measure_fit(points, T_WORLD_LIDAR, box_map)
+    assert fit.matched <= len(points)
+    assert 0.8 < fit.overlap <= 1.0
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_worst_axis_decides(box_map, scan_points, axis):
     """A shift by a little more than the gate along one axis of the world: the others' walls all fit."""

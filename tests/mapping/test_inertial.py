@@ -428,6 +428,13 @@ def test_errors_of_clock_and_rotation_are_found_with_their_deviations(late_s, rn
     assert found.rotation_sigma < np.deg2rad(0.3)
 
 
+def test_what_no_turn_shows_stays_unknown(rng):
+    found = compared(still, rng, samples(still, 12.0)).alignment()
+    assert found.offset_sigma_s > 0.09
+    assert abs(found.offset_s) < 0.01
+    assert found.rotation_sigma > np.deg2rad(4.0)
+
+
 @pytest.mark.parametrize(
     ("rates", "forces", "seen"),
     [

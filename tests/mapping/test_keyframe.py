@@ -36,6 +36,13 @@ def test_the_way_to_the_next_follows_the_scene(hall, monkeypatch):
         assert chosen.is_due(moved(1.03 * distance_m), scale * hall)
 
 
+def test_the_way_can_be_set(hall, monkeypatch):
+    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.0)
+    chosen = selector(hall, distance_m=3.0)
+    assert not chosen.is_due(moved(2.9), hall)
+    assert chosen.is_due(moved(3.0), hall)
+
+
 def test_a_turn_on_the_spot_makes_a_keyframe(hall):
     chosen = selector(hall, turn_deg=30.0)
     assert not chosen.is_due(moved(turn_deg=29.0), hall)

@@ -216,6 +216,19 @@ def test_edges_are_the_sharpest_points_and_no_neighbours(rng):
     assert all(steps[a:b].max() > 0.05 for a, b in beside)
 
 
+def test_the_sharpest_of_neighbours_is_chosen(rng):
+    """A sharp point is an edge, or has a sharper edge within five points, or one of the sector before."""
+    azimuth = np.deg2rad(np.arange(0.0, 360.0, 0.2))
+    points = on_sphere(azimuth, np.zeros(1800), 5.0 + 0.015 * rng.standard_normal(1800))
+    kinds, sharpness = kinds_of(points), curvatures(points)
+    edges = np.flatnonzero(kinds == EDGE)
+    assert len(edges) > 20
+    assert (np.diff(edges) > 5).all()
+    for i in np.setdiff1d(np.flatnonzero(sharpness > 0.1), edges):
+        rivals = edges[np.abs(edges - i) <= 5]
+        assert any(sharpness[rival] >= sharpness[i] or rival // 300 < i // 300 for rival in rivals)
+
+
 def distance_to_edges(room: Any, points: FloatArray) -> FloatArray:
     """Distances (N,) of points (N, 3) of the room's surfaces from the nearest edge: of walls, of pillars, of both."""
     away = [np.abs(np.abs(points) - room.half_size)]
@@ -271,3 +284,12 @@ def test_features_lie_within_the_range_limits(ring_scans):
         within = every.points[(before > 4.0) & (before < 7.0)]
         assert len(within) < len(every)
         assert np.isin(rows_of(within, scan), rows_of(limited.points, scan)).all()
+
+
+def test_one_feature_a_voxel_is_kept(ring_scans):
+    """Voxels of half a cell."""
+    features = extract_features(ring_scans[0], 0.5, 100.0, 1.0)
+    for sweep in features:
+        voxels = np.floor(sweep.points / 0.5)
+        assert len(np.unique(voxels, axis=0)) == len(voxels)
+    assert sum(map(len, features)) < 0.5 * sum(map(len, extract_features(ring_scans[0], 0.5, 100.0, 0.1)))

@@ -123,6 +123,15 @@ def test_a_lap_is_closed_by_appearance_alone(twice, monkeypatch):
     assert all(c.by_appearance and c.consistent >= detection._CONSISTENT for c in found)
 
 
+def test_closures_keep_their_distance(twice, monkeypatch):
+    submaps, truth = twice
+    monkeypatch.setattr(detection, "_SPACING_M", 7.0)
+    found = accepted(detect(submaps, drifted(truth))[0])
+    ways = np.array([submaps[c.second].way_m for c in found])
+    assert len(ways) >= 2
+    assert (np.diff(ways) >= 7.0).all()
+
+
 def test_nothing_is_closed_on_a_way_without_return(hall):
     truth = round_trip(0.45)
     closures, _ = detect(submaps_of(hall, truth), truth)
@@ -212,3 +221,19 @@ def test_closures_wait_for_others_to_agree_until_the_segment_ends(twice, monkeyp
     assert len(decided) > 2
     assert {c.reason for c in decided} == {"no other closure agrees"}
     assert detector.finish() == []
+
+
+def test_a_cloud_is_a_keyframe_with_its_neighbours(twice):
+    submaps, truth = twice
+    kept = KeyframeDatabase(CONFIG)
+    for i, submap in enumerate(submaps[:8]):
+        kept.add(submap.points, submap.way_m, int(i >= 6), truth[: i + 1])
+    way = kept.track.way_m
+    for index, around in ((0, [0, 1, 2]), (3, [1, 2, 3, 4, 5]), (5, [3, 4, 5]), (7, [6, 7])):
+        cloud = kept.cloud(index)
+        assert sorted(set(cloud.ahead_m)) == pytest.approx([way[i] - way[index] for i in around])
+        assert cloud.drift_rates == pytest.approx((np.deg2rad(2.0) / 100.0, 0.01))
+        assert cloud.submap is kept.submaps[index]
+    # The neighbours' points lie on the same walls: the hall's are 14 m from its middle.
+    world = transform_points(truth[3], kept.cloud(3).points)
+    assert (np.abs(world[:, 1]) < 14.1).all()

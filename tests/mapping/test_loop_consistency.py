@@ -62,6 +62,14 @@ def test_longer_ways_excuse_more(round_trip):
     assert agree(off, far, round_trip)
 
 
+def test_other_segments_do_not_agree(round_trip):
+    segment = round_trip.segment.copy()
+    segment[60:] = 1
+    two = Track(round_trip.T_world_lidar, round_trip.way_m, segment, RATES)
+    assert agree(link(two, 3, 63), link(two, 6, 66), two)
+    assert not agree(link(two, 3, 43), link(two, 6, 66), two)
+
+
 def test_between_segments_only_ways_within_them_count(round_trip):
     """The second is in a world of its own."""
     segment, poses = np.arange(80) // 40, round_trip.T_world_lidar.copy()

@@ -88,3 +88,13 @@ def test_next_to_nothing_is_not_registered(count):
     far = exp([0.0, 0.0, 0.0, 0.0, 0.0, 500.0])
     assert refine(few, few, far, PRIOR, DRIFT) is None
     assert refine(target, few, far, PRIOR, DRIFT) is None
+
+
+def test_neighbours_are_joined_where_they_lie():
+    points = planes(np.random.default_rng(1), ends=True)
+    left, right = points[points[:, 0] < 0.0], points[points[:, 0] >= 0.0]
+    T = exp([0.1, 0.2, -0.3, 4.0, 5.0, 0.6])
+    joined = DenseSubmap.join([(np.eye(4), left), (T, transform_points(inverse(T), right))], 60.0, CELL_M)
+    whole = DenseSubmap.join([(np.eye(4), np.concatenate([left, right]))], 60.0, CELL_M)
+    np.testing.assert_allclose(joined.points, whole.points, atol=1e-9)
+    assert np.linalg.norm(DenseSubmap.join([(np.eye(4), points)], 5.0, CELL_M).points, axis=1).max() <= 5.0

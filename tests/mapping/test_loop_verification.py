@@ -93,6 +93,18 @@ def test_only_what_a_side_could_see_counts_against_it(room):
     assert evaluate(place(before, FIRST, 1), room[1], TRUE).overlap < 0.95 * found.overlap
 
 
+def test_a_pole_has_no_direction():
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-6, 6, (6000, 2)), np.full(6000, -1.5)])
+    poles = [np.column_stack([np.tile(xy, (400, 1)), rng.uniform(-1.2, 3.0, 400)]) for xy in rng.uniform(-5, 5, (9, 2))]
+    stands = SubmapCloud.join(SparseSubmap.of(np.concatenate([floor, *poles]), 60.0))
+    assert stands.is_line.sum() > 50
+    turned = replace(stands, axes=np.where(stands.is_line[:, None], -stands.axes, stands.axes))
+    assert (
+        evaluate(stands, turned, np.eye(4)).inliers == evaluate(stands, stands, np.eye(4)).inliers == len(stands.points)
+    )
+
+
 def test_a_corridor_says_nothing_along_itself():
     first, second = pose(0.0, 0.2, 0.0), pose(3.0, -0.2, 30.0)
     found = verify(place(CORRIDOR, first, 1), place(CORRIDOR, second, 2), inverse(first) @ second)

@@ -82,3 +82,24 @@ def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng):
     assert len(expected) == 4
     for name, values in drawn.cloud().attributes.present():
         np.testing.assert_allclose(values, expected[name], rtol=1e-5, atol=1.0 if name == "rgb" else 1e-5)
+
+
+def test_attributes_go_on(rng, through_disk, monkeypatch):
+    """A map that is saved and restored in between is the whole one, to the last bit."""
+    monkeypatch.setattr(module, "_MIN_PENDING", 1500)
+    scans = [
+        (rng.uniform(-3.0, 3.0, (1000, 3)), some(rng, 1000, number, names))
+        for number, names in enumerate(("", "intensity", "intensity", "intensity rgb ring time", "rgb"))
+    ]
+    whole = GlobalMap(VOXEL_M)
+    for points, known in scans:
+        whole.add(points, np.eye(4), known)
+    for after in range(len(scans)):
+        part, restored = GlobalMap(VOXEL_M), GlobalMap(1.0)
+        for points, known in scans[:after]:
+            part.add(points, np.eye(4), known)
+        restored.restore(through_disk(part.state()))
+        for points, known in scans[after:]:
+            restored.add(points, np.eye(4), known)
+        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
+        assert restored.means().layout == whole.means().layout

@@ -154,6 +154,23 @@ def test_a_sensor_upside_down_is_as_good(mapper, rest_scans, rest_truth):
     assert_true(process(mapper, scans), rest_truth.T_world_lidar @ T_lidar_mounted, 0.0025, 0.03)
 
 
+def test_the_pose_does_not_drift_while_nothing_moves(mapper, room, drive):
+    """Fifty times the very same scan."""
+    scan = snapshot(room, drive(np.array([0.5]))[0], 0.0, 1)
+    results = process(mapper, [replace(scan, stamp=0.1 * k) for k in range(51)])
+    poses = np.array([result.state.T_world_lidar for result in results])
+    assert np.linalg.norm(poses[:, :3, 3], axis=1).max() < 1e-3
+    assert np.rad2deg(rotation_angle(poses)).max() < 0.01
+
+
+def test_a_first_scan_of_nothing_is_lost_and_the_next_begins_the_map(mapper, rest_scans, rest_truth):
+    first = mapper.process(empty(0.0), NOTHING)
+    assert first.status is Status.LOST
+    assert first.message == "no points within range"
+    assert mapper.local_map is None
+    assert_true(process(mapper, rest_scans), rest_truth.T_world_lidar, 0.006, 0.06)
+
+
 def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothing(settled, rest_scans, rest_truth):
     held = size(settled)
     lost = settled.process(empty(rest_scans[15].stamp), NOTHING)
@@ -221,6 +238,16 @@ def test_a_place_that_no_motion_leads_to_is_not_taken_until_driving_decides(sett
     assert np.rad2deg(rotation_angle(inverse(truth) @ found[-1].state.T_world_lidar)) < 0.1
 
 
+def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans, monkeypatch):
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 3)
+    mapper = Mapper(MappingConfig())
+    process(mapper, rest_scans[:10])
+    stamps = rest_scans[9].stamp + 0.1 * np.arange(1, 4)
+    lost = [mapper.process(garbage(float(stamp), seed), NOTHING) for seed, stamp in enumerate(stamps)]
+    assert [result.status for result in lost] == [Status.LOST] * 3
+    assert ["a new map begins here" in result.message for result in lost] == [False, False, True]
+
+
 def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(rest_scans, rest_truth, monkeypatch):
     """Two covered scans, then the room again, which fits the new map and not what came between."""
     monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 1)
@@ -270,3 +297,29 @@ def test_a_sensor_that_was_carried_away_is_relocalised_in_loams_map(ring_scans, 
     assert any("relocalised" in result.message for result in results)
     assert np.linalg.norm(error[-1, :3, 3]) < 0.05
     assert np.rad2deg(rotation_angle(error[-1])) < 1.0
+
+
+def test_along_a_corridor_loam_keeps_the_odometry():
+    """Walls, floor and ceiling along x, the sensor's way; the odometry is a tenth too short."""
+    half = np.array([1e3, 1.5, 1.2])
+
+    def scan(stamp: float) -> Scan:
+        azimuth, elevation = np.meshgrid(
+            np.deg2rad(np.arange(0.0, 360.0, 0.5)), np.deg2rad(np.arange(-28.0, 29.0, 2.0))
+        )
+        rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        rays = rays.reshape(3, -1).T
+        ranges = (half / np.maximum(np.abs(rays), 1e-12))[:, 1:].min(axis=1)
+        near = ranges < 6.0  # else incidence is grazing
+        rings = np.arange(29, dtype=np.int32).repeat(720)
+        return Scan((rays * ranges[:, None])[near], stamp, rings=rings[near])
+
+    way = exp([0.0, 0.0, 0.0, 0.09, 0.0, 0.0])
+    results = process(Mapper(LOAM), [scan(0.1 * k) for k in range(6)], [Prior(way)] * 6)
+    sigmas = [np.sqrt(result.state.covariance[3, 3]) for result in results[1:]]
+    for k, result in enumerate(results[1:], start=1):
+        assert result.status is Status.DEGRADED
+        assert "x" in result.degenerate
+        assert result.state.T_world_lidar[0, 3] == pytest.approx(0.09 * k, abs=0.02)
+        np.testing.assert_allclose(result.state.T_world_lidar[1:3, 3], 0.0, atol=5e-3)
+    assert (np.diff(sigmas) > 0.0).all(), "the uncertainty grows on the way"

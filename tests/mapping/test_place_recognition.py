@@ -125,3 +125,24 @@ def test_the_range_image_holds_the_nearest_range():
     image = found.range_image
     assert found.nearest_ranges(np.array([[9.0, 0.02, 0.02], [5.0, 5.0, 0.0]])) == pytest.approx([4.0, 0.0], abs=0.01)
     assert sorted(image[image > 0.0].tolist()) == pytest.approx([4.0, 7.0], abs=0.01)
+
+
+def test_points_out_of_range_or_not_finite_are_left_out():
+    points = np.array([[0.1, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 1.0, 1.0], [99.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+    assert SparseSubmap.of(points, 60.0).points == pytest.approx(np.array([[5.0, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 8])
+def test_nearly_empty_submaps_have_a_descriptor(count):
+    tiny = SparseSubmap.of(np.random.default_rng(0).uniform(-4, 4, (count, 3)), 60.0)
+    descriptor = BirdEyeView.of(tiny).descriptor(RADIUS_M)
+    assert np.isfinite(descriptor).all()
+    T, _ = align(BirdEyeView.of(tiny), BirdEyeView.of(tiny), np.zeros(1), RADIUS_M)
+    assert np.isfinite(T).all()
+
+
+def test_memory_of_a_submap_is_bounded():
+    points = np.random.default_rng(0).uniform(-30, 30, (60_000, 3))
+    found = SparseSubmap.of(points, 60.0)
+    assert len(found) == 2500
+    assert sum(array.nbytes for array in vars(found).values() if isinstance(array, np.ndarray)) < 70_000

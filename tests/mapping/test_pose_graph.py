@@ -9,7 +9,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.edges import Attitude
+from lidarslam.mapping.pose_graph.edges import Attitude, first_connected
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, bounded, optimise, relax
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2
@@ -204,6 +204,17 @@ def test_a_chain_that_is_loose_in_some_directions_can_be_solved(variances):
     assert_near(optimise(truth, edges, loops).poses, truth, 1e-6)
 
 
+def test_a_good_covariance_is_kept():
+    A = np.random.default_rng(3).normal(size=(6, 6)) * 0.1
+    np.testing.assert_allclose(bounded(A @ A.T), A @ A.T, rtol=1e-12)
+    np.testing.assert_allclose(bounded(np.zeros((6, 6))), np.diag(_LEAST**2), rtol=1e-12)
+
+
+def test_a_component_is_named_by_its_first_node():
+    assert first_connected(8, [(6, 7), (4, 5), (5, 7), (1, 2)]).tolist() == [0, 1, 1, 3, 4, 4, 4, 4]
+    assert first_connected(2, []).tolist() == [0, 1]
+
+
 @pytest.mark.real_data
 def test_a_real_graph_ends_where_gtsam_ends_with_it(real_data):
     path = real_data / "trajectories" / "parking-garage.g2o"
@@ -244,3 +255,9 @@ def test_gravity_holds_roll_and_pitch_where_the_edges_drift():
     heights = [float(np.abs(poses[:, 2, 3] - truth[:, 2, 3]).max()) for poses in (alone, held)]
     assert heights[0] > 10.0
     assert heights[1] < 0.05 * heights[0]
+
+
+def test_an_attitude_leaves_the_heading_alone():
+    truth = np.stack([np.eye(4), exp([0.0, 0.0, 2.0, 1.0, 0.0, 0.0])])
+    edges, up = chained(truth), np.array([0.0, 0.0, 1.0])
+    assert_near(optimise(truth, edges, [], [Attitude(1, up, up, 1e-3)]).poses, truth, 1e-6)

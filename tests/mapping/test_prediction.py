@@ -140,6 +140,27 @@ def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_a
     np.testing.assert_allclose(joint - np.diag([uneven, 0.0]), np.cov(way, after), rtol=0.02, atol=2e-4)
 
 
+def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable():
+    """Independent, both would be likely; it is the correlation that keeps the one from making up for the other."""
+    known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
+    state = MotionState(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.05)
+    covariance = predict(state, 5.1, measured(), ProcessNoise(), MappingConfig(), 0.05).covariance
+    back_and_fast = np.zeros(12)
+    back_and_fast[3], back_and_fast[9] = -0.05, 1.0
+    forth_and_fast = np.abs(back_and_fast)
+    squared = [error @ np.linalg.solve(covariance, error) for error in (back_and_fast, forth_and_fast)]
+    assert squared[0] > 20.0
+    assert squared[1] < 1.0
+
+
+def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was():
+    """However sure the odometry is, the next pose is no better known than the last."""
+    known = np.diag(np.array([1e-6] * 3 + [0.3] * 3 + [1e-6] * 6) ** 2)
+    state = MotionState(5.0, np.eye(4), np.zeros(6), known)
+    prediction = predict(state, 5.1, measured(np.eye(4), covariance=isotropic(1e-6)), ProcessNoise(), CONFIG)
+    np.testing.assert_allclose(np.sqrt(np.diag(prediction.covariance))[3:6], 0.3, rtol=1e-3)
+
+
 def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted():
     moved = exp(0.1 * VELOCITY)
     assert not predicted(measured(moved, covariance=isotropic(0.01))).contradicted

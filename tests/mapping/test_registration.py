@@ -82,6 +82,12 @@ def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map, s
     assert len(refined.degeneracy) == 0
 
 
+def test_the_true_pose_stays(box_map, rng):
+    refined = register(snapshot(rng), predicted(T_TRUE), box_map, coarse_first=False)
+    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    assert refined.iterations <= 2
+
+
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(box_map, rng, stamp_at):
     """At 120 deg/s and 1.5 m/s the sweep is bent by 12 degrees and 15 cm."""
@@ -89,6 +95,14 @@ def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(box_map, rng, 
     assert_at(refined.T_world_lidar, T_TRUE, 2e-4, 0.005)
     np.testing.assert_allclose(refined.velocity[:3], TURNING[:3], atol=np.deg2rad(0.1))
     np.testing.assert_allclose(refined.velocity[3:], TURNING[3:], atol=0.005)
+
+
+def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(box_map, rng):
+    off = exp([0.0, 0.0, 0.05, 0.1, 0.0, 0.0])
+    prediction = predicted(T_TRUE @ off, TURNING)
+    refined = register_sweep(sweep_of(rng, TURNING), prediction, box_map, with_velocity=False)
+    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    np.testing.assert_array_equal(refined.velocity, TURNING)
 
 
 @pytest.fixture(scope="module")

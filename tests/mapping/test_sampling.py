@@ -32,6 +32,13 @@ def test_at_most_one_point_goes_into_the_map_from_each_half_cell(rng):
     assert len(sampled) > 0.95 * len(np.unique(cells(scan.points, 0.2), axis=0))
 
 
+def test_registered_points_are_spread_wider(rng):
+    sampled = sample(shell(rng, 5.0, 50_000), cell_m=0.1, keypoints=100_000)
+    keys = sampled.keypoints.points
+    assert 100 < len(keys) < len(sampled)
+    assert len(np.unique(cells(keys, 0.25), axis=0)) == len(keys)
+
+
 @pytest.mark.parametrize("keypoints", [100, 2_000])
 def test_no_more_points_are_registered_than_wanted_and_they_come_from_everywhere(rng, keypoints):
     sampled = sample(shell(rng, 5.0), cell_m=0.05, keypoints=keypoints)
@@ -58,6 +65,12 @@ def test_times_stay_with_their_points(rng):
         np.testing.assert_array_equal(sweep.points, scan.points[np.round(1e6 * sweep.times).astype(int)])
 
 
+def test_elevations_are_those_of_their_points(rng):
+    sampled = sample(shell(rng, 5.0), cell_m=0.3)
+    upward = np.hypot(sampled.sweep.points[:, 0], sampled.sweep.points[:, 1])
+    np.testing.assert_allclose(sampled.elevations, np.arctan2(sampled.sweep.points[:, 2], upward), atol=1e-12)
+
+
 def test_nothing_is_sampled_from_nothing(rng):
     sampler = Sampler(MappingConfig())
     sampled = sampler.sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)))
@@ -70,6 +83,11 @@ def test_nothing_is_sampled_from_nothing(rng):
 @pytest.mark.parametrize(("radius_m", "cell_m"), [(6.0, 0.2), (24.0, 0.8), (0.6, 0.05), (60.0, 1.0)])
 def test_cells_are_a_share_of_the_median_range_within_bounds(rng, radius_m, cell_m):
     assert sample(shell(rng, radius_m)).cell_m == pytest.approx(cell_m, rel=0.02)
+
+
+def test_a_given_cell_stays_whatever_the_scene(rng):
+    sampler = Sampler(MappingConfig(cell_m=0.33))
+    assert {sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in (1.0, 40.0, 5.0)} == {0.33}
 
 
 def cell_sizes(rng: np.random.Generator, radii_m: list[float]) -> list[float]:

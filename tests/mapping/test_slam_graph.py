@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.loops.closure import NEAR_SCANS, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph import slam_graph
@@ -214,6 +214,14 @@ def test_every_loop_that_is_inlier_is_one(walk, closed):
         assert not inlier or closure.accepted
 
 
+def test_the_scans_between_follow_their_keyframes(walk, closed):
+    _, result = closed
+    np.testing.assert_allclose(result.T_world_lidar[result.keyframe_scans], result.keyframe_poses, atol=1e-9)
+    steps = log(inverse(result.T_world_lidar[:-1]) @ result.T_world_lidar[1:])
+    as_estimated = log(inverse(walk.estimate[:-1]) @ walk.estimate[1:])
+    assert np.linalg.norm((steps - as_estimated)[:, 3:], axis=1).max() < 0.04  # spread over the way, no jump
+
+
 def test_the_map_is_drawn_where_the_scans_have_gone(walk, closed):
     graph, result = closed
     true = cKDTree(np.concatenate([transform_points(T, p) for T, p in zip(walk.truth, walk.points, strict=True)]))
@@ -221,6 +229,10 @@ def test_the_map_is_drawn_where_the_scans_have_gone(walk, closed):
     uncorrected = replace(result, keyframe_poses=walk.estimate[result.keyframe_scans])
     off = true.query(graph.draw_map(uncorrected, VOXEL_M).points())[0]
     assert np.percentile(drawn, 90.0) < 0.5 * np.percentile(off, 90.0)
+
+
+def loops_of(result: Corrected) -> list[RelativePose]:
+    return [edge for edge in result.edges if isinstance(edge, LoopClosure)]
 
 
 @pytest.fixture(scope="module")
@@ -265,6 +277,14 @@ def test_a_local_map_that_is_right_is_left_alone(walk):
     assert sum(result.inliers) >= 2
     assert walk.errors_m(result.T_world_lidar).max() < 0.01
     graph.close()
+
+
+def test_edges_are_of_trajectory_odometry_and_loops(closed):
+    _, result = closed
+    keyframes = len(result.keyframe_scans)
+    assert len(loops_of(result)) == sum(result.inliers)
+    assert len(result.edges) - len(loops_of(result)) == 2 * (keyframes - 1)
+    assert 20 < keyframes < 120
 
 
 def test_where_tracking_was_lost_the_edge_is_weak_and_no_keyframe_is_made(walk):

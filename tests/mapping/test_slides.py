@@ -69,6 +69,14 @@ def found(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> tuple[Contr
     return find_contradictions(check(scans, T_world_lidar).tests, T_world_lidar)
 
 
+def test_normals_are_those_of_the_walls(room):
+    points = room.sweep(lambda times: np.tile(np.eye(4), (len(times), 1, 1)), 0.1).points
+    surfels = Surfels.of(points)
+    on_wall = np.abs(np.abs(surfels.points[:, 0]) - 7.0) < 0.01
+    assert np.count_nonzero(on_wall) > 50
+    assert np.quantile(-surfels.normals[on_wall, 0] * np.sign(surfels.points[on_wall, 0]), 0.1) > 0.99
+
+
 @pytest.mark.parametrize("shift_m", [0.0, -1.3, 20.0])
 def test_the_profile_peaks_at_the_shift(scans, shift_m):
     first, second = Surfels.of(scans[0]), Surfels.of(scans[10])

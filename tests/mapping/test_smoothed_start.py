@@ -43,3 +43,16 @@ def test_motions_of_a_sensor_without_rings_are_true(strokes):
 def test_registration_in_order_suffices_where_a_sweep_makes_a_map():
     scans, _ = walk("os0-64", 40, 10)
     assert smoothed_start(iter(scans), MappingConfig()) == {}
+
+
+@pytest.mark.slow  # registers forty scans of a Mid-360
+def test_nothing_is_smoothed_across_another_place(strokes):
+    scans, _ = strokes
+    elsewhere, _ = walk("mid-360", 40, name="tunnel")
+    assert smoothed_start(scans[:12] + elsewhere[12:], MappingConfig()) == {}
+
+
+def test_too_few_scans_are_left_as_they_are(strokes):
+    scans, _ = strokes
+    assert smoothed_start(scans[:5], MappingConfig()) == {}
+    assert smoothed_start([], MappingConfig()) == {}

@@ -134,6 +134,14 @@ def test_samples_of_cells_are_seen_from_where_their_points_were(rng):
     assert other.surfels(other.find(samples))[:, NORMAL][:, 0].max() < -0.99
 
 
+def test_neighbours_count_less_than_the_cell_itself():
+    """Two points beside one another in neighbouring cells: the surfel lies nearer to the cell's own."""
+    grid = grid_of(np.array([[0.25, 0.25, 0.25], [0.75, 0.25, 0.25]]))
+    surfel = grid.surfels(grid.find(np.array([[0.25, 0.25, 0.25]])))
+    np.testing.assert_allclose(surfel[:, MEAN], [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
+    np.testing.assert_allclose(surfel[:, COUNT], 1.8, rtol=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_line_has_its_direction(seed):
     rng = np.random.default_rng(seed)
@@ -163,6 +171,16 @@ def test_an_empty_cell_shows_the_nearest_around_it():
     np.testing.assert_array_equal(rows, grid.find(held)[distances.argmin(axis=1)])
     assert len(set(rows.tolist())) > 1
     assert (grid.find(np.array([[1.51, 0.25, 0.25], [1e4, 1e4, 1e4]])) == ABSENT).all()
+
+
+def test_means_are_those_of_the_cells_points(rng):
+    points = cloud(rng, 3_000) - 200.0
+    cells, inverse = np.unique(np.floor(points / CELL), axis=0, return_inverse=True)
+    expected = np.stack([np.bincount(inverse, points[:, k]) for k in range(3)], axis=1)
+    expected /= np.bincount(inverse)[:, None]
+    means = grid_of(points).means()
+    order, other = np.lexsort(np.floor(means / CELL).T), np.lexsort(cells.T)
+    np.testing.assert_allclose(means[order], expected[other], atol=1e-5)
 
 
 def test_what_is_near_stays_with_its_surfels_when_the_rest_is_forgotten(rng):

@@ -76,6 +76,15 @@ def test_coarse_grids_reach_farther(rng, first_level):
     assert len(local_map.match(beyond, make_transform(np.eye(3), [0.0, 0.0, 9.0]), first_level)) == 0
 
 
+def test_finer_grids_are_left_out_on_request(rng):
+    """Of floors half a coarse cell apart, fine cells show each, coarse ones something between."""
+    low, high = floor_points(rng, 30_000, z=-1.0), floor_points(rng, 5_000, z=-1.0 + 3.2 * CELL)
+    local_map = map_of(np.concatenate([low, high]))
+    asked = floor_points(rng, 200, half_size=2.0)
+    assert distances(asked, local_map.match(asked, HERE, 0)).max() < 1e-5
+    assert distances(asked, local_map.match(asked, HERE, len(LEVELS) - 1)).min() > 0.01
+
+
 @pytest.mark.parametrize(("elevation_deg", "z"), [(-4.0, None), (0.5, None), (8.0, None), (-5.7, -1.0)])
 def test_a_ring_bent_around_a_corner_or_on_the_ground_is_no_plane(elevation_deg, z):
     points = ring(elevation_deg, walls=(4.0, 5.0) if z is None else None, z=z)

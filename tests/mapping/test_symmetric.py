@@ -77,3 +77,10 @@ def test_vectors_of_simple_values_beside_repeated_ones(rng, spectrum, which):
     residual = np.einsum("nij,nj->ni", M, vectors) - spectrum[which] * vectors
     assert np.abs(residual).max() < 1e-7
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0])
+def test_where_every_direction_is_one_a_unit_vector_is_given(value):
+    M = value * np.eye(3)[None]
+    vectors = eigenvectors(entries(M), np.array([value]))
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=0.0, atol=1e-12)

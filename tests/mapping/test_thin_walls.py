@@ -1,14 +1,18 @@
 """Walls thinner than a cell: each side is matched by those who see it, wherever the cells' borders are."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.surfaces import Correspondences
 from lidarslam.mapping.surfels.grid import MEAN, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.hash_kernels import OTHER_SIDE
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.surfels.voxel_hash import key_cells
+from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005
@@ -120,6 +124,20 @@ def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng):
         np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
 
 
+def test_restored_it_goes_on_alike_to_the_last_bit(rng):
+    grid, near, far = grid_of_both_sides(rng, count=300)
+    restored = SurfelGrid(CELL)
+    restored.restore(Saved(deepcopy(grid.state())))
+    for other in (grid, restored):
+        for points, view in ((near, -1.0), (far, 1.0)):
+            other.insert(points + np.array([0.0, 0.4, 0.0]), np.zeros(300), np.tile([view, 0.0, 0.0], (300, 1)))
+    one, other_state = grid.state(), restored.state()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other_state[name])
+    for points, sensor in ((near, SENSORS[0]), (far, SENSORS[1])):
+        np.testing.assert_array_equal(grid.find(points, sensor), restored.find(points, sensor))
+
+
 def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng):
     grid, near, far = grid_of_both_sides(rng)
     before = [grid.surfels(grid.find(p, s)) for p, s in ((near, SENSORS[0]), (far, SENSORS[1]))]
@@ -145,3 +163,11 @@ def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng):
     np.testing.assert_allclose(surfels[:, NORMAL][:, 0], 1.0, atol=1e-3)
     grid.insert(far, np.zeros(count), np.tile([1.0, 0.0, 0.0], (count, 1)))
     assert len(grid) == len(cells)
+
+
+def test_the_other_side_of_the_farthest_cell_is_no_free_slot():
+    table, keys = VoxelHash(), point_keys(np.full((1, 3), 1e12), CELL) | OTHER_SIDE
+    table.insert(keys)
+    table.insert(keys)
+    assert len(table) == 1
+    assert table.find(keys).tolist() == [0]

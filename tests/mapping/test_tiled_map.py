@@ -138,6 +138,15 @@ def test_the_overview_has_no_more_points_than_it_may(views):
     assert drawn.tiled.brightest > 1.0
 
 
+def test_normals_of_many_points_are_those_of_few(monkeypatch):
+    built = walked(GlobalMap(VOXEL_M))
+    expected = built.cloud(left_out=np.arange(len(built.points())) % 5 == 0)
+    monkeypatch.setattr(module, "_MANY_POINTS", 1000)
+    found = built.cloud(left_out=np.arange(len(built.points())) % 5 == 0)
+    np.testing.assert_array_equal(found.points, expected.points)
+    assert np.mean(np.einsum("ij,ij->i", found.normals, expected.normals) > 1.0 - 1e-6) > 0.999
+
+
 def test_memory_is_bounded(tmp_path):
     built = GlobalMap(VOXEL_M, MOST, TileStore(tmp_path))
     for number in range(40):
@@ -147,6 +156,14 @@ def test_memory_is_bounded(tmp_path):
         assert len(built.points()) <= MOST
     assert not list(tmp_path.iterdir())  # the file has no name
     assert len(built._store) > len(built._store.tiles)  # some were visited again
+
+
+def test_a_map_that_just_fits_stays_in_one_piece(views):
+    size = len(walked(GlobalMap(VOXEL_M)).points())
+    fits, bursts = walked(GlobalMap(VOXEL_M, size)), walked(GlobalMap(VOXEL_M, size - 1))
+    assert fits.is_whole
+    assert not bursts.is_whole
+    assert drawn_map(fits, views, CONFIG).tiled is None
 
 
 def test_a_map_goes_on_with_the_tiles_on_disk(tmp_path, through_disk):

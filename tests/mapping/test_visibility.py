@@ -180,6 +180,26 @@ def _says(point: FloatArray, image: NDArray[np.float32]) -> int:
     return int(image[row, column] > 0.0 and len(seen) >= 6 and bool((seen > 0.0).all()))
 
 
+def test_a_view_keeps_the_nearest_of_each_pixel():
+    points = np.concatenate([at(a + 0.5, 1.0, e) for a in range(360) for e in (-15.0, 15.0)])
+    views = Views(every=1)
+    views.add(np.concatenate([points, at(45.3, 7.0), at(45.7, 6.0), at(45.4, 8.0), [[0.0, 0.0, 0.0]]]), 0)
+    (image,) = views.placed(np.eye(4)[None]).images
+    assert image[8, 45] == 6.0
+    assert (image[[0, 15]] == 1.0).all()
+    assert np.count_nonzero(image) == 2 * COLUMNS + 1
+
+
+def test_of_many_points_a_part_is_enough_and_has_all_lasers_in_it():
+    """128 lasers, column by column, as many sensors send them."""
+    elevations, azimuths = np.meshgrid(np.linspace(-15.0, 15.0, 128), np.arange(1024) * (360.0 / 1024))
+    points = np.concatenate([at(a, 5.0, e) for a, e in zip(azimuths.ravel(), elevations.ravel(), strict=True)])
+    views = Views(every=1)
+    views.add(points, 0)
+    (image,) = views.placed(np.eye(4)[None]).images
+    np.testing.assert_allclose(image, 5.0, rtol=1e-3)
+
+
 def test_views_are_of_every_second_scan_and_where_these_are_in_the_end():
     views, poses = Views(), exp(np.arange(30.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
     for number in range(1, 30, 2):  # every second scan belongs in the map

@@ -15,6 +15,7 @@ from lidarslam.odometry.alignment.alignment import (
     InitialEstimate,
     align,
     align_best,
+    try_instead,
 )
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
@@ -131,6 +132,16 @@ def test_empty_images_move_nothing(box_room, empty):
     assert not found.information.any()
 
 
+def test_what_leaves_the_elevations_takes_no_part(box_room):
+    """Pitched by 20 degrees a third of the points fall above or below the other image; the rest are right."""
+    twist = (0.0, math.radians(200.0), 0.0, 0.0, 0.0, 0.0)
+    sweeps = box_room.sweeps(2, twist, rolling=False)
+    found = one_on_the_other(sweeps, moved(twist, (0.0, 0.01, 0.0, 0.01, 0.0, 0.0)))
+    assert_close(found.T_prev_curr, moved(twist), 0.01, 1e-3)
+    assert 0.5 < found.inlier_share < 0.85
+    assert found.residual_m < 2e-3
+
+
 def speeding_up(times: FloatArray) -> FloatArray:
     """Poses on a turn and a way ahead that grow evenly, from rest at 0.1 s before the middle of the first sweep."""
     half = 0.5 * (times + 0.1) ** 2
@@ -236,6 +247,13 @@ def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m,
     information = np.eye(6) / sigma_m**2
     searched = best_of(street, REST, information=information)
     assert (wrong_by_m(searched) < 0.02) == (searched.explained > DOUBTFUL) == found
+
+
+def test_the_best_of_many_guesses_is_found_roughly(street):
+    guesses = [ahead(0.1 * x) for x in (-20, -10, 0, 13, 25)]
+    found = try_instead(one_on_the_other(street, REST), guesses, second_on_first(street), FINE)
+    assert found is not None
+    assert wrong_by_m(found) < 0.02
 
 
 def test_the_less_likely_a_guess_the_more_it_must_explain(street, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
-from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, _shift_scores
+from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, _peaks, _shift_scores
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 from lidarslam.odometry.network.networks import CorrelationNetwork
 from lidarslam.odometry.network.shipped import default_weights
@@ -105,3 +105,9 @@ def test_scores_that_are_no_numbers_give_no_motion():
     search = known(np.full((1, 180), np.nan, dtype=np.float32))
     candidates, _ = search.compare(search.describe(nothing, nothing), nothing, nothing)
     assert [candidate.is_motion() for candidate in candidates] == [False]
+
+
+def test_peaks_are_followed_down_to_the_least_probability():
+    scores = np.zeros((1, 180), dtype=np.float32)
+    scores[0, [10, 100, 140, 178, 2]] = [20.0, 19.0, 10.0, 18.0, 17.0]  # the last near the one across the seam
+    assert [int(left[0].argmax()) for left in _peaks(scores, 5, 6)] == [10, 100, 178]

@@ -1,5 +1,9 @@
 """Weights on disk: what is written comes back, and what is no such file is refused in one line."""
 
+import os
+import pickle
+from dataclasses import replace
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -16,6 +20,8 @@ from lidarslam.odometry.network.checkpoint import (
     write_tensor_file,
 )
 from lidarslam.odometry.network.networks import make_network
+
+BIAS = "columns.layers.8.bias"
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +44,28 @@ def test_what_is_saved_comes_back(trained, tmp_path):
     assert torch.equal(one, other)
 
 
+class Malicious:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, trace):
+        self.trace = trace
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.trace),)
+
+
+@pytest.mark.parametrize("how", ["pickle", "archive"])
+def test_a_pickle_is_refused_unopened(how, tmp_path):
+    path, trace = tmp_path / "weights.pt", tmp_path / "trace"
+    if how == "pickle":
+        path.write_bytes(pickle.dumps(Malicious(trace)))
+    else:
+        torch.save({"weight": Malicious(trace)}, path)
+    with pytest.raises(InputError, match="is no safetensors file"):
+        load_checkpoint(path)
+    assert not trace.exists()
+
+
 @pytest.mark.parametrize(
     ("make", "told"),
     [
@@ -57,5 +85,21 @@ def test_what_is_saved_comes_back(trained, tmp_path):
 )
 def test_other_files_kinds_and_versions_are_told(trained, tmp_path, make, told):
     make(tmp_path / "weights.safetensors", trained.weights)
+    with pytest.raises(InputError, match=told):
+        load_checkpoint(tmp_path / "weights.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({BIAS: None}, r"Missing key.*columns\.layers\.8\.bias"),
+        ({BIAS: torch.zeros(5)}, r"size mismatch for columns\.layers\.8\.bias"),
+        ({BIAS: torch.full((32,), torch.nan)}, r"columns\.layers\.8\.bias is torch.float32, or not finite"),
+        ({"surplus": torch.zeros(1)}, r"Unexpected key.*surplus"),
+    ],
+)
+def test_weights_that_do_not_fit_are_told(trained, tmp_path, changed, told):
+    weights = {name: value for name, value in {**trained.weights, **changed}.items() if value is not None}
+    save_checkpoint(tmp_path / "weights.safetensors", replace(trained, weights=weights))
     with pytest.raises(InputError, match=told):
         load_checkpoint(tmp_path / "weights.safetensors")

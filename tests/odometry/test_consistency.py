@@ -65,3 +65,8 @@ def test_distances_to_planes_are_exact():
     distances, facing = plane_distances(queries, plane)
     np.testing.assert_allclose(distances, [0.3, 0.05], atol=1e-12)
     np.testing.assert_array_equal(facing, [2, 2])
+
+
+def test_a_cloud_without_planes_gives_no_distance(rng):
+    distances, _ = plane_distances(rng.uniform(-1.0, 1.0, (50, 3)), rng.uniform(-1.0, 1.0, (500, 3)))
+    assert np.isnan(distances).mean() > 0.5

@@ -14,7 +14,7 @@ from lidarslam.odometry.network.torch_geometry import inverse, rotate, skew, tra
 from lidarslam.odometry.training import losses as module
 from lidarslam.odometry.training.config import LossConfig, TrainingConfig
 from lidarslam.odometry.training.losses import Objective, Surfaces, geometric_loss, nearest, objective
-from lidarslam.odometry.training.pairs import PairBatch, pair_of
+from lidarslam.odometry.training.pairs import PairBatch, pair_of, stack
 
 EYE = torch.eye(4, dtype=torch.float64)[None]
 XI = torch.tensor([0.03, -0.04, 0.05, 0.12, -0.1, 0.08], dtype=torch.float64)
@@ -154,6 +154,7 @@ def test_the_nearest_of_the_valid_is_found(max_distances, offset, monkeypatch):
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 WIDTH = 24
 ALIGNMENT_ONLY, GEOMETRY_ONLY = TrainingConfig(geometric=None), TrainingConfig(alignment_weight=0.0)
+PARTS = ("alignment", "confidence", "turn", "point_to_plane", "plane_to_plane")
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +196,19 @@ def test_errors_cost_their_square_and_then_their_size(rotation_deg, translation_
     parts = loss(estimate_of(off(rotation_deg, translation_m) @ T, log_sigma=5.0), batch_of(T))
     assert float(parts.alignment) == pytest.approx(cost, rel=1e-3, abs=1e-6)
     assert float(parts.confidence) == pytest.approx(30.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("config", "off_parts"),
+    [
+        (ALIGNMENT_ONLY, ("point_to_plane", "plane_to_plane")),
+        (GEOMETRY_ONLY, ("alignment", "confidence", "turn")),
+    ],
+)
+def test_parts_are_switched_off(pair, config, off_parts):
+    parts = loss(estimate_of(off(2.0, 0.1) @ pair.T_prev_curr), pair, config)
+    for name in PARTS:
+        assert (float(getattr(parts, name)) == 0.0) == (name in off_parts)
 
 
 def test_what_is_not_valid_does_not_count():
@@ -292,3 +306,12 @@ def test_geometry_is_best_at_the_truth(pair, change):
     # Surfaces are compared, not what the network sees.
     blind = replace(pair, scans=torch.zeros_like(pair.scans))
     assert torch.equal(loss(estimate_of(change @ pair.T_prev_curr), blind, GEOMETRY_ONLY).total, beside.total)
+
+
+def test_geometry_looks_at_pairs_that_are_valid(pair, monkeypatch):
+    """Where alignment failed, the compensation that surfaces rest on is a guess."""
+    T = torch.cat([off(0.0, 0.03) @ pair.T_prev_curr, off(0.0, 0.2) @ pair.T_prev_curr])
+    both = replace(stack([pair, pair]), valid=torch.tensor([True, False]))
+    monkeypatch.setattr(module, "_GEOMETRIC_POINTS", 16 * 96)
+    some, one = loss(estimate_of(T), both, GEOMETRY_ONLY), loss(estimate_of(T[:1]), pair, GEOMETRY_ONLY)
+    torch.testing.assert_close(list(some), list(one))

@@ -120,6 +120,18 @@ def test_sparse_rows_on_the_ground_get_a_normal_at_the_second_try():
     assert errors_deg(both, Z).max() < 0.1
 
 
+def test_empty_pixels_have_no_normals_and_too_few_neighbours_neither():
+    image = image_of(rays(), room(rays())[0])
+    lost = np.random.default_rng(0).random((ROWS, COLUMNS)) < 0.7
+    image[:, lost] = 0.0
+    normals = surface_normals(image, PATCHES[:1])
+    assert not normals[:, lost].any()
+    around = [np.roll(~lost, (down, across), (0, 1)) for down in (-1, 0, 1) for across in range(-4, 5)]
+    few = np.sum(around, axis=0)[1:-1] < PATCHES[0].min_neighbours
+    assert not there(normals)[1:-1][few].any()
+    assert normals.any()
+
+
 @pytest.mark.parametrize(("distance_m", "least", "most"), [(1.0, 0.0, 0.0), (8.0, 0.8, 1.0)])
 def test_a_patch_as_narrow_as_the_noise_of_ranges_is_no_surface(distance_m, least, most):
     """A wall beside a sensor with 64 rings: at 1 m, pixels lie 1 cm apart and scatter by as much along their rays."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lidarslam.core import geometry
-from lidarslam.odometry.network.torch_geometry import rotate, transform_points
+from lidarslam.odometry.network.torch_geometry import log, rotate, transform_points
 from lidarslam.odometry.training.pairs import Augmentation, PairBatch, Pairs, augmented, pair_of, reversed_pair, stack
 from lidarslam.odometry.training.preparation import PreparedRecording
 
@@ -134,6 +134,14 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
         torch.testing.assert_close(cosine.mean(), expected[1].mean(), rtol=0, atol=1e-3)
         wrong = replace(batch, T_prev_curr=exp(0.0, 0.0, 1e-3, 0.0, 0.0, 0.0).float() @ batch.T_prev_curr)
         assert (fit(wrong, item)[0] - expected[0]).abs().max() > 1e-5
+
+
+@pytest.mark.parametrize("change", ["mirror", "reverse"])
+def test_half_of_the_pairs_turn_the_other_way_round(recording, change):
+    batch = Pairs([recording], 0, surfaces=False, augmentation=only(**{change: 0.5})).batch(0, 40)
+    yaw = log(batch.T_prev_curr)[:, 2]
+    torch.testing.assert_close(yaw.abs(), yaw[0].abs().expand(40), rtol=0, atol=2e-3)
+    assert 10 < int((yaw < 0.0).sum()) < 30
 
 
 @pytest.mark.parametrize("name", WORN)

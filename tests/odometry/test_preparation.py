@@ -62,3 +62,10 @@ def test_one_bad_scan_does_not_lose_those_after_it(box_room, kind):
     rotation_deg, translation_m = (error[recording.valid] for error in errors(recording, TURNING))
     assert rotation_deg.max() < 0.15
     assert translation_m.max() < 0.006
+
+
+def test_scans_at_one_time_do_not_move_infinitely_fast(box_room):
+    scan = box_room.scans(1, SLOW)[0]
+    recording = prepare([scan, scan], CONFIG)
+    assert recording.interval_s > 0.0
+    assert recording.T_prev_curr.isfinite().all()

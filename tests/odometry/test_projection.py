@@ -61,6 +61,17 @@ def test_every_pixel_holds_the_nearest_of_a_dense_cloud():
     np.testing.assert_allclose(project(points).image[3], expected, rtol=1e-6)
 
 
+def test_images_and_index_agree():
+    points = random_cloud(400).astype(np.float32)
+    found = project(points)
+    filled = found.index >= 0
+    assert 100 < filled.sum() < GRID.rows * GRID.columns - 100
+    chosen = points[found.index[filled]]
+    np.testing.assert_array_equal(found.image[:3, filled].T, chosen)
+    np.testing.assert_allclose(found.image[3, filled], np.linalg.norm(chosen, axis=1), rtol=1e-6)
+    assert not found.image[:, ~filled].any()
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("shift", [1, 30, -7])
 def test_a_turn_by_columns_rolls_the_image(shift, dtype):

@@ -43,6 +43,12 @@ def test_gradients_are_right(angle):
     assert torch.autograd.gradcheck(tg.inverse, (T,))
 
 
+def test_gradients_at_exact_zero():
+    xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
+    jacobian = torch.autograd.functional.jacobian(lambda x: tg.log(exp(x))[0], xi)[:, 0]
+    torch.testing.assert_close(jacobian, torch.eye(6, dtype=torch.float64))
+
+
 def test_inverse_points_and_turns_agree_with_core():
     xi = np.concatenate([_tangents(angle, 1) for angle in ANGLES])
     T, points = geometry.exp(xi), np.random.default_rng(0).normal(size=(len(xi), 5, 3))
@@ -62,3 +68,11 @@ def test_quaternions_agree_with_scipy_and_are_normalised_each_on_its_own():
     back = tg.quaternion_from_rotation(R).numpy()
     unit = q * np.sign(q[:, :1]) / np.linalg.norm(q, axis=1, keepdims=True)
     np.testing.assert_allclose(back, unit, atol=1e-14)
+
+
+def test_quaternion_of_length_zero_is_the_identity_with_a_finite_gradient():
+    q = torch.zeros(1, 4, requires_grad=True)
+    R = tg.rotation_from_quaternion(q)
+    torch.testing.assert_close(R[0], torch.eye(3))
+    (grad,) = torch.autograd.grad(R.sum(), q)
+    assert grad.isfinite().all()

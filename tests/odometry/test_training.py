@@ -13,7 +13,7 @@ from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.losses import objective
 from lidarslam.odometry.training.pairs import birds, pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.training import learning_rate, make_optimizer, validate
+from lidarslam.odometry.training.training import learning_rate, make_optimizer, summarise, validate
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 
@@ -93,6 +93,14 @@ def test_validation_tells_known_errors(small_room):
     assert found.covered_percent == pytest.approx([100.0 * (20 + n) / 30 for n in (1 + 2, 2 + 4, 3 + 5)])
 
 
+def test_validation_is_over_all_recordings(small_room):
+    recordings = [numbered(6, small_room), numbered(20, small_room), numbered(2, small_room)]
+    found = validate(Stub(known_errors(20), 0.0), recordings)
+    assert found.pairs == 5 + 19 + 1
+    squares = sum(n * n for n in range(1, 6)) + sum(n * n for n in range(1, 20)) + 1
+    assert found.rotation_rms_deg == pytest.approx(math.sqrt(squares / 25.0), rel=1e-4)
+
+
 def test_without_a_valid_pair_there_is_no_number(small_room):
     doubted = replace(numbered(3, small_room), valid=torch.zeros(2, dtype=torch.bool))
     for recordings in ([doubted], []):
@@ -100,3 +108,10 @@ def test_without_a_valid_pair_there_is_no_number(small_room):
         assert found.pairs == 0
         assert math.isnan(found.rotation_rms_deg)
         assert all(math.isnan(share) for share in found.covered_percent)
+
+
+def test_coverage_of_a_normal_distribution():
+    g = torch.Generator().manual_seed(0)
+    sigmas = torch.rand(20_000, 6, generator=g) + 0.1
+    found = summarise(torch.randn(20_000, 6, generator=g) * sigmas, sigmas)
+    assert found.covered_percent == pytest.approx((68.27, 95.45, 99.73), abs=0.3)

@@ -56,6 +56,14 @@ def test_a_scan_ends_above_the_ground_within_the_grass(simulation):
     np.testing.assert_array_equal(simulation.scan(30).scan.points, sweep.scan.points)
 
 
+def test_walls_stand_before_grass(simulation, yard):
+    bare = replace(simulation, world=replace(yard, movers=()))
+    grown, mown = simulation.scan(10), bare.scan(10)
+    walls, behind = ({tuple(point) for point in one.scan.points if point[2] > 0.0} for one in (mown, grown))
+    assert len(walls) > 1000
+    assert len(walls & behind) > 0.98 * len(walls)  # which ones are lost is drawn anew
+
+
 def test_the_reference_map_is_of_the_ground(simulation, yard):
     bare = replace(simulation, world=replace(yard, movers=()))
     np.testing.assert_array_equal(reference_map(simulation, step=25).points, reference_map(bare, step=25).points)

@@ -12,6 +12,7 @@ from lidarslam.simulation.mesh import (
     cylinder_mesh,
     height_field_mesh,
     meet_boxes,
+    world_mesh,
 )
 from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World
 
@@ -89,6 +90,17 @@ def test_height_field_is_the_surface_of_height_at(field, rng):
     np.testing.assert_allclose(normals_of(mesh)[:, 2], field.cell_m**2)  # it faces up and covers its grid once
 
 
+def test_world_mesh_holds_everything_that_stands(boxes, cylinders, field):
+    route = Route(np.eye(3), 1.0, 1.0, 2.0, 1.0)
+    world = World("any", 0, route, boxes, cylinders, (field, field))
+    mesh = world_mesh(world)
+    parts = [box_mesh(boxes), cylinder_mesh(cylinders), height_field_mesh(field), height_field_mesh(field)]
+    assert len(mesh.triangles) == sum(len(part.triangles) for part in parts)
+    corners = np.concatenate([part.vertices[part.triangles] for part in parts])
+    np.testing.assert_array_equal(mesh.vertices[mesh.triangles], corners)
+    assert mesh.triangles.dtype == np.int32
+
+
 ROUTE = Route(np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0]]), 1.0, 1.0, 3.0, 1.0)
 
 
@@ -145,3 +157,10 @@ def test_boxes_by_formula_agree_with_their_mesh(rng):
     both = met & ~grazing
     assert np.quantile(np.abs(distances[both] - hits.ranges[both]), 0.999) < 1e-4
     assert np.median(np.abs(normals - hits.normals)[both]) < 1e-5
+
+
+def test_rays_along_an_axis_meet_boxes():
+    box = Boxes(np.zeros((1, 3)), np.ones((1, 3)), np.eye(3)[None])
+    origins = np.array([[-5.0, 0.5, 0.5], [-5.0, 1.5, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    distances, _ = meet_boxes(box, origins, np.tile([1.0, 0.0, 0.0], (4, 1)))
+    np.testing.assert_array_equal(distances, [4.0, np.inf, np.inf, np.inf])  # the last starts inside

@@ -101,6 +101,20 @@ def test_same_request_same_bytes(tmp_path):
     assert (other / "scan_000000.ply").read_bytes() != (one / "scan_000000.ply").read_bytes()
 
 
+@pytest.mark.parametrize("name", ["kitti", "rosbag1"])
+def test_readme_says_how_it_was_made_and_what_to_type(name, tmp_path):
+    out = tmp_path / "hall"
+    summary = record(request(out, format=name, scans=1), silently)
+    text = (out / "README.md").read_text()
+    assert f"lidarslam simulate --out {out} --world hall --sensor vlp-16 --motion tracked --mount tilted" in text
+    assert f"--scans 1 --seed 4 --format {name}\n" in text
+    assert f"lidarslam run {summary.source}" in text
+    assert summary.source.exists()
+    for entry in out.iterdir():
+        if entry.suffix in (".tum", ".ply"):
+            assert entry.name in text
+
+
 def test_nothing_is_left_of_a_recording_that_failed(tmp_path):
     def interrupt(number, total):
         (partial,) = tmp_path.iterdir()
@@ -196,6 +210,13 @@ def test_a_speed_is_kept_and_written_down(tmp_path):
     text = (tmp_path / "a" / "README.md").read_text()
     assert "--motion car --speed 0.4 --mount" in text
     assert "car at 0.4 m/s" in text
+
+
+def test_a_car_follows_a_trajectory_on_the_ground(tmp_path, given, given_file):
+    along(tmp_path / "a", given_file, motion="car", scans=5, format="ply")
+    positions = open_recording(tmp_path / "a").ground_truth.positions
+    np.testing.assert_allclose(positions[:, :2], given.positions[:5, :2], atol=1e-6)
+    np.testing.assert_allclose(positions[:, 2], 1.73, atol=1e-3)
 
 
 def test_kitti_pose_files_are_those_of_a_camera(tmp_path, given):

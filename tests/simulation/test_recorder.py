@@ -100,6 +100,17 @@ def test_same_seed_same_bytes_in_any_order(simulation):
     assert not same_bytes(simulation.scan(9), replace(simulation, seed=6).scan(9))
 
 
+def test_is_a_scan_sequence(simulation):
+    assert len(simulation) == 300
+    assert "yard" in simulation.name
+    stamps = [scan.stamp for scan in simulation.scans(10, 20, 4)]
+    np.testing.assert_allclose(stamps, [1.0, 1.4, 1.8])
+    truth = simulation.ground_truth
+    assert len(truth) == 300
+    np.testing.assert_allclose(truth.T_world_lidar[10:20:4], simulation.T_world_lidar_at(np.array(stamps)), atol=1e-12)
+    assert next(simulation.scans(299)).stamp == pytest.approx(29.9)
+
+
 def test_dropouts_happen_at_their_rate():
     n = 100_000
     measured = measure(NOISY, np.full(n, 10.0), np.ones(n), np.full(n, 0.8), np.random.default_rng([1, 2]))

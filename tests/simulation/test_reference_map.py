@@ -71,6 +71,12 @@ def test_the_far_side_of_a_wall_stays_out():
     np.testing.assert_allclose(normals, np.tile([1.0, 0.0, 0.0], (len(normals), 1)), atol=1e-12)
 
 
+def test_normals_are_of_the_side_that_was_seen():
+    seen, _ = see(ALL, ALL, [0.0], from_behind=True)  # a ceiling
+    normals = sample_seen(SQUARE, seen, spacing_m=0.2).normals
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, -1.0], (len(normals), 1)), atol=1e-12)
+
+
 def test_the_map_covers_the_scans(recording, yard_map):
     sweep = recording.scan(80)
     T = recording.T_world_lidar_at(sweep.scan.stamp + sweep.scan.time_offsets)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lidarslam.core.geometry import is_rigid
 from lidarslam.simulation.world import Boxes, HeightField, Mover
 
 UNIT_BOX = Boxes(np.zeros((1, 3)), np.ones((1, 3)), np.eye(3)[None])
@@ -33,6 +34,15 @@ def test_a_mover_comes_back_after_a_round(mover):
     period = np.linalg.norm(steps, axis=1).sum() / mover.speed_mps
     times = np.linspace(0.0, period, 50)
     np.testing.assert_allclose(mover.pose_at(times + 3.0 * period), mover.pose_at(times), atol=1e-9)
+
+
+def test_a_mover_is_never_in_two_places(mover):
+    times = np.linspace(0.0, 40.0, 40001)
+    poses = mover.pose_at(times)
+    assert is_rigid(poses)
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps.max() <= mover.speed_mps * 0.001 * (1.0 + 1e-6)
+    np.testing.assert_allclose(np.median(steps), mover.speed_mps * 0.001)
 
 
 def test_a_mover_looks_where_it_goes(mover):

@@ -159,6 +159,18 @@ def test_a_scan_without_points(name, driver, tmp_path, sweeps, drive):
     assert [len(scan) for scan in recording.scans()] == [len(sweeps[0].scan), 0, len(sweeps[2].scan)]
 
 
+def test_ply(tmp_path, sweeps, rig):
+    recording = write("ply", tmp_path / "room", sweeps, rig)
+    for scan, simulated in zip(recording.scans(), sweeps, strict=True):
+        assert_same(scan, simulated.scan)
+        np.testing.assert_allclose(scan.time_offsets, simulated.scan.time_offsets, rtol=0.0, atol=0.51e-9)
+    info = recording.describe()
+    assert [f"{field.name} {field.type_name}" for field in info.fields] == [
+        "x float32", "y float32", "z float32", "intensity float32", "t uint32", "ring uint16",
+    ]  # fmt: skip
+    assert (info.point_time.unit, info.point_time.reference) == ("ns", "relative")
+
+
 def test_kitti_scans_are_compensated_exactly(tmp_path, sweeps, rig, room):
     recording = write("kitti", tmp_path / "drive", sweeps, rig)
     assert len(recording) == len(sweeps)
