@@ -37,6 +37,13 @@ def lidarslam(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
+def succeeds(*arguments: object) -> str:
+    """What a command says that ends with exit status 0."""
+    result = lidarslam(*arguments)
+    assert result.exit_code == 0, result.output
+    return str(result.output)
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     """A seeded source of random numbers."""

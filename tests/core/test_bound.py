@@ -80,10 +80,3 @@ def test_a_process_and_its_children_end_with_the_context(still_runs: Callable[[i
         with bound(process):
             family = [int(word) for word in process.stdout.readline().split()]
     assert not [one for one in family if still_runs(one)]
-
-
-def test_one_that_has_ended_is_no_error() -> None:
-    with subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], start_new_session=True) as process:
-        with bound(process):
-            process.wait()
-        assert process.returncode == 3

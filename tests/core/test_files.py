@@ -8,7 +8,7 @@ import pytest
 
 from lidarslam.core import files as module
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import bounded_lines, make_directory, only_writer, remove_partial_files, replacing
+from lidarslam.core.files import bounded_lines, only_writer, remove_partial_files, replacing
 
 
 def names(path: Path) -> list[str]:
@@ -44,14 +44,6 @@ def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("whole")
     remove_partial_files(tmp_path)
     assert names(tmp_path) == ["file"]
-
-
-def test_a_directory_is_made_with_its_parents(tmp_path: Path) -> None:
-    make_directory(tmp_path / "a" / "b")
-    assert names(tmp_path / "a" / "b") == []
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="a file is in the way"):
-        make_directory(tmp_path / "file")
 
 
 def test_a_directory_has_one_writer(tmp_path: Path) -> None:

@@ -60,13 +60,6 @@ def test_exp_is_the_matrix_exponential_at_the_ends(angle):
 
 @given(tangents, tangents)
 @quick
-def test_exp_is_rigid_and_composes(xi, other):
-    T_a_b, T_b_c = g.exp(xi), g.exp(other)
-    assert g.is_rigid(T_a_b @ T_b_c, 1e-12)
-
-
-@given(tangents, tangents)
-@quick
 def test_conjugation_moves_the_tangent_vector_by_the_adjoint(xi, other):
     T = g.exp(other)
     np.testing.assert_allclose(T @ g.exp(xi) @ g.inverse(T), g.exp(g.adjoint(T) @ xi), atol=1e-10)

@@ -8,9 +8,6 @@ import pytest
 from lidarslam.core.scan import PointAttributes, Scan
 
 INVALID = [[np.nan, 1, 1], [1, np.inf, 1], [1, 1, -np.inf], [0, 0, 0], [1e30, 1, 1], [1, -1e30, 1]]
-SOME = PointAttributes(
-    intensity=np.array([1.0, np.nan, 3.0], dtype=np.float32), rgb=np.arange(9, dtype=np.uint8).reshape(3, 3)
-)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -136,19 +133,6 @@ def test_attributes_are_those_that_are_wanted_and_there():
     assert not list(scan.attributes([]).present())
     untimed = Scan.from_raw(np.ones((2, 3)), 5.0).attributes(["time"])
     assert untimed.time.tolist() == [5.0, 5.0]
-
-
-@pytest.mark.parametrize("chosen", [np.array([True, False, True]), np.array([0, 2])], ids=["mask", "indices"])
-def test_attributes_are_selected_together(chosen):
-    part = SOME.select(chosen)
-    assert part.intensity.tolist() == [1.0, 3.0]
-    assert part.rgb.tolist() == [[0, 1, 2], [6, 7, 8]]
-    assert part.ring is part.time is None
-
-
-def test_attributes_are_chosen_by_name():
-    assert [name for name, _ in SOME.present()] == ["intensity", "rgb"]
-    assert [name for name, _ in SOME.only(["rgb", "time"]).present()] == ["rgb"]
 
 
 def test_the_construction_of_attributes_is_checked():

@@ -81,17 +81,6 @@ def test_another_world_changes_no_motion(random_trajectory):
     assert moved.length_m == pytest.approx(trajectory.length_m)
 
 
-def test_select_takes_masks_indices_and_slices(random_trajectory):
-    trajectory = random_trajectory(6)
-    mask = np.array([True, False, True, False, True, False])
-    for chosen in (mask, np.array([0, 2, 4]), slice(None, None, 2)):
-        part = trajectory.select(chosen)
-        np.testing.assert_array_equal(part.stamps, trajectory.stamps[::2])
-        np.testing.assert_array_equal(part.T_world_lidar, trajectory.T_world_lidar[::2])
-    with pytest.raises(ValueError, match="must increase"):
-        trajectory.select(np.array([2, 0]))
-
-
 def test_interpolation_is_exact_for_constant_body_velocity():
     trajectory = moving([0.0, 0.1, 0.35, 0.4, 1.0])
     stamps = np.array([0.72, 0.0, 0.05, 1.0, 0.1, 0.39])
@@ -190,13 +179,6 @@ def test_tum_dialects(text, written):
 def test_what_is_wrong_with_a_tum_file(text, words, written):
     with pytest.raises(InputError, match=words):
         read_tum(written(text))
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.tum: cannot be read"):
-        read_tum(tmp_path / "absent.tum")
-    with pytest.raises(InputError, match=r"absent\.txt: cannot be read"):
-        read_kitti_poses(tmp_path / "absent.txt")
 
 
 def test_rounded_kitti_rotations_are_mended(written, random_trajectory):

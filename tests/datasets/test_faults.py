@@ -36,12 +36,6 @@ def test_kinds_are_counted_and_the_first_of_each_is_remembered():
     assert faults.warnings() == ("2 scans have a fault; the first: a", "2 scans were left out: why; the first: b")
 
 
-def test_one_scan_is_singular():
-    faults = Faults()
-    faults.unreadable(InputError("x"))
-    assert faults.warnings() == ("1 scan was left out: it could not be read; the first: x",)
-
-
 def test_unreadable_scans_are_left_out_where_they_are_counted_and_raised_elsewhere():
     faults = Faults()
     assert [scan.stamp for scan in Odd([0, 1, 2, 3, 4]).scans(faults=faults)] == [0.0, 2.0, 4.0]

@@ -154,22 +154,6 @@ def test_without_calibration_or_poses_there_is_no_truth(tmp_path, rng):
     assert any("calib.txt" in note for note in recording.describe().notes)
 
 
-def test_describe(tmp_path, rng):
-    _write_sequence(tmp_path, rng)
-    scan = tmp_path / "sequences" / "04" / "velodyne" / "000000.bin"
-    cloud = np.fromfile(scan, dtype=np.float32).reshape(-1, 4)
-    cloud[3, :3] = 0.0
-    cloud[5, 1] = np.nan
-    cloud.tofile(scan)
-    info = open_recording(tmp_path).describe()
-    assert (info.reader, info.scans, len(info.first), info.first.dropped) == ("kitti-odometry", 6, 48, 2)
-    assert info.duration_s == pytest.approx(5 * 0.1037, abs=1e-6)
-    assert info.rate_hz == pytest.approx(1 / 0.1037, rel=1e-4)
-    assert info.ground_truth == tmp_path / "poses" / "04.txt"
-    assert info.point_time is None
-    assert [field.name for field in info.fields] == ["x", "y", "z", "intensity"]
-
-
 def test_damaged_files_are_named(tmp_path, rng):
     _write_sequence(tmp_path, rng)
     folder = tmp_path / "sequences" / "04"

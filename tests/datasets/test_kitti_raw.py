@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.published.kitti_raw import oxts_poses
 from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
@@ -280,17 +279,6 @@ def test_damaged_and_foreign_files_are_named(tmp_path, rng):
     (extract / "velodyne_points" / "data" / "0000000000.txt").write_text("1 2 3 0.5\n")
     with pytest.raises(InputError, match=r"use the \.\.\._sync drive"):
         open_recording(extract)
-
-
-def test_mercator_metres_are_metres():
-    rows = np.zeros((2, 30))
-    rows[:, :2] = [[49.0, 8.4], [49.0 + 1e-4, 8.4 + 2e-4]]
-    rows[1, 5] = np.pi / 2
-    T = oxts_poses(rows)
-    step = T[1, :3, 3] - T[0, :3, 3]
-    expected = 6378137.0 * np.deg2rad([2e-4 * np.cos(np.deg2rad(49.0)), 1e-4])
-    np.testing.assert_allclose(step[:2], expected, rtol=1e-5)
-    np.testing.assert_allclose(T[1, :3, 0], [0.0, 1.0, 0.0], atol=1e-12)  # heading north
 
 
 def test_one_stray_stamp_costs_no_other():

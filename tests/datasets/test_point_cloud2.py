@@ -8,7 +8,6 @@ from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
 STAMP_NS = 1_700_000_000_250_000_000
-STAMP = STAMP_NS / 10**9
 
 
 def test_padded_rows_and_big_endian(driver, make_sweep, ros2_kit):

@@ -292,13 +292,6 @@ def test_stamps_that_do_not_increase_are_skipped_and_counted(ros2_kit, make_swee
     assert faults.left_out == 0
 
 
-def test_a_stamp_that_was_never_set_is_skipped(ros2_kit, make_sweep):
-    sweep = make_sweep("velodyne", STAMP_NS)
-    clouds = [(STAMP_NS + i, ros2_kit.cloud(sweep.records, ns)) for i, ns in enumerate([0, STAMP_NS])]
-    recording = open_recording(ros2_kit.write({"/points": clouds}))
-    assert [scan.stamp for scan in recording.scans()] == [STAMP_NS / 10**9]
-
-
 @pytest.mark.parametrize("reference", ["relative", "absolute"])
 @pytest.mark.parametrize("count", [25, 40])
 def test_simulated_time_from_zero(ros2_kit, reference, count):

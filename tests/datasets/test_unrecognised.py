@@ -60,14 +60,6 @@ def test_the_drives_of_a_date_are_named(tmp_path: Path) -> None:
     assert f"name {drives[0]} for its times" in open_recording(drives[0] / "velodyne_points" / "data").warnings[0]
 
 
-def test_a_folder_within_kittis_odometry_names_the_root(tmp_path: Path) -> None:
-    scans(tmp_path / "sequences" / "04" / "velodyne")
-    (tmp_path / "poses").mkdir()
-    write(tmp_path / "poses" / "04.txt")
-    for name in ("poses", "poses/04.txt", "sequences"):
-        assert f"lies in a recording (kitti-odometry); name that: {tmp_path}" in refused(tmp_path / name)
-
-
 def test_recordings_in_a_folder_are_named(tmp_path: Path) -> None:
     write(tmp_path / "bags" / "a.bag", tmp_path / "bags" / "b.bag")
     assert "holds 2 recordings (rosbag); name one: " in refused(tmp_path / "bags")

@@ -45,15 +45,11 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
             "odometry: {kiss_icp: {voxel_size: 1}}",
             "no odometry.kiss_icp.voxel_size; did you mean voxel_size_m?",
         ),
-        ("mapping: {tracking: {lost_belo: 0.3}}", "did you mean lost_below?"),
         (
             "odometry: {kiss_icp: {voxel_size_m: [1]}}",
             "voxel_size_m=[1]: input should be a valid number",
         ),
-        ("odometry: {kiss_icp: {voxel_size_m: .nan}}", "input should be a finite number"),
-        ("odometry: 3", "odometry=3: expected a section"),
         (LAUGHS + "mapping: *i\n", "mapping=["),
-        (LAUGHS + "odometry: {method: *i}\n", "and 5 more"),
         ("odometry: &a\n  kiss_icp: *a\n", "there is no odometry.kiss_icp.kiss_icp"),
         ("odometry: {kiss_icp: {voxel_size_m: '" + "x" * 100_000 + "'}}", "xxx...xxx"),
         ('"odo\\e[31m\\nmetry": 1', "there is no odo\\x1b[31m\\nmetry"),
@@ -179,8 +175,6 @@ def _edited(table: np.ndarray, name: str) -> str:
 
 BAD_TRAJECTORIES = {
     "NaN": "holds numbers that are no poses",
-    "no rotation": "holds numbers that are no poses",
-    "seven columns": "expected 8 numbers, got 7",
     "light years": "expected metres",
     "one pose": "two poses or more|one of them is too short",
     "one stamp": "two poses or more|one of them is too short",

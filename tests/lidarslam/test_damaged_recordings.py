@@ -22,6 +22,7 @@ from lidarslam.core.geometry import is_rigid
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_kitti_poses, read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
+from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE, header, point_cloud
 from lidarslam.storage.directory import UNFINISHED
 from lidarslam.storage.unfinished import About
 
@@ -188,31 +189,11 @@ def write_scan(path: Path, table: np.ndarray, how: str, seed: int) -> None:
 def write_bag(folder: Path, scans: list[tuple[int, str, np.ndarray]]) -> Path:
     """A bag of clouds: the stamp in ns, the sensor and the points of each."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    if folder.exists():
-        for path in folder.iterdir():
-            path.unlink()
-        folder.rmdir()
+    shutil.rmtree(folder, ignore_errors=True)
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
+        connection = writer.add_connection("/points", POINT_CLOUD2_TYPE, typestore=store)
         for index, (stamp_ns, frame_id, table) in enumerate(scans):
-            stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-            codes = {"f4": 7, "u2": 4, "f8": 8}
-            fields = [
-                types["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=codes[kind.str[1:]], count=1)
-                for name, (kind, offset) in table.dtype.fields.items()
-            ]
-            message = types["sensor_msgs/msg/PointCloud2"](
-                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id),
-                height=1,
-                width=len(table),
-                fields=fields,
-                is_bigendian=False,
-                point_step=table.dtype.itemsize,
-                row_step=table.nbytes,
-                data=np.frombuffer(table.tobytes(), np.uint8),
-                is_dense=True,
-            )
+            message = point_cloud(store, header(store, stamp_ns, frame_id), table)
             raw = store.serialize_cdr(message, message.__msgtype__)
             writer.write(connection, STAMP_NS + index * PERIOD_NS, bytes(raw))
     return folder
@@ -249,8 +230,7 @@ def usual_ns(index: int) -> int:
     return STAMP_NS + index * PERIOD_NS
 
 
-@pytest.mark.parametrize("stray_ns", [0, 5 * 10**9, STAMP_NS + YEAR_NS, STAMP_NS - YEAR_NS])
-@pytest.mark.parametrize("place", [0, 3])
+@pytest.mark.parametrize(("place", "stray_ns"), [(0, 0), (3, STAMP_NS + YEAR_NS)])
 def test_one_stray_stamp_costs_one_scan(tmp_path, tables, stray_ns, place):
     bag = write_bag(tmp_path / "drive", messages_at(tables, lambda i: stray_ns if i == place else usual_ns(i)))
     code, summary, _ = run(bag, asked=8)
@@ -276,23 +256,6 @@ def test_a_clock_set_back_for_good_ends_the_run_with_a_line_and_what_there_is(tm
     assert summary["scans"] == 14
 
 
-def test_scans_that_were_dropped_are_told_as_gaps(tmp_path, tables):
-    stamps = messages_at(tables, lambda i: usual_ns(i) + (20 * PERIOD_NS if i > 5 else 0))
-    _, summary, _ = run(write_bag(tmp_path / "drive", stamps), asked=8)
-    assert summary["scans"] == 8
-    assert any("1 gap in the stamps" in w and "2.1 s after scan 5" in w for w in summary["warnings"])
-
-
-def test_two_sensors_on_one_topic(tmp_path, tables):
-    scans = [(usual_ns(index), "front" if index % 2 else "rear", table) for index, table in enumerate(tables)]
-    bag = write_bag(tmp_path / "drive", scans)
-    _, summary, _ = run(bag, asked=8)
-    assert summary["scans"] == 4
-    assert any("another sensor than 'rear'; for that one set reader.frame_id" in w for w in summary["warnings"])
-    _, summary, _ = run(bag, "--set", "reader.frame_id=front", asked=8)
-    assert summary["scans"] == 4
-
-
 def write_folder(folder: Path, tables: list[np.ndarray]) -> Path:
     folder.mkdir(exist_ok=True)
     for index, table in enumerate(tables):
@@ -305,12 +268,6 @@ def test_no_fault_no_warning(tmp_path, tables):
     (folder / "timestamps.txt").write_text("".join(f"{0.1 * index:.1f}\n" for index in range(len(tables))))
     code, summary, said = run(folder, asked=8)
     assert (code, summary["warnings"], said) == (0, [], "")
-
-
-def test_millimetres_are_told(tmp_path, tables):
-    folder = write_folder(tmp_path / "drive", [spoil(table, "millimetres") for table in tables])
-    _, summary, _ = run(folder)
-    assert any(w.startswith("8 scans look like centimetres or millimetres") for w in summary["warnings"])
 
 
 def test_scans_that_vanish_while_it_runs_are_counted(tmp_path, tables, monkeypatch):
@@ -351,22 +308,13 @@ def test_links_that_lead_nowhere_or_in_a_circle_are_counted(tmp_path, tables):
 
 def test_pipes_are_not_waited_for(tmp_path, tables):
     velodyne = tmp_path / "drive" / "velodyne"
-    velodyne.mkdir(parents=True)
-    for index, table in enumerate(tables):
-        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
-        points.astype("<f4").tofile(velodyne / f"{index:06d}.bin")
+    kitti_drive(tmp_path / "drive", tables)
     (velodyne / "000003.bin").unlink()
     os.mkfifo(velodyne / "000003.bin")
     (velodyne / "000004.bin").unlink()
     (velodyne / "000004.bin").mkdir()
     _, summary, _ = run(tmp_path / "drive", asked=8)
     assert (summary["scans"], left_out(summary)) == (6, 2)
-
-
-@pytest.mark.parametrize("name", ["räder 点 a b", "two  spaces", "'quoted' \"names\"", "%2e?#&;", "\u00ff latin"])
-def test_names_that_are_odd(tmp_path, tables, name):
-    code, summary, _ = run(write_folder(tmp_path / name, tables[:3]), asked=3)
-    assert (code, summary["scans"]) == (0, 3)
 
 
 def test_a_name_that_no_terminal_can_show(tmp_path, tables):
@@ -427,7 +375,7 @@ def kitti_drive(folder, tables):
 
 
 @pytest.mark.parametrize("name", ["calib.txt", "poses.txt", "times.txt"])
-@pytest.mark.parametrize("content", [None, b"", b"hello\n", b"\xff\xfe\x00", b"1 2 3\n", b"0.0\n0.1\n"])
+@pytest.mark.parametrize("content", [None, b"", b"\xff\xfe\x00", b"0.0\n0.1\n"])
 def test_kitti_files_missing_short_or_garbage(tmp_path, tables, name, content):
     folder, row = kitti_drive(tmp_path / "drive", tables[:4]), IDENTITY_ROW
     (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
@@ -460,7 +408,7 @@ def test_poses_of_which_some_are_missing_are_counted(tmp_path, tables):
         assert warnings.count("poses for the scans up to") == 1
 
 
-@pytest.mark.parametrize("stamp", ["1e300", "-1e300", "1e12", "123456789012345", "inf", "nan"])
+@pytest.mark.parametrize("stamp", ["-1e300", "123456789012345", "nan"])
 def test_stamps_beyond_all_time_are_told(tmp_path, tables, stamp):
     folder = write_folder(tmp_path / "drive", tables[:3])
     (folder / "times.txt").write_text(f"0.0\n0.1\n{stamp}\n")
@@ -469,7 +417,7 @@ def test_stamps_beyond_all_time_are_told(tmp_path, tables, stamp):
     assert f"expected one stamp a line, got '{stamp}' at line 3" in said
 
 
-@pytest.mark.parametrize("first", [-9e10, -1.0, 4.9e8, 2.5e9, 9e10])
+@pytest.mark.parametrize("first", [-9e10, 2.5e9])
 def test_stamps_of_any_clock_are_shown_and_run(tmp_path, tables, first):
     folder = write_folder(tmp_path / "drive", tables[:3])
     (folder / "times.txt").write_text("".join(f"{first + 0.1 * i:.3f}\n" for i in range(3)))

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.geometry import exp
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
+
+from ..conftest import lidarslam
 
 LOW_DEG, SCANS = 0.4, 36
 KEYS = ("elevation_bias_deg", "elevation_sigma_deg", "elevation_correction_deg")
@@ -38,7 +38,7 @@ def summary(source: Path, out: Path, *settings: str) -> dict[str, Any]:
     command = ["run", str(source), "--out", str(out), "--odometry", "constant-velocity"]
     for setting in settings:
         command += ["--set", setting]
-    result = CliRunner().invoke(main, command)
+    result = lidarslam(*command)
     assert result.exit_code == 0, result.output
     return json.loads((out / "summary.json").read_text())  # type: ignore[no-any-return]
 
@@ -63,14 +63,14 @@ def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
     # The run says what it used, and is still the one that was asked for.
     assert read_yaml(out / "config.yaml")["reader"]["elevation_correction_deg"] == correction_deg
     command = ["run", str(low), "--out", str(out), "--odometry", "constant-velocity", "--resume"]
-    again = CliRunner().invoke(main, [*command, "--set", "reader.elevation_correction_deg=auto"])
+    again = lidarslam(*command, "--set", "reader.elevation_correction_deg=auto")
     assert again.exit_code == 0, again.output
 
 
 def test_without_a_map_there_is_no_estimate(small_recording: Path, tmp_path: Path) -> None:
     command = ["run", str(small_recording), "--out", str(tmp_path / "run"), "--odometry", "kiss-icp", "--no-mapping"]
     pytest.importorskip("kiss_icp")
-    assert CliRunner().invoke(main, command).exit_code == 0
+    assert lidarslam(*command).exit_code == 0
     found = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert [found[key] for key in KEYS] == [None] * 3
 

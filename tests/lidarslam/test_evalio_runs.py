@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import lidarslam
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE, header, point_cloud, vector
+
+from ..conftest import succeeds
 
 SOURCE = "evalio:hilti_2022/basement_2"
 START_NS = 1_640_000_000 * 10**9
@@ -31,29 +32,14 @@ POINT = np.dtype(
         "itemsize": 48,
     }
 )
-DATATYPES = {"<f4": 7, "<f8": 8, "<u2": 4}
+IMU = "sensor_msgs/msg/Imu"
 
 
 def _write_bag(path: Path, room: Any, drive: Callable[[FloatArray], FloatArray]) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
-    packages = ("builtin_interfaces", "geometry_msgs", "sensor_msgs", "std_msgs")
-    wanted = {name: kind for name, kind in store.types.items() if name.startswith(packages)}
-    types = {name.rpartition("/")[2]: wanted[name] for name in sorted(wanted, reverse=True)}
-
-    def header(stamp_ns: int) -> Any:
-        stamp = types["Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        return types["Header"](seq=0, stamp=stamp, frame_id="PandarXT-32")
-
-    def vector(values: FloatArray) -> Any:
-        return types["Vector3"](x=values[0], y=values[1], z=values[2])
-
-    fields = [
-        types["PointField"](name=name, offset=offset, datatype=DATATYPES[kind.str], count=1)
-        for name, (kind, offset) in POINT.fields.items()
-    ]
     with Writer(path) as writer:
-        clouds = writer.add_connection("/hesai/pandar", "sensor_msgs/msg/PointCloud2", typestore=store)
-        imu = writer.add_connection("/alphasense/imu", "sensor_msgs/msg/Imu", typestore=store)
+        clouds = writer.add_connection("/hesai/pandar", POINT_CLOUD2_TYPE, typestore=store)
+        imu = writer.add_connection("/alphasense/imu", IMU, typestore=store)
         for index in range(SCANS):
             scan = room.ring_sweep(drive, 0.1 * index + 0.05)
             stamp_ns = START_NS + index * 10**8
@@ -61,25 +47,15 @@ def _write_bag(path: Path, room: Any, drive: Callable[[FloatArray], FloatArray])
             table["x"], table["y"], table["z"] = scan.points.T
             table["timestamp"] = stamp_ns * 1e-9 + scan.time_offsets + 0.05
             table["ring"] = scan.rings
-            cloud = types["PointCloud2"](
-                header=header(stamp_ns),
-                height=1,
-                width=len(scan),
-                fields=fields,
-                is_bigendian=False,
-                point_step=POINT.itemsize,
-                row_step=table.nbytes,
-                data=table.view(np.uint8),
-                is_dense=True,
-            )
+            cloud = point_cloud(store, header(store, stamp_ns, "PandarXT-32"), table)
             writer.write(clouds, stamp_ns, store.serialize_ros1(cloud, cloud.__msgtype__))
-            sample = types["Imu"](
-                header=header(stamp_ns),
-                orientation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+            sample = store.types[IMU](
+                header=cloud.header,
+                orientation=store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
                 orientation_covariance=np.zeros(9),
-                angular_velocity=vector(np.zeros(3)),
+                angular_velocity=vector(store, np.zeros(3)),
                 angular_velocity_covariance=np.zeros(9),
-                linear_acceleration=vector(np.array([0.0, 0.0, 9.81])),
+                linear_acceleration=vector(store, np.array([0.0, 0.0, 9.81])),
                 linear_acceleration_covariance=np.zeros(9),
             )
             writer.write(imu, stamp_ns, store.serialize_ros1(sample, sample.__msgtype__))
@@ -105,51 +81,29 @@ def sequence(
     return folder
 
 
-def _invoke(*arguments: str) -> str:
-    done = CliRunner().invoke(main, list(arguments))
-    assert done.exit_code == 0, done.output
-    return done.output
-
-
 @pytest.mark.long
 def test_run_and_what_follows_it(sequence: Path, tmp_path: Path) -> None:
-    _invoke("run", SOURCE, "--odometry", "kiss-icp", "--no-report")
+    succeeds("run", SOURCE, "--odometry", "kiss-icp", "--no-report")
     (run,) = (tmp_path / "runs").iterdir()
     assert run.name.startswith("hilti_2022_basement_2_")
     description = yaml.safe_load((run / "config.yaml").read_text())["run"]
     assert description["source"] == str(sequence)
-    _invoke("evaluate", str(run))
+    succeeds("evaluate", run)
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["association"]["matched"] == SCANS
     assert metrics["trajectory"]["ate_rmse_m"] < 0.03
-    _invoke("view", str(run), "--picture", "map.png")
+    succeeds("view", run, "--picture", "map.png")
     assert not (tmp_path / "evalio:hilti_2022").exists()
 
 
 def test_info_as_json(sequence: Path) -> None:
-    known = json.loads(_invoke("info", SOURCE, "--json"))
+    known = json.loads(succeeds("info", SOURCE, "--json"))
     assert (known["reader"], known["scans"], known["source"]) == ("evalio", SCANS, str(sequence))
     assert known["first_scan"]["has_rings"]
     assert known["point_time"]["last_s"] == pytest.approx(0.1, abs=1e-3)
-
-
-@pytest.mark.long
-def test_compare_names_folders_without_slashes(sequence: Path, tmp_path: Path) -> None:
-    _invoke("compare", SOURCE, "--methods", "kiss-icp", "--out", "compared")
-    assert (tmp_path / "compared" / "hilti_2022_basement_2" / "kiss-icp" / "trajectory.tum").is_file()
 
 
 def test_python_opens_the_name(sequence: Path) -> None:
     recording = lidarslam.open(SOURCE, stop=2)
     assert len(list(recording)) == len(recording) == 2
     assert recording.ground_truth is not None
-
-
-def test_what_is_missing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("evalio")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("EVALIO_DATA", raising=False)
-    done = CliRunner().invoke(main, ["run", SOURCE, "--out", "run"])
-    assert done.exit_code == 1
-    (line,) = done.output.strip().splitlines()
-    assert line.endswith(f"is not downloaded: evalio -D {tmp_path / 'evalio_data'} dl hilti_2022/basement_2")

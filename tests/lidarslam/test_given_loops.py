@@ -5,17 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.config.yaml_text import read_yaml
+
+from ..conftest import lidarslam
 
 FAST = ("--odometry", "constant-velocity", "--no-report", "--set", "pose_graph.keyframes.distance_m=0.1")
 
 
 def run(source: Path, out: Path, *arguments: object) -> Result:
-    command = ["run", str(source), "--out", str(out), *FAST, *map(str, arguments)]
-    return CliRunner().invoke(main, command, catch_exceptions=False)
+    return lidarslam("run", source, "--out", out, *FAST, *arguments)
 
 
 def loops(out: Path) -> list[dict[str, Any]]:

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 from scipy.spatial.transform import Rotation
 
 import lidarslam
-from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
 from lidarslam.core.trajectory import Trajectory, read_tum
@@ -22,6 +21,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 
+from ..conftest import lidarslam as command
 from ..conftest import write_recording
 
 SCANS = 20
@@ -65,7 +65,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
 def _run(tmp_path: Path) -> Callable[..., tuple[Result, Path]]:
     def run(source: Path, *arguments: str, name: str = "run") -> tuple[Result, Path]:
         out = tmp_path / name
-        return CliRunner().invoke(main, ["run", str(source), "--out", str(out), *FAST, *arguments]), out
+        return command("run", source, "--out", out, *FAST, *arguments), out
 
     return run
 
@@ -178,7 +178,7 @@ def test_in_a_finished_map_the_imu_takes_part(longer: Path, tmp_path: Path, run:
     assert result.exit_code == 0, result.output
     found = tmp_path / "found"
     arguments = ["--map", str(out), "--out", str(found), "--odometry", "imu", "--guess", "0", "0", "0", *FAST]
-    result = CliRunner().invoke(main, ["localise", str(longer), *arguments])
+    result = command("localise", longer, *arguments)
     assert result.exit_code == 0, result.output
     assert rotation_error_deg(found, longer) < 0.15
 
@@ -208,17 +208,6 @@ def test_a_programs_own_loop_takes_the_samples_as_they_come(longer: Path, is_giv
     motions = trajectory.relative_motions()[0 if is_given else 32 :]
     true = read_tum(longer / "ground_truth.tum").relative_motions()[-len(motions) :]
     assert np.rad2deg(np.sqrt((rotation_angle(inverse(motions) @ true) ** 2).mean())) < 0.15
-
-
-@pytest.mark.long
-def test_a_late_clock_is_corrected_on_the_way(longer: Path, tmp_path: Path) -> None:
-    late = flawed(longer, tmp_path / "late", lambda rows: rows + np.eye(7)[0] * 0.02)
-    angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
-    with lidarslam.Slam({"odometry": {"method": "imu", "imu_rotation_deg": angles}, "mapping.keypoints": 800}) as slam:
-        register_all(slam, late)
-        slam.save(tmp_path / "run")
-    warnings = json.loads((tmp_path / "run" / "summary.json").read_text())["warnings"]
-    assert any(re.search(r"stamps are (1[6-9]|2[0-4]) ms late; corrected", warning) for warning in warnings), warnings
 
 
 def test_samples_are_checked(tmp_path: Path) -> None:

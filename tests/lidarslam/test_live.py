@@ -25,6 +25,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
+from lidarslam.datasets.ros.made_messages import header, point_cloud
 from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.live import bounded
 from lidarslam.live.messages import PosePublisher, serialize_transform
@@ -174,27 +175,11 @@ NOW = 1_700_000_000 * 10**9  # of publication
 
 def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8) -> bytes:
     """A serialised cloud of 200 points, with times from 0 to 0.1 s in nanoseconds."""
-    types = STORE.types
-    fields = [
-        types["sensor_msgs/msg/PointField"](name=name, offset=4 * column, datatype=6 if name == "t" else 7, count=1)
-        for column, name in enumerate("xyzt")
-    ]
-    table = np.zeros(200, np.dtype([("xyz", "<f4", 3), ("t", "<u4")]))
-    table["xyz"] = np.random.default_rng(0).uniform(1.0, 5.0, (200, 3))
+    table = np.zeros(200, np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")]))
+    for axis, values in zip("xyz", np.random.default_rng(0).uniform(1.0, 5.0, (200, 3)).T, strict=True):
+        table[axis] = values
     table["t"] = np.linspace(0.0, last_time, 200)
-    stamp_ns = round(1e9 * stamp_s)
-    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    cloud = types[CLOUD](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id),
-        height=1,
-        width=200,
-        fields=fields,
-        is_bigendian=False,
-        point_step=16,
-        row_step=3200,
-        data=np.frombuffer(table.tobytes(), np.uint8),
-        is_dense=True,
-    )
+    cloud = point_cloud(STORE, header(STORE, round(1e9 * stamp_s), frame_id), table)
     return bytes(STORE.serialize_cdr(cloud, CLOUD))
 
 

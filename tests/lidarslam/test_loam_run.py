@@ -1,21 +1,17 @@
 """LOAM's mapping from the command line: a run, a pose graph, a comparison."""
 
 import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, read_tum
-from lidarslam.mapping.loam.features import find_features
 
-from ..conftest import write_recording
+from ..conftest import succeeds, write_recording
 
 SCANS = 8
 
@@ -28,12 +24,6 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[
     return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, truth, is_timed=True)
 
 
-def lidarslam(*arguments: object) -> str:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
 def position_errors(run: Path, source: Path) -> FloatArray:
     """Distances (N,) of the run's positions from the truth, whose world is the first scan's frame."""
     truth, found = read_tum(source / "ground_truth.tum"), read_tum(run / "trajectory.tum")
@@ -44,7 +34,7 @@ def position_errors(run: Path, source: Path) -> FloatArray:
 @pytest.mark.parametrize("more", [[], ["--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2"]])
 def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
     out = tmp_path / "run"
-    lidarslam("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
+    succeeds("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
     assert position_errors(out, source).max() < 0.03
     assert "method: loam" in (out / "config.yaml").read_text()
     with (out / "scans.csv").open() as file:
@@ -53,36 +43,3 @@ def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
     assert all(0 < int(row["points_used"]) < int(row["points"]) for row in rows[1:])
     assert (out / "map.ply").stat().st_size > 10_000
     assert (out / "pose_graph.g2o").exists() == bool(more)
-
-
-@pytest.mark.long
-def test_a_comparison_with_loam(source: Path, tmp_path: Path) -> None:
-    lidarslam("compare", source, "--out", tmp_path / "out", "--methods", "constant-velocity+loam")
-    (method,) = json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"].items()
-    assert method[0] == "constant-velocity+loam"
-    assert (method[1]["status"], method[1]["lost_scans"]) == ("ok", 0)
-    assert method[1]["metrics"]["trajectory"]["ate_rmse_m"] < 0.02
-
-
-def test_an_interrupted_run_comes_to_the_same_results(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arguments = ["--odometry", "constant-velocity", "--mapping", "loam", "--set", "checkpoints.every_scans=3"]
-    whole, out, left = tmp_path / "whole", tmp_path / "run", 5
-    lidarslam("run", source, "--out", whole, *arguments)
-
-    def interrupted(*given: Any) -> Any:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise KeyboardInterrupt
-        return find_features(*given)
-
-    monkeypatch.setattr("lidarslam.mapping.loam.features.find_features", interrupted)
-    command = ["run", str(source), "--out", str(out), *arguments]
-    assert CliRunner().invoke(main, command).exit_code == 1
-    assert (out / "unfinished" / "state.npz").exists()
-    monkeypatch.undo()
-    lidarslam("run", source, "--out", out, *arguments, "--resume")
-    for name in ("trajectory.tum", "odometry.tum", "map.ply"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.finished_run import load_run
 
-from ..conftest import write_recording
+from ..conftest import lidarslam, write_recording
 
 Drive = Callable[[FloatArray], FloatArray]
 SCANS, FIRST = 34, 8
@@ -29,7 +28,7 @@ def record(folder: Path, room: Any, drive: Drive) -> Path:
 
 def call(*words: str | Path) -> Result:
     """The command line."""
-    return CliRunner().invoke(main, [*map(str, words), *WITHOUT_ODOMETRY])
+    return lidarslam(*words, *WITHOUT_ODOMETRY)
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.compare.method_run import judge
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.core.geometry import inverse
@@ -16,7 +15,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
 
-from ..conftest import write_recording
+from ..conftest import lidarslam, write_recording
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +33,7 @@ def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str)
         poses.append(poses[-1] @ motion)
     prior = out.parent / f"{scale}.tum"
     write_tum(prior, Trajectory(truth.stamps, np.array(poses)))
-    command = ["run", str(recording), "--out", str(out), "--prior", str(prior), "--no-mapping", *more]
-    result = CliRunner().invoke(main, command)
+    result = lidarslam("run", recording, "--out", out, "--prior", prior, "--no-mapping", *more)
     return result, json.loads((out / "summary.json").read_text(encoding="utf-8"))
 
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.storage.directory import MAPS
 from lidarslam.storage.finished_run import load_map, load_run
+
+from ..conftest import lidarslam
 
 SCANS = 10
 WITHOUT = (0, 3, 4)  # scans that lack the fields
@@ -66,7 +66,7 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[
 def run(source: Path, out: Path, *arguments: str) -> str:
     """Run a recording; what it printed."""
     given = [one.format(source) for one in arguments]
-    result = CliRunner().invoke(main, ["run", str(source), "--out", str(out), *SETTINGS, *given])
+    result = lidarslam("run", source, "--out", out, *SETTINGS, *given)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -113,18 +113,6 @@ def test_rings_and_times_are_those_of_the_first_point(
     only = tmp_path / "rings"
     run(source, only, *WAYS["true poses"], "--set", "global_map.fields=[ring]")
     assert [name for name, _ in load_map(only).attributes.present()] == ["ring"]
-
-
-@pytest.mark.long
-def test_geometry_does_not_depend_on_the_fields(source: Path, tmp_path: Path) -> None:
-    for name, fields in (("none", "[]"), ("all", "[intensity, rgb, ring, time]")):
-        run(source, tmp_path / name, *WAYS["pose graph"], "--set", f"global_map.fields={fields}")
-    none, every = load_map(tmp_path / "none"), load_map(tmp_path / "all")
-    np.testing.assert_array_equal(none.points, every.points)
-    np.testing.assert_array_equal(none.normals, every.normals)
-    assert not list(none.attributes.present())
-    for name in ("trajectory.tum", "pose_graph.g2o"):
-        assert (tmp_path / "none" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
 
 
 def test_further_formats(source: Path, tmp_path: Path) -> None:

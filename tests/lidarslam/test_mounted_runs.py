@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from lidarslam import Slam
 from lidarslam.assessment.inputs import truth_of_run
-from lidarslam.cli import main
 from lidarslam.config.settings import load_config
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
@@ -24,6 +22,8 @@ from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 from lidarslam.storage.finished_run import load_map
+
+from ..conftest import succeeds
 
 SCANS = 22  # of which the guess looks at every fourth
 TURNS = {
@@ -73,14 +73,8 @@ def recordings(tmp_path_factory: pytest.TempPathFactory, simulation: Simulation)
     return paths
 
 
-def call(*words: str | Path) -> str:
-    result = CliRunner().invoke(main, [*map(str, words)])
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 def run(source: Path, out: Path, *words: str) -> Path:
-    call("run", source, "-o", out, *FAST, *words)
+    succeeds("run", source, "-o", out, *FAST, *words)
     return out
 
 
@@ -177,18 +171,6 @@ def test_localisation(recordings, upright, tmp_path):
     found = {}
     for name in ("upright again", "rolled again"):
         out = tmp_path / name
-        assert "found at scan" in call("localise", recordings[name], "--map", upright, "-o", out, *CONSTANT)
+        assert "found at scan" in succeeds("localise", recordings[name], "--map", upright, "-o", out, *CONSTANT)
         found[name] = poses(out)
     np.testing.assert_allclose(found["rolled again"], found["upright again"], atol=1e-6)
-
-
-@pytest.mark.long
-def test_exports(upright, rolled, tmp_path):
-    written = []
-    for one in (rolled, upright):
-        folder = tmp_path / f"of_{one.name}"
-        folder.mkdir()
-        for command, file in (("export-bag", "run.mcap"), ("export-mesh", "mesh.ply"), ("export-grid", "grid.yaml")):
-            call(command, one, "-o", folder / file)
-        written.append({path.name: path.read_bytes() for path in folder.iterdir()})
-    assert written[0] == written[1]

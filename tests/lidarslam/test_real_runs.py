@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
+from ..conftest import lidarslam
+
+pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
 
 def run(source: Path, out: Path, *options: str) -> dict[str, float]:
     """The errors and the summary of a run that ends with exit status 0."""
-    ended = CliRunner().invoke(main, ["run", str(source), "--out", str(out), *options])
+    ended = lidarslam("run", source, "--out", out, *options)
     assert ended.exit_code == 0, ended.output
     summary = json.loads((out / "summary.json").read_text())
     metrics = out / "metrics.json"
@@ -24,8 +25,6 @@ def run(source: Path, out: Path, *options: str) -> dict[str, float]:
 METHODS = ("learned", "constant-velocity")
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "odometry", "step"),
     [
@@ -40,8 +39,6 @@ def test_scans_do_not_slide_at_any_rate(real_data: Path, tmp_path: Path, name: s
     assert result["lost_scans"] == 0
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 @pytest.mark.parametrize("odometry", METHODS)
 @pytest.mark.parametrize("yaw_deg", [30, 80, 135])
 def test_the_direction_of_the_axes_does_not_matter(
@@ -54,8 +51,6 @@ def test_the_direction_of_the_axes_does_not_matter(
     assert result["lost_scans"] == 0
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 @pytest.mark.parametrize("odometry", METHODS)
 @pytest.mark.parametrize("step", [1, 2, 3, 5])
 def test_a_real_drive_at_speed_from_its_first_scan(real_data: Path, tmp_path: Path, odometry: str, step: int) -> None:
@@ -66,8 +61,6 @@ def test_a_real_drive_at_speed_from_its_first_scan(real_data: Path, tmp_path: Pa
     assert result["lost_scans"] == 0
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [0.0, 1e-5])
 def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noise_m: float) -> None:
     """Few points constrain the height: the odometry's motion has to hold it, on any processor."""
@@ -83,8 +76,6 @@ def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noi
     assert result["lost_scans"] == 0
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 @pytest.mark.parametrize("step", [3, 4])
 def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: Path, tmp_path: Path, step: int) -> None:
     """The map grows with degraded scans that the odometry confirms, without which the next flight fits none."""
@@ -93,20 +84,16 @@ def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: P
     assert result["lost_scans"] == 0
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 @pytest.mark.parametrize("start", [0, 20, 40, 80])
 def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, start: int) -> None:
     """Hardly any surface constrains the first velocity, 2.2 m/s; the run is right, and reports that."""
     out = tmp_path / "run"
     options = "--odometry", "learned+imu", "--start", str(start), "--stop", str(start + 40)
-    ended = CliRunner().invoke(main, ["run", str(real_data / "sim_corridor_yard"), "--out", str(out), *options])
+    ended = lidarslam("run", real_data / "sim_corridor_yard", "--out", out, *options)
     assert ended.exit_code == 3, ended.output
     assert json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.02
 
 
-@pytest.mark.real_data
-@pytest.mark.slow
 def test_a_crowd_that_is_followed_is_reported(real_data: Path, tmp_path: Path) -> None:
     """Played backwards, half of 30 people walk along from the first scan on, and the path is too short."""
     crowd, backwards = real_data / "sim_office_crowd", tmp_path / "backwards"
@@ -117,7 +104,7 @@ def test_a_crowd_that_is_followed_is_reported(real_data: Path, tmp_path: Path) -
         scan["time"] *= -1.0
         np.save(backwards / f"{number:06d}.npy", scan)
     np.savetxt(backwards / "times.txt", stamps[-1] - stamps[::-1])
-    ended = CliRunner().invoke(main, ["run", str(backwards), "--out", str(tmp_path / "run")])
+    ended = lidarslam("run", backwards, "--out", tmp_path / "run")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     truth_m = np.linalg.norm(np.diff(np.loadtxt(crowd / "ground_truth.tum")[:, 1:4], axis=0), axis=1).sum()
     assert ended.exit_code == 3 or abs(summary["length_m"] - truth_m) < 0.3, ended.output

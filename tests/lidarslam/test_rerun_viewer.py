@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from lidarslam.config.settings import ViewerConfig, load_config
-from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.errors import OutputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
@@ -24,7 +24,6 @@ from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment, web_page
 from lidarslam.viewer.rerun_program import is_taken, open_window, served_page
 from lidarslam.viewer.rerun_recording import IncompleteRecordingError, save, show_file_in_window, show_in_window
-from lidarslam.viewer.rerun_recording import _PipedFile as PipedFile
 from lidarslam.viewer.rerun_scenes import show_runs
 from lidarslam.viewer.rerun_viewer import rerun_viewer
 from lidarslam.viewer.web_page import WebPage
@@ -100,39 +99,6 @@ def test_a_run_with_a_window_and_no_display_ends_before_it_begins(small_recordin
     with pytest.raises(OutputError, match=r"no display .* --rerun web, .* --rerun save"):
         execute(request, lambda *_: None)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("content", [None, b"", b"not a recording"])
-def test_a_file_that_is_no_recording_gets_one_line(tmp_path: Path, content: bytes | None) -> None:
-    if content is not None:
-        (tmp_path / "some.rrd").write_bytes(content)
-    with pytest.raises(InputError, match=r"some\.rrd: no"):
-        show_file_in_window(tmp_path / "some.rrd")
-
-
-def test_a_write_that_fails_empties_the_file_and_swallows_the_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a disk that fills up does: first it takes a part, then it says so."""
-    room = 100_000
-
-    def write(handle: int, piece: bytes) -> int:
-        nonlocal room
-        if not room:
-            raise OSError(28, "No space left on device")
-        taken = written(handle, piece[:room])
-        room -= taken
-        return taken
-
-    written = os.write
-    monkeypatch.setattr("lidarslam.viewer.rerun_recording.os.write", write)
-    file = PipedFile(tmp_path / "file")
-    with file.entrance.open("wb") as entrance:
-        file.close_entrance()
-        for _ in range(50):
-            entrance.write(bytes(100_000))
-    assert file.finish()
-    assert (tmp_path / "file").stat().st_size == 0
 
 
 @pytest.fixture

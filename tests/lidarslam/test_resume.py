@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 from lidarslam.storage.finished_run import load_run
+
+from ..conftest import lidarslam
 
 ROOT = Path(__file__).parents[2]
 KILL = signal.SIGKILL
@@ -510,11 +510,11 @@ def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(
     assert ended.status == 1
     assert "holds an unfinished run or merge; replace it with --overwrite" in ended.said
     for command in (["evaluate", str(killed)], ["view", str(killed)], ["view", str(killed), "--picture", "x.png"]):
-        result = CliRunner().invoke(main, command)
+        result = lidarslam(*command)
         assert result.exit_code == 1
         assert f"did not finish; resume it with lidarslam run {source} --out {killed} --resume" in result.stderr
     whole_run = whole("constant velocity").out
-    result = CliRunner().invoke(main, ["evaluate", str(whole_run), "--reference", str(killed)])
+    result = lidarslam("evaluate", whole_run, "--reference", killed)
     assert (result.exit_code, "did not finish" in result.stderr) == (1, True)
 
 
@@ -538,7 +538,7 @@ def test_what_a_killed_overwrite_was_to_replace_is_given_back(
     assert untouched == (part == 0.5)
     if untouched:
         assert len(load_run(out).trajectory) == 6
-        assert CliRunner().invoke(main, ["evaluate", str(out)]).exit_code == 0
+        assert lidarslam("evaluate", out).exit_code == 0
         assert caplog.text.count("results of an earlier run") == 1
     else:
         with pytest.raises(InputError, match="did not finish"):

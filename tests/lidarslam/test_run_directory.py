@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from lidarslam.core.errors import OutputError
-from lidarslam.storage.directory import ABOUT, CONFIG, MAP_PLY, METRICS, RunDirectory
+from lidarslam.storage.directory import CONFIG, MAP_PLY, METRICS, RunDirectory
 
 
 def names(path: Path) -> list[str]:
@@ -38,18 +38,6 @@ def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier: Path) ->
         directory.write_text(CONFIG, "run:\n  version: 1\n")
     assert names(earlier) == [CONFIG, "notes.txt"], "no metrics of the run before"
     assert "version: 1" in (earlier / CONFIG).read_text()
-
-
-def test_what_did_not_finish_is_not_called_a_run(tmp_path: Path) -> None:
-    """It may be a merge, which nothing resumes."""
-    (tmp_path / ABOUT).parent.mkdir()
-    (tmp_path / ABOUT).write_text("{}")
-    said = "holds an unfinished run or merge; replace it with --overwrite, or resume a run with --resume$"
-    with pytest.raises(OutputError, match=said), RunDirectory.create(tmp_path):
-        pass
-    with RunDirectory.create(tmp_path, overwrite=True):
-        pass
-    assert not (tmp_path / ABOUT).exists()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -110,15 +110,6 @@ def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path) -> No
     assert {"Absolute errors", "Error components", "Map errors"} <= set(shown)
 
 
-def test_evaluate_against_camera_poses_draws_these(finished_run: Path) -> None:
-    kitti = finished_run.parent / "truth.txt"
-    shutil.copyfile(finished_run / "trajectory.kitti", kitti)
-    assert lidarslam("evaluate", finished_run, "--reference", kitti).exit_code == 0
-    html = (finished_run / "report.html").read_text()
-    assert "Absolute errors" in figures(html)
-    assert "truth.txt" in html
-
-
 def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_map(finished_run: Path) -> None:
     for name in ("map.ply", *PAGE):
         (finished_run / name).unlink()

@@ -7,11 +7,9 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import bounds_of, bounds_text
 from lidarslam.core.errors import ConfigError
@@ -21,7 +19,7 @@ from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.train.settings import TrainConfig
 
-from ..conftest import write_recording
+from ..conftest import lidarslam, write_recording
 
 
 def settings_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
@@ -115,7 +113,7 @@ def test_at_its_bounds_a_run_is_right_or_says_that_it_is_not(
 ) -> None:
     settings = ["odometry.method=constant-velocity", *needed(name, bound), f"{name}={text_of(name, bound)}"]
     words = [word for setting in settings for word in ("--set", setting)]
-    result = CliRunner().invoke(main, ["run", str(recording), "--out", str(tmp_path / "run"), "--no-report", *words])
+    result = lidarslam("run", recording, "--out", tmp_path / "run", "--no-report", *words)
     if name.endswith("min_range_m") and bound:
         assert (result.exit_code, "or no point is left" in result.stderr) == (1, True)
         return

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.compare.comparison import CompareOutcome, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.core.tasks import SERIAL, Where
 
+from ..conftest import lidarslam
 from .conftest import Told
 
 pytest.importorskip("ray")
@@ -167,7 +166,7 @@ def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
     for jobs in ("1", "2"):
         out = tmp_path / jobs / "walk"
         command = ["simulate", "--out", str(out), "--scans", "23", "--format", "ply", "--jobs", jobs]
-        result = CliRunner().invoke(main, command, catch_exceptions=False)
+        result = lidarslam(*command)
         assert result.exit_code == 0, result.output
     one, two = (
         {path.name: path.read_bytes() for path in (tmp_path / jobs / "walk").iterdir() if path.name != "README.md"}

@@ -8,10 +8,6 @@ import pytest
 from lidarslam.pipeline.threads import BackgroundWorker, prefetch
 
 
-def test_items_come_in_order() -> None:
-    assert list(prefetch(range(100))) == list(range(100))
-
-
 def test_an_error_comes_after_the_items_before_it() -> None:
     def items() -> Iterator[int]:
         yield 1

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.run.summary import time_scale, time_scale_warning
+
+from ..conftest import lidarslam
 
 STAMPS = 100.0 + 0.1 * np.arange(60)
 
@@ -54,7 +54,7 @@ def test_few_turns_lost_scans_and_long_intervals_decide_nothing() -> None:
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("time_scale") / "walk"
     options = ["--scans", "40", "--world", "hall", "--motion", "handheld", "--format", "mcap"]
-    CliRunner().invoke(main, ["simulate", "-o", str(out), *options], catch_exceptions=False)
+    lidarslam("simulate", "-o", out, *options)
     return out
 
 
@@ -63,7 +63,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: float, fault: str | None) -> None:
     options = ["--odometry", "constant-velocity", "--no-report", "--set", f"reader.time_scale={scale}"]
     out = tmp_path / "run"
-    CliRunner().invoke(main, ["run", str(walk), "--out", str(out), *options], catch_exceptions=False)
+    lidarslam("run", walk, "--out", out, *options)
     warnings = [text for text in json.loads((out / "summary.json").read_text())["warnings"] if "points' times" in text]
     assert len(warnings) == (fault is not None)
     assert all(f"times are {fault}" in text for text in warnings)

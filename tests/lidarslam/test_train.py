@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.training.config import LossConfig, SimulatedConfig
+from lidarslam.odometry.training.config import SimulatedConfig
 from lidarslam.odometry.training.pairs import AUGMENTATION, Pairs
 from lidarslam.odometry.training.preparation import PreparedRecording
 from lidarslam.odometry.training.training import summarise, validate
@@ -31,8 +30,10 @@ from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import data as training_data
 from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
-from lidarslam.train.settings import LOSSES, load_train_config
+from lidarslam.train.settings import load_train_config
 from lidarslam.train.train import TrainRequest, execute
+
+from ..conftest import lidarslam
 
 SIZES = ("images.columns=96", "batch=2", "steps=8", "warmup_steps=2", "hold_out=0.3")
 TINY = [f"training.{size}" for size in SIZES]
@@ -272,23 +273,8 @@ def test_of_the_simulated_recordings_some_kinds_can_be_chosen():
         simulated(SimulatedConfig(recordings=1, worlds=("park",)))
 
 
-@pytest.mark.parametrize(
-    ("name", "geometric", "alignment_weight"),
-    [
-        ("both", LossConfig(), 0.0),
-        ("paper", LossConfig(robust=False), 0.0),
-        ("point-to-plane", LossConfig(plane_to_plane=False), 0.0),
-        ("plane-to-plane", LossConfig(point_to_plane=False), 0.0),
-        ("alignment", None, 1.0),
-    ],
-)
-def test_named_losses(name, geometric, alignment_weight):
-    config = load_train_config(None, LOSSES[name]).training
-    assert (config.geometric, config.alignment_weight) == (geometric, alignment_weight)
-
-
 def train(*arguments: object) -> Result:
-    return CliRunner().invoke(main, ["train", *map(str, arguments)], catch_exceptions=False)
+    return lidarslam("train", *arguments)
 
 
 def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):

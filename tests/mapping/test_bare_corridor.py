@@ -17,6 +17,8 @@ from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher, measure_fit
 from lidarslam.mapping.tracking.start_poses import constraining_points
 
+from .shapes import surfel_map_of
+
 CELL = 0.1
 NOISE_M = 0.008
 # x, and side of the corridor.
@@ -50,9 +52,7 @@ def elevations(points: FloatArray) -> FloatArray:
 
 
 def map_of(points: FloatArray) -> SurfelMap:
-    surfel_map = SurfelMap(CELL, 100.0)
-    surfel_map.insert(points, elevations(points), np.zeros(3))
-    return surfel_map
+    return surfel_map_of(points, CELL)
 
 
 @pytest.fixture

@@ -73,18 +73,6 @@ def test_a_map_of_other_cells_has_the_same_points(rng):
         assert len(found) == pytest.approx(len(expected), rel=0.2)
 
 
-def test_a_restored_map_goes_on(rng, through_disk):
-    whole = map_of(rng.uniform(-4.0, 4.0, (1000, 3)), rng.uniform(-4.0, 4.0, (2000, 3)), 0.3)
-    restored = FeatureMap(1.0, 1.0)
-    restored.restore(through_disk(whole.state()))
-    for _ in range(2):
-        for one, other in zip(whole.grids, restored.grids, strict=True):
-            np.testing.assert_array_equal(one.means, other.means)
-        more = rng.uniform(-5.0, 5.0, (3000, 3))
-        for held in (whole, restored):
-            add(held, more[:1000], more[1000:])
-
-
 def test_a_local_map_is_restored_as_what_it_is(rng, through_disk):
     whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
     saved = through_disk({"map": whole.state()})

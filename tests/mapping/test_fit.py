@@ -10,30 +10,22 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.fit import Fit, directional_support, translation_information
 from lidarslam.mapping.tracking.scan_matcher import measure_fit
 
+from .shapes import on_sides, surfel_map_of
+
 CONFIG = TrackingConfig()
 HALF = np.array([7.0, 5.0, 2.0])
 T_WORLD_LIDAR = exp([0.0, 0.0, 0.4, 1.0, -0.5, 0.2])
 
 
-def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> FloatArray:
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
-    axis = rng.integers(0, 3, count)
-    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
-    return points
-
-
 @pytest.fixture
 def box_map(rng: np.random.Generator) -> SurfelMap:
-    local_map = SurfelMap(0.2, 100.0)
-    points = box_points(rng, 60_000)
-    local_map.insert(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.zeros(3))
-    return local_map
+    return surfel_map_of(on_sides(rng, HALF, 60_000), 0.2)
 
 
 @pytest.fixture
 def scan_points(rng: np.random.Generator) -> FloatArray:
     """Seen from `T_WORLD_LIDAR`, away from the box's edges."""
-    return transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 3_000, margin=0.5))
+    return transform_points(inverse(T_WORLD_LIDAR), on_sides(rng, HALF, 3_000, margin_m=0.5))
 
 
 def test_a_scan_in_its_place_fits_entirely(box_map, scan_points):
@@ -57,7 +49,7 @@ def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map, scan_po
 
 def test_points_at_corners_count_once_each(box_map, rng):
     """Whatever a point there is held against, planes or bodies."""
-    points = transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 4_000))
+    points = transform_points(inverse(T_WORLD_LIDAR), on_sides(rng, HALF, 4_000))
     fit = measure_fit(points, T_WORLD_LIDAR, box_map)
     assert fit.matched <= len(points)
     assert 0.8 < fit.overlap <= 1.0

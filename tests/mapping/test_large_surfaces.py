@@ -10,18 +10,13 @@ from lidarslam.mapping.registration.local_map import inflation_of_small
 from lidarslam.mapping.registration.registration import register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
+from .shapes import on_sides, surfel_map_of
+
 CELL_M = 0.1
 HALL_M = np.array([8.0, 6.0, 2.5])  # half its length, width and height
 PERSON_M = np.array([0.25, 0.2, 0.85])
 WALKED = np.array([0.12, 0.02, 0.0])
 ALL, ALONG = (0, 1, 2), (1, 2)  # the axes across which there are walls
-
-
-def on_box(rng: np.random.Generator, half: FloatArray, count: int, axes: tuple[int, ...]) -> FloatArray:
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * half
-    axis = rng.choice(axes, count)
-    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * half[axis]
-    return points
 
 
 def people(rng: np.random.Generator, count: int) -> FloatArray:
@@ -31,24 +26,20 @@ def people(rng: np.random.Generator, count: int) -> FloatArray:
         yaw, away_m = 2.1 * k, 1.5 + 0.15 * k
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         place = away_m * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) - [0.0, 0.0, 1.6]
-        parts.append(on_box(rng, PERSON_M, count // 12, (0, 1)) @ turn.T + place)
+        parts.append(on_sides(rng, PERSON_M, count // 12, (0, 1)) @ turn.T + place)
     return np.concatenate(parts)
-
-
-def map_of(points: FloatArray) -> SurfelMap:
-    surfel_map = SurfelMap(CELL_M, 100.0)
-    surfel_map.insert(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.zeros(3))
-    return surfel_map
 
 
 def scene(axes: tuple[int, ...], crowd: int) -> tuple[SurfelMap, Sweep]:
     """A map of a hall with people, and a sweep of it after the sensor and the people have walked."""
     rng = np.random.default_rng(7)
     noise = 0.003
-    hall, sweep = on_box(rng, HALL_M, 400_000, axes), on_box(rng, HALL_M, 1_500, axes)
+    hall, sweep = on_sides(rng, HALL_M, 400_000, axes), on_sides(rng, HALL_M, 1_500, axes)
     standing, walking = people(rng, 60_000), people(rng, crowd)
     points = np.concatenate([sweep - WALKED, walking])
-    surfel_map = map_of(np.concatenate([hall, standing]) + rng.normal(0.0, noise, (len(hall) + len(standing), 3)))
+    surfel_map = surfel_map_of(
+        np.concatenate([hall, standing]) + rng.normal(0.0, noise, (len(hall) + len(standing), 3)), CELL_M
+    )
     return surfel_map, Sweep(points + rng.normal(0.0, noise, points.shape))
 
 

@@ -256,13 +256,6 @@ def test_edges_of_a_room_are_its_edges(room, drive, rng, sigma_m, false_edges):
     assert len(planes) > 0.5 * len(scan)
 
 
-def noisy_wall(rng: np.random.Generator) -> Scan:
-    """A wall at 5 m in 16 rings, with 2 cm of noise."""
-    points = np.concatenate([wall_at(5.0, AZIMUTH_DEG) + np.array([0.0, 0.0, 0.1 * ring]) for ring in range(16)])
-    points *= 1.0 + 0.02 * rng.standard_normal((len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
-    return Scan(points, 0.0, np.tile(np.linspace(-0.05, 0.05, 300), 16), np.arange(16, dtype=np.int32).repeat(300))
-
-
 def rows_of(features: FloatArray, scan: Scan) -> NDArray[np.intp]:
     """Indices (M,) of the scan's points that features (M, 3) are."""
     rows = {tuple(point): index for index, point in enumerate(scan.points)}

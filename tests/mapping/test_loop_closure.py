@@ -12,6 +12,8 @@ from lidarslam.mapping.loops import detection
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.loops.detection import KeyframeDatabase, LoopDetector
 
+from .shapes import on_boxes
+
 
 @dataclass(frozen=True, eq=False)
 class Submap:
@@ -29,19 +31,6 @@ UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])
 CONFIG = LoopConfig(min_way_m=10.0)
 
 
-def box_points(boxes, rng: np.random.Generator) -> FloatArray:
-    parts = []
-    for centre, half in boxes:
-        c, h = np.array(centre, dtype=float), np.array(half, dtype=float)
-        for axis in range(3):
-            u, v = [a for a in range(3) if a != axis]
-            for side in (-1.0, 1.0):
-                p = rng.uniform(-1.0, 1.0, (int(4.0 * h[u] * h[v] / 0.035), 3)) * h
-                p[:, axis] = side * h[axis] + rng.normal(0.0, 0.005, len(p))
-                parts.append(c + p)
-    return np.concatenate(parts)
-
-
 @pytest.fixture(scope="module")
 def hall() -> FloatArray:
     """36 x 28 x 4 m with boxes of all sizes along the walls and in the middle."""
@@ -52,7 +41,7 @@ def hall() -> FloatArray:
         if not (6.0 < max(abs(x), abs(y) + 2.0) < 12.5):
             half = rng.uniform(0.3, 1.4, 3)
             boxes.append(((x, y, half[2]), half))
-    return box_points(boxes, rng)
+    return on_boxes(boxes, 0.035, rng, 0.005)
 
 
 def round_trip(laps: float, step_m: float = 2.0) -> FloatArray:
@@ -165,7 +154,9 @@ def test_rooms_that_are_all_the_same_are_not_taken_for_one(min_way_m, min_simila
     """One room after the other, each exactly like the last: everything fits, and drift explains none of it."""
     monkeypatch.setattr(detection, "_MIN_SIMILARITY", min_similarity)
     rng = np.random.default_rng(0)
-    room = box_points([((0, 0, 1.5), (5, 4, 1.5)), ((3, 2, 0.6), (0.6, 1, 0.6)), ((-4, -1, 0.9), (0.7, 0.4, 0.9))], rng)
+    room = on_boxes(
+        [((0, 0, 1.5), (5, 4, 1.5)), ((3, 2, 0.6), (0.6, 1, 0.6)), ((-4, -1, 0.9), (0.7, 0.4, 0.9))], 0.035, rng, 0.005
+    )
     stands = make_transform(np.eye(3), np.array([[-2.0, -1.0, 1.3], [0.0, 0.5, 1.3], [2.0, -1.0, 1.3]]))
     truth, submaps = [], []
     for number in range(6):

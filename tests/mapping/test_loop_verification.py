@@ -10,6 +10,8 @@ from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap
 from lidarslam.mapping.loops.verification import SubmapCloud, evaluate, verify
 
+from .shapes import on_boxes
+
 MIN_OVERLAP = LoopConfig().min_overlap
 # Centre and half sizes; the sensor stands inside.
 ROOM = [((0, 0, 1.5), (5, 4, 1.5)), ((3.2, 2.1, 0.6), (0.5, 1.1, 0.6)), ((-4.4, -1.5, 0.9), (0.6, 0.4, 0.9))]
@@ -22,25 +24,10 @@ OTHER_ROOM = [((0, 0, 1.5), (5, 4, 1.5)), *OTHER_FURNITURE]
 CORRIDOR = [((0, 0, 1.3), (60, 1.2, 1.3))]
 
 
-def box_points(boxes, spacing_m: float, rng: np.random.Generator, noise_m: float = 0.005) -> FloatArray:
-    """Points (N, 3) on the faces of boxes, inside or outside alike."""
-    parts = []
-    for centre, half in boxes:
-        c, h = np.array(centre, dtype=float), np.array(half, dtype=float)
-        for axis in range(3):
-            u, v = [a for a in range(3) if a != axis]
-            count = int(4.0 * h[u] * h[v] / spacing_m**2)
-            for side in (-1.0, 1.0):
-                p = rng.uniform(-1.0, 1.0, (count, 3)) * h
-                p[:, axis] = side * h[axis] + rng.normal(0.0, noise_m, count)
-                parts.append(c + p)
-    return np.concatenate(parts)
-
-
 def submap_from(
     boxes, T_world_lidar: FloatArray, seed: int, spacing_m: float = 0.08, reach_m: float = 25.0
 ) -> SparseSubmap:
-    points = box_points(boxes, spacing_m, np.random.default_rng(seed))
+    points = on_boxes(boxes, spacing_m**2, np.random.default_rng(seed), 0.005)
     points = transform_points(inverse(T_world_lidar), points)
     points = points[np.linalg.norm(points, axis=1) < reach_m]
     return SparseSubmap.of(points, 60.0)

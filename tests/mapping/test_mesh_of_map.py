@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map.edits import reconstruct
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+
+from ..conftest import lidarslam
 
 RADIUS_M = 3.0
 
@@ -52,12 +52,12 @@ def test_the_files_are_read_by_others(bowl, tmp_path, suffix):
     write_tum(run / "trajectory.tum", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     write_cloud(run / "map.ply", bowl)
     command = ["export-mesh", str(run), "--out", str(out), "--cell", "0.3"]
-    done = CliRunner().invoke(main, command, catch_exceptions=False)
+    done = lidarslam(*command)
     assert done.exit_code == 0, done.output
     mesh = o3d.io.read_triangle_mesh(str(out))
     assert len(mesh.triangles) > 500
     assert distances(np.asarray(mesh.vertices)).max() < 0.3
     colours = np.asarray(mesh.vertex_colors)
     assert suffix in (".obj", ".stl") or (len(colours) and set(np.unique(colours)) == {0.0, 1.0})
-    assert CliRunner().invoke(main, command).exit_code == 1
-    assert CliRunner().invoke(main, ["export-mesh", str(run), "--out", "mesh.off"]).exit_code == 2
+    assert lidarslam(*command).exit_code == 1
+    assert lidarslam("export-mesh", run, "--out", "mesh.off").exit_code == 2

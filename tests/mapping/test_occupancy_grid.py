@@ -4,9 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map.occupancy_grid import (
@@ -20,6 +18,8 @@ from lidarslam.mapping.global_map.occupancy_grid import (
 )
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
+
+from ..conftest import lidarslam
 
 SLOPE = np.tan(np.deg2rad(10.0))
 SENSOR_M = 1.0
@@ -144,7 +144,7 @@ def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
     write_tum(run / "trajectory.tum", Trajectory(0.1 * np.arange(len(path)), T))
     write_cloud(run / "map.ply", PointCloud(points, normals))
     command = ["export-grid", str(run), "--out", str(out)]
-    done = CliRunner().invoke(main, command, catch_exceptions=False)
+    done = lidarslam(*command)
     assert done.exit_code == 0, done.output
     cloud = load_map(run)  # in single precision
     grid = occupancy_grid(cloud.points, cloud.normals, path, GridOptions(resolution_m=STEP))
@@ -156,6 +156,6 @@ def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
     x, y, yaw = (float(word) for word in str(about["origin"]).strip("[]").split(","))
     np.testing.assert_allclose([x, y, yaw], [*grid.origin, 0.0], atol=1e-6)
     np.testing.assert_array_equal(meaning, grid.cells)
-    assert CliRunner().invoke(main, command).exit_code == 1
-    assert CliRunner().invoke(main, [*command, "--overwrite"]).exit_code == 0
-    assert CliRunner().invoke(main, ["export-grid", str(run), "--out", str(tmp_path / "map.png")]).exit_code == 1
+    assert lidarslam(*command).exit_code == 1
+    assert lidarslam(*command, "--overwrite").exit_code == 0
+    assert lidarslam("export-grid", run, "--out", tmp_path / "map.png").exit_code == 1

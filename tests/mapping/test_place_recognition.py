@@ -7,6 +7,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, ro
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
 from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, _level_rotation
 
+from .shapes import on_boxes
+
 RADIUS_M = 16.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])
 
@@ -16,16 +18,7 @@ def scene(seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     boxes = [((0, 0, 2), (12, 8, 2))]
     boxes += [((*rng.uniform((-10, -6), (10, 6)), 1.0), (*rng.uniform(0.3, 1.5, 2), 1.0)) for _ in range(12)]
-    parts = []
-    for centre, half in boxes:
-        c, h = np.array(centre), np.array(half)
-        for axis in range(3):
-            u, v = [a for a in range(3) if a != axis]
-            for side in (-1.0, 1.0):
-                p = rng.uniform(-1.0, 1.0, (int(4.0 * h[u] * h[v] / 0.02), 3)) * h
-                p[:, axis] = side * h[axis]
-                parts.append(c + p)
-    return np.concatenate(parts)
+    return on_boxes(boxes, 0.02, rng)
 
 
 def pose(x: float, y: float, yaw_deg: float) -> FloatArray:

@@ -103,18 +103,6 @@ def test_false_loops_are_rejected_and_change_nothing(true, false, rng):
     assert_near(found.poses, expected.poses, 1e-6)
 
 
-def test_false_loops_that_agree_and_outnumber_the_true_are_inliers(rng):
-    """A known limit: six closures place the second lap 10 m aside, against one, and the chain cannot decide."""
-    truth = laps(2 * LAP)
-    aside = np.eye(4)
-    aside[:3, 3] = [0.0, 10.0, 0.0]
-    pairs = [(key, key + LAP) for key in range(0, 12, 2)]
-    false = [RelativePose(a, b, inverse(truth[a]) @ aside @ truth[b], TIGHT) for a, b in pairs]
-    chain_edges = with_errors(chained(truth, 4.0 * LOOSE), rng)
-    found = optimise(drifted(chain_edges, len(truth)), chain_edges, [edge(truth, 5, 5 + LAP), *false])
-    assert found.inliers.tolist() == [False] + [True] * 6
-
-
 def test_edges_are_weighed_by_their_covariances():
     """Two measurements of one motion: the estimate is their mean, weighted by information."""
     far, near = exp([0, 0, 0, 2.0, 0, 0]), exp([0, 0, 0, 1.0, 0, 0])

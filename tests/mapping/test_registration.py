@@ -13,26 +13,16 @@ from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.registration import register as register_sweep
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
+from .shapes import on_sides, surfel_map_of
+
 CELL = 0.2
 HALF = np.array([4.0, 3.0, 1.5])
 T_TRUE = exp([0.02, -0.03, 0.5, 0.6, -0.4, 0.1])
 TURNING = np.concatenate([np.deg2rad([0.0, 0.0, 120.0]), [1.5, 0.0, 0.0]])
 
 
-def sides(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2), margin: float = 0.0) -> FloatArray:
-    """Points (N, 3) on the sides of a box across these axes, as far from its edges as the margin."""
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
-    axis = rng.choice(axes, count)
-    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
-    return points
-
-
-def map_of(planes: FloatArray, seen_from: FloatArray | None = None) -> SurfelMap:
-    sensor = np.zeros(3) if seen_from is None else seen_from
-    local_map = SurfelMap(CELL, 100.0)
-    rays = planes - sensor
-    local_map.insert(planes, np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)), sensor)
-    return local_map
+def map_of(planes: FloatArray) -> SurfelMap:
+    return surfel_map_of(planes, CELL)
 
 
 def seen(world: FloatArray, T_world_lidar: FloatArray, times: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -47,7 +37,7 @@ def sweep_of(
 ) -> Sweep:  # fmt: skip
     """A rolling sweep of a tenth of a second, without noise."""
     times = 0.1 * rng.uniform(-stamp_at, 1.0 - stamp_at, count)
-    return Sweep(seen(sides(rng, count, axes, margin=2.1 * CELL), T_world_lidar, times, velocity), times)
+    return Sweep(seen(on_sides(rng, HALF, count, axes, margin_m=2.1 * CELL), T_world_lidar, times, velocity), times)
 
 
 def snapshot(rng: np.random.Generator, T_world_lidar: FloatArray = T_TRUE, **wanted: Any) -> Sweep:
@@ -78,7 +68,7 @@ def assert_at(T_found: FloatArray, T_true: FloatArray, metres: float, degrees: f
 @pytest.fixture(scope="module")
 def box_map() -> SurfelMap:
     rng = np.random.default_rng(5)
-    return map_of(sides(rng, 60_000))
+    return map_of(on_sides(rng, HALF, 60_000))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -117,7 +107,7 @@ def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(box_ma
 
 @pytest.fixture(scope="module")
 def corridor_map() -> SurfelMap:
-    return map_of(sides(np.random.default_rng(5), 60_000, axes=(1, 2)))
+    return map_of(on_sides(np.random.default_rng(5), HALF, 60_000, axes=(1, 2)))
 
 
 @pytest.mark.parametrize("along_m", [0.3, -0.7])
@@ -138,7 +128,7 @@ def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(corridor
 
 def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng):
     """Their normals are off by a little, and each would pull along the corridor a little."""
-    noisy = sides(rng, 60_000, axes=(1, 2))
+    noisy = on_sides(rng, HALF, 60_000, axes=(1, 2))
     local_map = map_of(noisy + rng.normal(0.0, 0.02, noisy.shape))
     sweep = snapshot(rng, axes=(1, 2))
     sweep = replace(sweep, points=sweep.points + rng.normal(0.0, 0.02, sweep.points.shape))
@@ -162,8 +152,10 @@ def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(corrido
 def test_a_few_points_on_its_end_hold_a_corridor(off_m):
     """All others fit perfectly wherever along it the sensor is, and must not make outliers of them."""
     rng = np.random.default_rng(1)
-    local_map = map_of(np.concatenate([sides(rng, 60_000, axes=(1, 2)), sides(rng, 3_000, axes=(0,))]))
-    world = np.concatenate([sides(rng, 2_000, (1, 2), 2.1 * CELL), sides(rng, 150, (0,), 2.1 * CELL)])
+    local_map = map_of(
+        np.concatenate([on_sides(rng, HALF, 60_000, axes=(1, 2)), on_sides(rng, HALF, 3_000, axes=(0,))])
+    )
+    world = np.concatenate([on_sides(rng, HALF, 2_000, (1, 2), 2.1 * CELL), on_sides(rng, HALF, 150, (0,), 2.1 * CELL)])
     T_predicted = T_TRUE.copy()
     T_predicted[0, 3] += off_m
     prediction = predicted(T_predicted, rotation_deg=5.0, metres=0.3)
@@ -181,7 +173,7 @@ def test_too_few_points_make_no_pose(box_map, rng, count, suffices):
 
 def test_outliers_do_not_move_the_pose(box_map, rng):
     """A third of the points stands away from the walls, all on one side of them, as people and furniture do."""
-    world = sides(rng, 3_000, margin=2.1 * CELL)
+    world = on_sides(rng, HALF, 3_000, margin_m=2.1 * CELL)
     world[::3] *= rng.uniform(0.8, 0.98, (1_000, 1))
     sweep = Sweep(transform_points(inverse(T_TRUE), world))
     off = exp([0.0, 0.01, 0.02, 0.05, -0.05, 0.0])

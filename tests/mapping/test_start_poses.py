@@ -11,6 +11,8 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.start_poses import best_starts, best_velocity, turned_poses
 
+from .shapes import surfel_map_of
+
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -40,11 +42,7 @@ def test_turns_are_about_the_given_vertical():
 
 @pytest.fixture
 def l_map(rng: np.random.Generator, l_shaped_room: RoomPoints) -> SurfelMap:
-    points = l_shaped_room(rng, 20_000)
-    local_map = SurfelMap(0.2, 100.0)
-    elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
-    local_map.insert(points, elevations, np.zeros(3))
-    return local_map
+    return surfel_map_of(l_shaped_room(rng, 20_000), 0.2)
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 180.0, -97.0])

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
-from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+from .shapes import on_sides, surfel_map_of
 
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
@@ -20,17 +21,7 @@ def elevations_of(points: FloatArray) -> FloatArray:
 
 
 def map_of(points: FloatArray, cell_m: float = CELL) -> SurfelMap:
-    local_map = SurfelMap(cell_m, 100.0)
-    local_map.insert(points, elevations_of(points), ORIGIN)
-    return local_map
-
-
-def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> FloatArray:
-    """Points (N, 3) on the six sides of a box, as far from its edges as the margin."""
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
-    axis = rng.integers(0, 3, count)
-    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
-    return points
+    return surfel_map_of(points, cell_m)
 
 
 def floor_points(rng: np.random.Generator, count: int, half_size: float = 4.0, z: float = -1.0) -> FloatArray:
@@ -55,7 +46,7 @@ def distances(points: FloatArray, matches: Correspondences) -> FloatArray:
 
 
 def test_points_on_walls_meet_the_walls(rng):
-    local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
+    local_map, asked = map_of(on_sides(rng, HALF, 40_000)), on_sides(rng, HALF, 2_000, margin_m=2 * CELL)
     matches = local_map.match(asked, HERE)
     np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
     assert distances(asked, matches).max() < 1e-5
@@ -120,9 +111,9 @@ def test_the_map_stays_around_the_sensor(rng):
 @pytest.mark.parametrize("factor", [0.45, 0.8, 2.0])
 def test_planes_stay_in_place_when_cells_change_their_size(rng, factor):
     """By more than two it changes when the sensor leaves a hall for a corridor, or the other way round."""
-    resized = map_of(box_points(rng, 60_000)).resized(CELL * factor)
+    resized = map_of(on_sides(rng, HALF, 60_000)).resized(CELL * factor)
     assert resized.cell_m == CELL * factor
-    asked = box_points(rng, 2_000, margin=max(1.0, 2 * CELL * factor))
+    asked = on_sides(rng, HALF, 2_000, margin_m=max(1.0, 2 * CELL * factor))
     matches = resized.match(asked, HERE)
     assert len(np.unique(matches.index)) > 0.95 * len(asked)
     off = distances(asked, matches)
@@ -142,30 +133,12 @@ def test_grazed_ground_is_still_known_when_cells_change_their_size(rng):
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (10.0, 25.0), (-35.0, 0.0)])
 def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_deg):
     R = exp(np.deg2rad([roll_deg, pitch_deg, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
-    vertical = map_of(box_points(rng, 40_000) @ R.T).vertical()
+    vertical = map_of(on_sides(rng, HALF, 40_000) @ R.T).vertical()
     tilt_deg = np.hypot(roll_deg, pitch_deg)  # the corners of a room as small as this pull at it
     assert np.rad2deg(np.arccos(vertical @ R[:, 2])) < 1.0 + 0.16 * tilt_deg
     assert np.linalg.norm(vertical) == pytest.approx(1.0)
     wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
     np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])  # without a floor the world's
-
-
-def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(monkeypatch, rng):
-    monkeypatch.setattr("lidarslam.mapping.surfels.surfel_map._TIDIED_AFTER", 3)
-    tidied: list[float] = []
-    monkeypatch.setattr("lidarslam.mapping.surfels.grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
-
-    def add(local_map: SurfelMap) -> int:
-        tidied.clear()
-        local_map.insert(rng.uniform(-1.0, 1.0, (50, 3)), np.zeros(50), np.zeros(3))
-        return len(tidied)
-
-    local_map = SurfelMap(0.1, 30.0)
-    assert [add(local_map) for _ in range(5)] == [0, 0, 3, 0, 0]
-    restored = SurfelMap(0.1, 30.0)
-    restored.restore(Saved(local_map.state()))
-    assert [add(restored) for _ in range(4)] == [3, 0, 0, 3]
-    assert [add(local_map.resized(0.2)), add(local_map)] == [3, 3]
 
 
 def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):

@@ -134,28 +134,6 @@ def test_between_lasers_that_are_far_apart_nothing_is_seen():
         assert seen_through(at(10.0, 5.0, 1.0 + above_deg), seen, VOXEL_M).tolist() == [expected]
 
 
-def test_only_what_is_farther_all_around_is_seen_through():
-    """The pixel of the point is (8, 45): its direction is 1 degree up, the centre of row 8."""
-    point = at(45.3)
-    for row, column, is_beside in ((8, 45, True), (7, 44, True), (9, 46, True), (6, 45, False), (8, 47, False)):
-        nearer, same = wall(10.0), wall(10.0)
-        nearer[row, column], same[row, column] = 3.0, 5.2
-        assert seen_through(point, placed([nearer] * 9), VOXEL_M).tolist() == [not is_beside]
-        assert seen_through(point, placed([same] * 9), VOXEL_M).tolist() == [not is_beside]
-
-
-def test_where_nothing_returns_nothing_is_seen():
-    """Glass, the sky; and beams that are too few."""
-    point = at(45.3)
-    alone, none_here, few = wall(0.0), wall(10.0), wall(10.0)
-    alone[8, 45], none_here[8, 45], few[7:9, 44:46] = 10.0, 0.0, 0.0
-    few[8, 45] = 10.0  # six of nine
-    for image, expected in ((wall(0.0), False), (alone, False), (none_here, False), (few, True)):
-        assert seen_through(point, placed([image] * 9), VOXEL_M).tolist() == [expected]
-    few[9, 46] = 0.0
-    assert not seen_through(point, placed([few] * 9), VOXEL_M).any()
-
-
 def test_far_away_and_outside_the_rows_nothing_is_seen():
     images = [wall(60.0)] * 9
     reach_m = 3.0 * 0.1 * 360.0 / (2.0 * np.pi)

@@ -60,22 +60,6 @@ def test_poses_by_index_where_scans_are_missing(area: Path) -> None:
     assert next(recording.scans()).stamp == pytest.approx(START + 0.2)
 
 
-def test_the_description_has_no_assumed_rate(area: Path) -> None:
-    info = open_recording(area / "MathildaAVE-1").describe()
-    assert info.rate_hz == pytest.approx(10.0)
-    assert (info.reader, info.ground_truth) == ("apollo", area / "MathildaAVE-1" / "poses" / "gt_poses.txt")
-    assert not any("rate" in note for note in info.notes)
-
-
-def test_the_sequence_has_to_be_chosen(area: Path) -> None:
-    with pytest.raises(InputError, match="choose one with --sequence: MathildaAVE-1, SanJose"):
-        open_recording(area)
-    with pytest.raises(InputError, match="has no sequence 'x'; there are: MathildaAVE-1"):
-        open_recording(area, ReaderConfig(sequence="x"))
-    with pytest.raises(InputError, match="is the sequence MathildaAVE-1, not x"):
-        open_recording(area / "MathildaAVE-1", ReaderConfig(sequence="x"))
-
-
 def test_poses_that_do_not_go_with_the_scans(area: Path) -> None:
     poses = area / "MathildaAVE-1" / "poses" / "gt_poses.txt"
     lines = poses.read_text().splitlines(keepends=True)

@@ -88,13 +88,6 @@ def test_without_calibration_both_stay_in_the_vehicles_frame(log: SimpleNamespac
     assert "are in the vehicle's frame" in recording.warnings[0]
 
 
-def test_the_description(log: SimpleNamespace) -> None:
-    info = open_recording(log.folder).describe()
-    assert info.rate_hz == pytest.approx(10.0, abs=1e-3)
-    assert info.ground_truth == log.folder / "city_SE3_egovehicle.feather"
-    assert [field.type_name for field in info.fields[:4]] == ["float16", "float16", "float16", "uint8"]
-
-
 def test_damaged_files_are_named(log: SimpleNamespace) -> None:
     sweep = next((log.folder / "sensors" / "lidar").iterdir())
     sweep.write_bytes(sweep.read_bytes()[:100])

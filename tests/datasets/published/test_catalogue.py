@@ -5,11 +5,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.datasets.published.catalogue import CATALOGUE
 from lidarslam.datasets.registry import READERS
+
+from ...conftest import lidarslam
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +21,7 @@ def nothing_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _datasets(*arguments: str) -> Result:
-    return CliRunner().invoke(main, ["datasets", *arguments])
+    return lidarslam("datasets", *arguments)
 
 
 def _line(result: Result, name: str) -> str:
@@ -80,13 +81,6 @@ def test_json_has_all_facts(tmp_path: Path) -> None:
     assert content["enwide"]["truth"] == "total station, positions alone"
     (one,) = json.loads(_datasets("kitti_raw", "--json").output)
     assert one["on_disk"] == []
-
-
-def test_unknown_names_are_one_line() -> None:
-    result = _datasets("newercollege")
-    assert result.exit_code == 1
-    hint = "did you mean newer_college_2021 or newer_college_2020?"
-    assert f"neither a known data set nor a folder; {hint}" in result.output
 
 
 def test_the_page_has_the_same_table() -> None:

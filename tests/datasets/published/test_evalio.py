@@ -16,7 +16,6 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.recording import ImuSummary
 from lidarslam.datasets.registry import choose_reader, is_recording, open_recording
 
 START_NS = 1_640_000_000 * 10**9
@@ -117,14 +116,6 @@ def test_some_of_the_scans(hilti: SimpleNamespace) -> None:
     assert not list(recording.scans(3))
 
 
-def test_the_description_names_data_set_and_sensor(hilti: SimpleNamespace) -> None:
-    info = open_recording(hilti.folder).describe()
-    assert (info.scans, info.reader, info.ground_truth) == (3, "evalio", hilti.folder)
-    assert info.rate_hz == pytest.approx(10.0)
-    assert "hilti_2022/basement_2 by evalio, Hesai PandarXT-32" in info.notes[0]
-    assert info.imu == ImuSummary("Bosch BMI085", 100, 400.0, has_extrinsic=True)
-
-
 def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
     """Organised clouds with holes; the truth is of a frame of its own, in a table with seconds and nanoseconds."""
     folder, kit = make_sequence("newer_college_2021/stairs")
@@ -212,11 +203,6 @@ def test_what_is_not_downloaded_names_the_command(evalio_data: Path) -> None:
     (evalio_data / "hilti_2022" / "basement_2").mkdir(parents=True)
     with pytest.raises(InputError, match=r"exp14_basement_2.bag is missing.*; evalio dl hilti_2022/basement_2$"):
         open_recording(Path("evalio:hilti_2022/basement_2"))
-
-
-def test_the_command_names_a_folder_of_its_own(evalio_data: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=rf"evalio -D {tmp_path} dl hilti_2022/basement_2$"):
-        open_recording(tmp_path / "hilti_2022" / "basement_2")
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from lidarslam.cli import main
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.fetched import cache_folder, fetch, fetched, is_url, url_of
 from lidarslam.datasets.registry import open_recording
+
+from ...conftest import lidarslam
 
 pytest.importorskip("fsspec")
 
@@ -200,9 +200,9 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_commands_take_urls_as_sources_and_nothing_else(recording: Path) -> None:
-    result = CliRunner().invoke(main, ["info", f"file://{recording}"])
+    result = lidarslam("info", f"file://{recording}")
     assert result.exit_code == 0, result.output
     assert "scan-folder" in result.output
-    result = CliRunner().invoke(main, ["run", str(recording), "--out", "s3://bucket/run"])
+    result = lidarslam("run", recording, "--out", "s3://bucket/run")
     assert result.exit_code == 2
     assert "only sources are fetched" in result.output

@@ -73,13 +73,6 @@ def test_the_root_and_a_drive(root, wanted):
     assert open_recording(root, ReaderConfig(sequence=wanted)).name == open_recording(drive).name == DRIVES[1]
 
 
-def test_which_drive(root):
-    with pytest.raises(InputError, match="choose one with --sequence: 2013_05_28_drive_0000_sync"):
-        open_recording(root)
-    with pytest.raises(InputError, match=r"no drive .7..*there are: 2013_05_28_drive_0000_sync"):
-        open_recording(root, ReaderConfig(sequence="7"))
-
-
 def test_truth_is_that_of_the_lidar_at_the_scans_with_a_pose(root):
     recording = open_recording(root, ReaderConfig(sequence="0"))
     truth, stamps = recording.ground_truth, [scan.stamp for scan in recording.scans()]

@@ -105,13 +105,6 @@ def test_the_truth_is_of_the_lidar(nuscenes: SimpleNamespace) -> None:
     np.testing.assert_allclose(truth.T_world_lidar, expected, atol=1e-9)
 
 
-def test_the_description(nuscenes: SimpleNamespace) -> None:
-    info = open_recording(nuscenes.root, ReaderConfig(sequence="103")).describe()
-    assert (info.scans, info.ground_truth) == (6, nuscenes.tables / "ego_pose.json")
-    assert info.rate_hz == pytest.approx(20.0)
-    assert [field.name for field in info.fields] == ["x", "y", "z", "intensity", "ring"]
-
-
 def test_the_scene_has_to_be_chosen(nuscenes: SimpleNamespace) -> None:
     with pytest.raises(InputError, match="holds 2 scenes; choose one with --sequence: scene-0061, scene-0103"):
         open_recording(nuscenes.root)
