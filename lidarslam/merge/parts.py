@@ -88,7 +88,7 @@ def earlier_parts(out: Path) -> set[str]:
 
 def read_part(saved: Saved) -> TrackedScans:
     """The recording of a file; InputError where it is damaged."""
-    part: TrackedScans = decode(TrackedScans, saved.value("part"), saved.at("part"))
+    part: TrackedScans = decode(TrackedScans, saved.value("part"), saved)
     return part
 
 
