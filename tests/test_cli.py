@@ -83,6 +83,11 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
             "--no-loop 1 5: the run has 5 scans, from 0",
         ),
         (
+            ["run", "{recording}", "--out", "{out}", "--loop", "1", "4", "--no-loop", "4", "1"],
+            2,
+            "exclude one another",
+        ),
+        (
             ["run", "{recording}", "--out", "{out}", "--loop", "1", "4", "--no-pose-graph"],
             2,
             "leave --no-pose-graph out",
@@ -126,7 +131,10 @@ def test_mistakes_get_one_line(
     ("arguments", "method"),
     [
         ([], "surfels"),
+        (["--mapping"], "surfels"),
         (["--mapping", "loam"], "loam"),
+        (["--mapping", "off"], "off"),
+        (["--no-mapping"], "off"),
         (["--set", "mapping.method=loam", "--no-mapping"], "off"),
     ],
 )

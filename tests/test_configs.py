@@ -32,6 +32,23 @@ def test_settings_win_over_the_file(tmp_path: Path) -> None:
     assert config.odometry.kiss_icp.max_range_m == 40.0
 
 
+@pytest.mark.parametrize(
+    ("text", "settings", "method"),
+    [
+        ("", [], "surfels"),
+        ("mapping: {method: loam}", [], "loam"),
+        ("mapping: {method: off}", [], "off"),
+        ("mapping: {method: off}", ["mapping.method=loam"], "loam"),
+    ],
+)
+def test_a_mapping_is_named_and_off_is_a_word(tmp_path: Path, text: str, settings: list[str], method: str) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(text)
+    mapping = load_config(file, settings).mapping
+    assert mapping.method == method
+    assert mapping.enabled == (method != "off")
+
+
 @pytest.mark.parametrize("method", get_args(MappingName))
 def test_every_mapping_is_dumped_so_that_it_loads_again(tmp_path: Path, method: MappingName) -> None:
     file = tmp_path / "config.yaml"

@@ -154,6 +154,18 @@ def test_a_wrong_odometry_is_corrected_by_the_map(recording: Path, tmp_path: Pat
     np.testing.assert_allclose(odometry.relative_motions(), wrong.relative_motions(), atol=1e-6)
 
 
+def test_an_external_trajectory_builds_an_exact_map(
+    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
+) -> None:
+    config = load_config(None, ["odometry.method=external", "mapping.method=off", "global_map.voxel_size_m=0.1"])
+    prior = recording / "ground_truth.tum"
+    execute(RunRequest(recording, tmp_path / "run", config, prior=prior), quiet)
+    cloud = o3d.io.read_point_cloud(str(tmp_path / "run" / "map.ply"))
+    in_room = transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points))
+    assert np.median(room.distance_to_surface(in_room)) < 1e-5
+    assert room.distance_to_surface(in_room).max() < 0.06
+
+
 def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -> None:
     for index in (9, 10):
         table = np.load(recording / f"{index:06d}.npy")
@@ -206,6 +218,14 @@ def test_a_recording_is_not_written_into(recording: Path) -> None:
     with pytest.raises(OutputError, match="is the recording itself"):
         execute(RunRequest(recording, recording, load_config(None, KISS_ICP), overwrite=True), quiet)
     assert sorted(recording.iterdir()) == before
+
+
+def test_a_run_that_cannot_start_leaves_nothing_behind(recording: Path, tmp_path: Path) -> None:
+    for scan in recording.glob("*.npy"):
+        scan.write_bytes(b"not an array")
+    with pytest.raises(InputError, match=r"\.npy"):
+        execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> None:

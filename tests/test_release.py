@@ -32,6 +32,14 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert [line for line in lines if line.startswith("## ")][:2] == ["## [Unreleased]", heading]
 
 
+def test_the_citation_describes_the_project() -> None:
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert citation["authors"] == PROJECT["authors"]
+    assert citation["license"] == PROJECT["license"]
+    assert citation["repository-code"] == PROJECT["urls"]["Homepage"]
+    assert [work["title"].split(":")[0] for work in citation["references"][1:]] == ["LOAM", "KISS-ICP"]
+
+
 def test_workflows_call_the_commands_of_the_makefile() -> None:
     commands = [step["run"] for workflow in WORKFLOWS for step in _steps(workflow) if "run" in step]
     assert sorted(commands) == ["make lint", "make lowest", "make release", "make test", "make test-long"]

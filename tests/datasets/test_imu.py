@@ -71,6 +71,12 @@ def test_every_kind_of_bag(bag_kit, make_sweep, samples, frame_id):
     assert imu.rate_hz == pytest.approx(200.0, rel=1e-3)
 
 
+def test_a_bag_without_one(ros2_kit, make_sweep):
+    recording = open_recording(ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": "sensor_msgs/msg/Imu"}))
+    assert recording.imu is None
+    assert recording.describe().imu is None
+
+
 def test_the_extrinsic_goes_along_the_chain_of_frames(bag_kit, make_sweep, samples):
     static = [(STAMP_NS, transforms(bag_kit, ("base", "/imu", T_BASE_IMU), ("base", "mast", np.eye(4))))]
     static += [(STAMP_NS + 1, transforms(bag_kit, ("mast", "lidar", inverse(T_LIDAR_BASE))))]

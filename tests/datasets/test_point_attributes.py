@@ -82,6 +82,10 @@ def test_colours_of_every_type(columns):
     np.testing.assert_array_equal(read_colours(table(columns)), RGB)
 
 
+def test_a_packed_colour_of_another_size_is_none():
+    assert read_colours(table({"rgb": PACKED.astype(np.uint64)})) is None
+
+
 @pytest.mark.parametrize("columns", COLOURS.values(), ids=list(COLOURS))
 def test_point_cloud2(ros2_kit, columns):
     records = table(columns | {"intensity": np.arange(4, dtype=np.uint16) * 20_000}).reshape(2, 2)

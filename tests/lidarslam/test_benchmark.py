@@ -184,3 +184,9 @@ def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> 
 def test_what_is_no_method_is_refused_in_words(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         parse_method(name)
+
+
+@pytest.mark.parametrize(("names", "message"), [("kiss-icp,kiss-icp", "named twice"), (" , ", "no method is named")])
+def test_a_list_names_each_method_once(names: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_methods(names)

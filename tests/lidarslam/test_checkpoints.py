@@ -28,7 +28,7 @@ from lidarslam.run.results import TileWriter
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import CONFIG, RunDirectory
 from lidarslam.storage.state_file import read_state
-from lidarslam.storage.unfinished import Unfinished, require_whole
+from lidarslam.storage.unfinished import About, Unfinished, require_whole
 
 
 class Clock:
@@ -187,6 +187,24 @@ def test_another_scan_than_the_one_that_was_read_is_noticed(held: Scan) -> None:
     odometry.restore = lambda _: None
     with pytest.raises(InputError, match="the recording has changed"):
         scans_left(map(scan_at, STAMPS), held, odometry, Saved({"odometry": {}}))
+
+
+def test_two_are_not_at_work_on_one_run(tmp_path: Path) -> None:
+    with claim(tmp_path, {"a": 1}) as first:
+        first.begin(0)
+        for resume in (False, True):
+            with pytest.raises(OutputError, match="another lidarslam"), claim(tmp_path, {"a": 1}, resume):
+                pass
+        assert About.read(tmp_path) is not None
+
+
+def test_results_that_are_not_whole_are_not_taken_for_such_by_a_failed_attempt_to_replace_them(tmp_path: Path) -> None:
+    with claim(tmp_path, {}) as unfinished:
+        unfinished.begin(0)
+    with pytest.raises(RuntimeError), claim(tmp_path, {"other": 1}):
+        raise RuntimeError
+    with pytest.raises(InputError, match="did not finish"):
+        require_whole(tmp_path)
 
 
 def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> None:

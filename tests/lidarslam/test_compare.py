@@ -227,6 +227,21 @@ def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tm
         assert own == sequence
 
 
+def test_an_interruption_before_any_turn_is_written_for_every_recording(
+    recording: Path, tmp_path: Path, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarslam.compare.comparison.run_method", interrupted)
+    entries = (RecordingEntry(recording), RecordingEntry(recording, start=1))
+    outcome = compare(_request(recording, tmp_path, "kiss-icp", recordings=entries), told.narrator)
+    assert outcome.interrupted
+    for name in ("room", "room-2"):
+        content = json.loads((tmp_path / name / "comparison.json").read_text())
+        assert content["methods"]["kiss-icp"]["status"] == "not run"
+
+
 def test_mistakes_are_found_before_anything_is_run(recording: Path, tmp_path: Path, told: Told) -> None:
     out = tmp_path / "out"
     bare, lost = RecordingEntry(recording), RecordingEntry(tmp_path / "nowhere")

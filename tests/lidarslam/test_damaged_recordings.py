@@ -317,6 +317,12 @@ def test_pipes_are_not_waited_for(tmp_path, tables):
     assert (summary["scans"], left_out(summary)) == (6, 2)
 
 
+@pytest.mark.parametrize("name", ["räder 点 a b", "two  spaces", "'quoted' \"names\"", "%2e?#&;", "\u00ff latin"])
+def test_names_that_are_odd(tmp_path, tables, name):
+    code, summary, _ = run(write_folder(tmp_path / name, tables[:3]), asked=3)
+    assert (code, summary["scans"]) == (0, 3)
+
+
 def test_a_name_that_no_terminal_can_show(tmp_path, tables):
     try:
         folder = write_folder(tmp_path / os.fsdecode(b"drive \xff"), tables[:3])

@@ -149,3 +149,15 @@ def test_evaluate_and_view_take_the_latest_run(whole_run: Path) -> None:
     assert evaluated.stdout.endswith("written to metrics.json\nnext: lidarslam view runs/whole\n")
     viewed = lidarslam("view", "--save", "run.rrd")
     assert (viewed.exit_code, viewed.stderr) == (0, "lidarslam: taking the latest run, runs/whole\n")
+
+
+def test_results_are_named_after_sequence_and_data_set() -> None:
+    Path("disk/nuscenes/v1.0-mini").mkdir(parents=True)
+    Path("disk/nuscenes/v1.0-mini/scene.json").touch()
+    Path("disk/area/MathildaAVE/poses").mkdir(parents=True)
+    Path("disk/area/MathildaAVE/poses/gt_poses.txt").touch()
+    assert source_name(Path("disk/nuscenes"), "scene-0061") == "nuscenes_scene-0061"
+    assert source_name(Path("disk/area"), "MathildaAVE") == "area_MathildaAVE"
+    assert source_name(Path("disk/area/MathildaAVE"), "MathildaAVE") == "MathildaAVE"
+    assert source_name(Path("disk/site.bag"), "04") == "site"
+    assert source_name(Path("evalio_data/hilti_2022/basement_2")) == "hilti_2022_basement_2"

@@ -7,6 +7,8 @@ import pytest
 from click.testing import Result
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.folders.scan_files import read_ply
+from lidarslam.odometry.network.exported import DESCRIPTION, read_exported
 from lidarslam.storage.comparison_folder import run_directories
 
 from ..conftest import lidarslam
@@ -49,6 +51,23 @@ def test_a_forged_comparison(tmp_path: Path, text: str) -> None:
     (tmp_path / "comparison.json").write_text(text)
     with pytest.raises(InputError, match=r"comparison\.json: not a comparison"):
         run_directories(tmp_path)
+
+
+@pytest.mark.parametrize("text", [f'{{"kind": "x", "version": {LONG}}}', DEEP, "[]", '{"version": 1e999}'])
+def test_a_forged_network(tmp_path: Path, text: str) -> None:
+    (tmp_path / DESCRIPTION).write_text(text)
+    with pytest.raises(InputError, match=f"{DESCRIPTION} is missing or damaged"):
+        read_exported(tmp_path)
+
+
+@pytest.mark.parametrize("count", ["99999999999999999999", "9223372036854775807", "1000000000000", LONG])
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_a_ply_with_endless_faces_before_its_vertices(tmp_path: Path, count: str, encoding: str) -> None:
+    path = tmp_path / "scan.ply"
+    elements = f"element face {count}\nproperty int a\nelement vertex 1\nproperty float x\n"
+    path.write_text(f"ply\nformat {encoding} 1.0\n{elements}end_header\n1\n2\n3.0\n")
+    with pytest.raises(InputError, match="not a readable PLY file"):
+        read_ply(path)
 
 
 NAMES = ["/abs/path", "../../x", "a/b", "..", "", "a\\0b", "\\e[2J", "report.html", "x" * 121]

@@ -110,20 +110,74 @@ def simulated(room, drive) -> list[SimulatedScan]:
     return scans
 
 
+def write_pcap(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    """A third of a second of a VLP-16 that sees 5 m everywhere."""
+    folder.mkdir()
+    with (folder / "drive.pcap").open("wb") as file:
+        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
+        for number in range(260):
+            second = number * 24 * 55.296e-6
+            blocks = [
+                struct.pack("<HH", 0xEEFF, round(36000 * (10 * second + block * 0.0011)) % 36000)
+                + struct.pack("<HB", 2500 + 40 * block, 9) * 32
+                for block in range(12)
+            ]
+            payload = b"".join(blocks) + struct.pack("<IBB", round(1e6 * (123.25 + second)), 0x37, 0x22)
+            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+            ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, b"\xc0\xa8\1\xc9", b"\xff" * 4)
+            frame = b"\xff" * 6 + b"\1" * 6 + b"\x08\x00" + ip + udp
+            stamp = divmod(round(1e6 * (1_700_000_123.25 + second)), 10**6)
+            file.write(struct.pack("<IIII", *stamp, len(frame), len(frame)) + frame)
+
+
 def write_npy(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
     stamps = np.array([simulated.scan.stamp for simulated in scans])
     truth = Trajectory(stamps, rig.T_world_lidar_at(stamps))
     write_recording(folder, [simulated.scan for simulated in scans], truth, is_timed=True)
 
 
-# The writer, and the files of a recording that are damaged.
-RECORDINGS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
-    "kitti": (write_kitti, ("**/000001.bin", "**/times.txt", "**/calib.txt", "poses/*.txt")),
-    "ply": (write_ply_scans, ("*1.ply", "timestamps.txt", "imu.csv")),
-    "npy": (write_npy, ("*1.npy", "timestamps.txt", "ground_truth.tum")),
-    "rosbag1": (FORMATS["rosbag1"].write, ("*.bag",)),
-    "rosbag2": (FORMATS["rosbag2"].write, ("*.db3", "metadata.yaml")),
-    "mcap": (FORMATS["mcap"].write, ("*.mcap", "metadata.yaml")),
+def write_pcd(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    """The first two in text, the others in binary."""
+    folder.mkdir()
+    for number, simulated in enumerate(scans):
+        points, path = simulated.scan.points.astype("f4"), folder / f"{number}.pcd"
+        if number > 1:
+            write_cloud(path, PointCloud(points.astype(np.float64), np.tile([0.0, 0.0, 1.0], (len(points), 1))))
+            continue
+        header = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+        rows = "\n".join(" ".join(f"{value:.4f}" for value in point) for point in points)
+        path.write_text(f"{header}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n{rows}\n")
+
+
+def write_raw(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    """A drive of KITTI raw."""
+    drive = folder / "2011_09_26" / "drive_sync"
+    (drive / "velodyne_points" / "data").mkdir(parents=True)
+    (drive / "oxts" / "data").mkdir(parents=True)
+    lines = [f"2011-09-26 13:02:2{number}.950000000\n" for number in range(len(scans))]
+    for number, simulated in enumerate(scans):
+        points = np.column_stack([simulated.scan.points, simulated.intensities]).astype("<f4")
+        (drive / "velodyne_points" / "data" / f"{number:010d}.bin").write_bytes(points.tobytes())
+        numbers = [49.0 + 1e-6 * number, 8.4, 110.0, 0.01, 0.02, 0.1 * number, *[0.1] * 24]
+        (drive / "oxts" / "data" / f"{number:010d}.txt").write_text(" ".join(map(str, numbers)) + "\n")
+    for name in ("velodyne_points/timestamps.txt", "oxts/timestamps.txt"):
+        (drive / name).write_text("".join(lines))
+    extrinsic = "R: 1 0 0 0 1 0 0 0 1\nT: 0.8 -0.3 0.8\n"
+    (folder / "2011_09_26" / "calib_imu_to_velo.txt").write_text(extrinsic)
+    (folder / "2011_09_26" / "calib_velo_to_cam.txt").write_text(extrinsic)
+
+
+# The writer, the source within its folder, and the files of it that are damaged.
+RECORDINGS: dict[str, tuple[Callable[..., None], str, tuple[str, ...]]] = {
+    "kitti": (write_kitti, ".", ("**/000001.bin", "**/times.txt", "**/calib.txt", "poses/*.txt")),
+    "raw": (write_raw, "2011_09_26/drive_sync", ("**/*1.bin", "**/*.txt")),
+    "ply": (write_ply_scans, ".", ("*1.ply", "timestamps.txt", "imu.csv")),
+    "pcd": (write_pcd, ".", ("1.pcd", "2.pcd")),
+    "npy": (write_npy, ".", ("*1.npy", "timestamps.txt", "ground_truth.tum")),
+    "rosbag1": (FORMATS["rosbag1"].write, ".", ("*.bag",)),
+    "rosbag2": (FORMATS["rosbag2"].write, ".", ("*.db3", "metadata.yaml")),
+    "mcap": (FORMATS["mcap"].write, ".", ("*.mcap", "metadata.yaml")),
+    "pcap": (write_pcap, "drive.pcap", ("drive.pcap",)),
 }
 
 
@@ -133,7 +187,7 @@ def recordings(tmp_path_factory, simulated, drive) -> Path:
     root = tmp_path_factory.mktemp("whole")
     times = np.arange(0.0, 0.6, 0.01)
     imu = ImuSamples(times, np.tile([0.0, 0.0, 0.3], (len(times), 1)), np.tile([0.0, 0.0, 9.81], (len(times), 1)))
-    for name, (write, _) in RECORDINGS.items():
+    for name, (write, _, _) in RECORDINGS.items():
         write(root / name, simulated, Rig("velodyne", 0.1, drive, imu))
     return root
 
@@ -183,6 +237,9 @@ DEEP = "[" * 100_000
 _PLY = (
     "ply\nformat {} 1.0\nelement face {}\nproperty int a\nelement vertex 1\nproperty float x\nend_header\n1\n2\n3.0\n"
 )
+_PCD = (
+    "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n1 2 3\n"
+)
 _NPY = b"\x93NUMPY\1\0v\0{'descr': '<f8', 'fortran_order': False, 'shape': (%d, 4), }"
 # Faults of earlier days: the pattern of the file, as a share of them, and its content.
 SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
@@ -190,6 +247,7 @@ SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
         *[(0.0, seed(_PLY.format(kind, 10**20 - 1))) for kind in ("ascii", "binary_little_endian")],
         (0.4, seed("1e999\n" * 4)),
     ],
+    "pcd": [(0.0, seed(_PCD.format(10**12, kind))) for kind in ("ascii", "binary", "binary_compressed")],
     "npy": [(0.0, seed((_NPY % 10**12).ljust(127) + b"\n")), (0.4, seed(b"\xff" * 64))],
     "rosbag2": [(0.6, seed(DEEP)), (0.6, seed("rosbag2_bagfile_information: &a [*a]\n"))],
     "kitti": [(0.3, seed("nan\n" * 4))],
@@ -198,7 +256,9 @@ SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
 
 @pytest.mark.parametrize("kind", RECORDINGS)
 def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    _, patterns = RECORDINGS[kind]
+    if kind == "pcap":
+        pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
+    _, source, patterns = RECORDINGS[kind]
 
     def check(which: float, made: list[Change]) -> None:
         folder = tmp_path / kind
@@ -206,8 +266,8 @@ def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pyte
         shutil.copytree(recordings / kind, folder)
         damage(folder, patterns, which, made)
         with nothing_else_changes(tmp_path, monkeypatch):
-            ends_well("info", folder)
-            ends_well("run", folder, "--out", tmp_path / "out", "--overwrite", *FAST)
+            ends_well("info", folder / source)
+            ends_well("run", folder / source, "--out", tmp_path / "out", "--overwrite", *FAST)
 
     for which, made in SEEDS.get(kind, []):
         check = example(which, made)(check)

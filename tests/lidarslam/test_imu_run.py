@@ -210,6 +210,17 @@ def test_a_programs_own_loop_takes_the_samples_as_they_come(longer: Path, is_giv
     assert np.rad2deg(np.sqrt((rotation_angle(inverse(motions) @ true) ** 2).mean())) < 0.15
 
 
+@pytest.mark.long
+def test_a_late_clock_is_corrected_on_the_way(longer: Path, tmp_path: Path) -> None:
+    late = flawed(longer, tmp_path / "late", lambda rows: rows + np.eye(7)[0] * 0.02)
+    angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
+    with lidarslam.Slam({"odometry": {"method": "imu", "imu_rotation_deg": angles}, "mapping.keypoints": 800}) as slam:
+        register_all(slam, late)
+        slam.save(tmp_path / "run")
+    warnings = json.loads((tmp_path / "run" / "summary.json").read_text())["warnings"]
+    assert any(re.search(r"stamps are (1[6-9]|2[0-4]) ms late; corrected", warning) for warning in warnings), warnings
+
+
 def test_samples_are_checked(tmp_path: Path) -> None:
     with lidarslam.Slam({"odometry.method": "imu"}) as slam:
         slam.register_imu(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])

@@ -96,6 +96,16 @@ def test_tiles_of_others_are_not_touched(small_recording: Path, tmp_path: Path) 
     assert [path.read_text() for path in elsewhere.iterdir()] == ["precious", "precious"]
 
 
+def test_a_file_in_the_way_of_the_tiles(small_recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "map").write_text("a file")
+    result = lidarslam("run", small_recording, "--out", out, *FAST, *BOUND)
+    assert result.exit_code == 1
+    assert f"{out / 'map'}: a file is in the way; name another directory" in result.stderr
+    assert [path.name for path in out.iterdir()] == ["map"]
+
+
 def test_a_merge_with_tiles(small_recording: Path, tmp_path: Path) -> None:
     """The common map and that of each recording."""
     sources = [shutil.copytree(small_recording, tmp_path / name) for name in ("one", "two")]

@@ -8,7 +8,13 @@ import open3d as o3d
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.odometry.methods.consistency import ConsistencyCheck
+from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.pipeline.localisation import OdometryAlone
+from lidarslam.pipeline.pipeline import Pipeline
 
 from ..conftest import lidarslam
 
@@ -114,6 +120,28 @@ def test_the_last_map_that_rerun_shows_is_the_written_one(source: Path, tmp_path
     points = np.stack(list(shown[-1]))
     assert len(points) == len(written(tmp_path / "run"))
     np.testing.assert_allclose(np.sort(points, axis=0), np.sort(written(tmp_path / "run"), axis=0), atol=1e-4)
+
+
+def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
+    """Also after a scan that shows nothing, and with a state restored in between."""
+    T_world_lidar, stamps = truth().T_world_lidar, truth().stamps
+    given = [Scan(points, float(stamp)) for points, stamp in zip(scans, stamps, strict=True)]
+    for number in range(20, 25):
+        given[number] = given[number].select(np.arange(0))
+    localiser = OdometryAlone(ConsistencyCheck())
+    pipeline = Pipeline(ExternalOdometry(truth()), localiser, GlobalMapConfig(voxel_size_m=0.1))
+    results = list(pipeline.run(given))
+    poses = np.array([result.T_world_lidar for result in results])
+    numbers = pipeline.map.views.state()["_numbers"]
+    assert numbers[:2].tolist() == [0, 2]
+    assert not set(numbers) & set(range(20, 25))
+    placed = pipeline.map.views.placed(poses)
+    np.testing.assert_array_equal(placed.T_world_lidar, poses[numbers])
+    # The image is that of the scan with this number: nearest ranges, a fraction of a voxel apart.
+    last = int(numbers[-1])
+    nearest = np.linalg.norm(results[last].points, axis=1).min()
+    assert placed.images[-1][placed.images[-1] > 0.0].min() == pytest.approx(nearest, rel=1e-3)
+    assert T_world_lidar[last, 0, 3] == pytest.approx(placed.T_world_lidar[-1, 0, 3], abs=1e-6)
 
 
 def test_moved_points_are_removed_again_with_other_settings(source: Path, tmp_path: Path) -> None:

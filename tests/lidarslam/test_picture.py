@@ -107,6 +107,15 @@ def test_the_scale_bar_is_as_long_as_it_says(size_m: float) -> None:
     assert 0.07 * 1600 < longest <= 0.2 * 1600
 
 
+def test_the_thin_ends_of_a_long_drive_are_in_the_frame(rng: np.random.Generator) -> None:
+    dense = rng.normal(0.0, 5.0, (50_000, 3)) * [1.0, 1.0, 0.1]
+    thin = np.column_stack([np.linspace(-300.0, 300.0, 2_000), np.zeros((2_000, 2))])
+    view = fit_view(np.concatenate([dense, thin]), np.empty((0, 3)), width=WIDTH)
+    pixels = view.project(thin)
+    assert pixels[:, 0].min() > 0
+    assert pixels[:, 0].max() < WIDTH
+
+
 def test_a_stray_point_does_not_shrink_the_scene() -> None:
     stray = np.array([[5_000.0, 0.0, 0.0]])
     view = fit_view(np.concatenate([plane(0.0), stray]), np.empty((0, 3)), turn_deg=0.0, width=WIDTH)
@@ -135,6 +144,19 @@ def test_a_ceiling_seen_from_below_does_not_hide_the_floor() -> None:
     both = PointCloud(np.concatenate([floor.points, ceiling.points]), np.concatenate([floor.normals, ceiling.normals]))
     view = fit_view(both.points, np.empty((0, 3)), width=WIDTH)
     assert (draw_layer(both.points, both.normals, view).points < len(floor)).all()
+
+
+@pytest.mark.parametrize("elevation_deg", [TOP, OBLIQUE])
+def test_a_plane_is_closed_and_evenly_lit(elevation_deg: float) -> None:
+    floor = cloud(plane(0.0, count=120))
+    layer = draw_layer(floor.points, floor.normals, view := fit_view(floor.points, np.empty((0, 3)), elevation_deg))
+    covered = np.zeros(view.height * view.width, dtype=bool)
+    covered[layer.pixels] = True
+    row, column = (side // 2 for side in (view.height, view.width))
+    assert covered.reshape(view.height, view.width)[row - 50 : row + 50, column - 50 : column + 50].all()
+    assert np.median(layer.brightness) > 0.75
+    inner = np.abs(layer.brightness - np.median(layer.brightness)) < 0.15
+    assert inner.mean() > 0.9
 
 
 def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:

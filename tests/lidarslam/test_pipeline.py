@@ -167,6 +167,14 @@ def test_a_follower_sees_what_a_scan_showed_before_the_next(
     )
 
 
+def test_a_follower_hears_of_a_lost_scan_and_does_not_draw_it(room_scans: list[Scan], room_truth: Trajectory) -> None:
+    notes = _Notes()
+    list(followed(_Astray(room_truth, 19, [0.0] * 6, "the sensor was covered"), notes).run(room_scans))
+    assert [scan.lost for scan in notes.scans] == [False] * 19 + [True]
+    assert notes.scans[19].T_prev_curr is None
+    assert isinstance(notes.told[-1], GraphScan)
+
+
 def test_a_follower_is_up_to_date_when_a_run_is_broken_off(
     true_odometry: ExternalOdometry, room_scans: list[Scan]
 ) -> None:

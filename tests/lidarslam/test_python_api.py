@@ -184,6 +184,12 @@ def test_arrays_are_corrected_as_the_settings_of_the_reader_say(room_scans: list
         np.testing.assert_allclose(as_it_is.T_world_lidar, plain.register_frame(room_scans[4]).T_world_lidar, atol=1e-6)
 
 
+def test_only_a_pose_graph_changes_earlier_poses(room_scans: list[Scan]) -> None:
+    for settings, is_final in ((SETTINGS, True), (GRAPH, False)):
+        with Slam(settings) as slam:
+            assert slam.register_frame(room_scans[0]).is_final is is_final
+
+
 def test_clouds_of_open3d_go_in_and_out(slam: Slam, room_scans: list[Scan]) -> None:
     import open3d as o3d
 
@@ -216,13 +222,21 @@ POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (60, 3))
     ("points", "times", "stamp", "told"),
     [
         (np.zeros((5, 2)), None, 0.2, r"must be \(N, 3\).* \(5, 2\)"),
+        (np.zeros((2, 5, 3)), None, 0.2, r"must be \(N, 3\)"),
         (POINTS.T, None, 0.2, r"\(3, 60\); give points\.T"),
+        (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "got the fields x, y"),
+        (np.array([["a", "b", "c"]]), None, 0.2, "array of numbers"),
         ([[1.0, 2.0], [1.0]], None, 0.2, "array of numbers"),
         (POINTS, np.zeros(7), 0.2, "7 for 60 points"),
+        (POINTS, np.full(60, 1.7e9), 2.0, "subtract the stamp"),
         (POINTS, np.linspace(0, 1e8, 60), 2.0, "nanoseconds by 1e-9"),
+        (POINTS, np.linspace(0, 1, 60), 0.2, "multiply times from 0 to 1"),
         (POINTS, None, 0.1, "is not after the scan before, 0.100000000 s"),
+        (POINTS, None, -1.0, "stamps must increase"),
+        (POINTS, None, None, "with every scan or with none"),
         (POINTS, None, float("nan"), "finite"),
         (POINTS, None, 1_700_000_000_000_000_000, "nanoseconds by 1e-9"),
+        (POINTS, None, "now", "a number of seconds"),
         (Scan(POINTS, 0.2), None, 0.2, "give it alone"),
     ],
 )
@@ -317,7 +331,9 @@ def test_configurations_of_every_form(tmp_path: Path) -> None:
     ("settings", "told"),
     [
         ({"odometry": {"method": "icp"}}, "no odometry is called 'icp'"),
+        ({"odometry.method": "external"}, "odometry.method=external"),
         ({"odometry.method": "constant-velocity", "mapping": {"method": "off"}}, "needs scan-to-map registration"),
+        ({"odometry": 3, "odometry.method": "kiss-icp"}, "odometry is a value, not a section"),
         ("no such file.yaml", "no such file.yaml"),
     ],
 )

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from lidarslam.config.settings import ViewerConfig, load_config
-from lidarslam.core.errors import OutputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
@@ -99,6 +99,14 @@ def test_a_run_with_a_window_and_no_display_ends_before_it_begins(small_recordin
     with pytest.raises(OutputError, match=r"no display .* --rerun web, .* --rerun save"):
         execute(request, lambda *_: None)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not a recording"])
+def test_a_file_that_is_no_recording_gets_one_line(tmp_path: Path, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / "some.rrd").write_bytes(content)
+    with pytest.raises(InputError, match=r"some\.rrd: no"):
+        show_file_in_window(tmp_path / "some.rrd")
 
 
 @pytest.fixture

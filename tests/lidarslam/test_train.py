@@ -22,7 +22,7 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.training.config import SimulatedConfig
+from lidarslam.odometry.training.config import LossConfig, SimulatedConfig
 from lidarslam.odometry.training.pairs import AUGMENTATION, Pairs
 from lidarslam.odometry.training.preparation import PreparedRecording
 from lidarslam.odometry.training.training import summarise, validate
@@ -30,7 +30,7 @@ from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import data as training_data
 from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
-from lidarslam.train.settings import load_train_config
+from lidarslam.train.settings import LOSSES, load_train_config
 from lidarslam.train.train import TrainRequest, execute
 
 from ..conftest import lidarslam
@@ -271,6 +271,21 @@ def test_of_the_simulated_recordings_some_kinds_can_be_chosen():
         simulated(SimulatedConfig(recordings=1, worlds=("strete",)))
     with pytest.raises(ConfigError, match=r"simulated\.recordings=1: none is of the worlds"):
         simulated(SimulatedConfig(recordings=1, worlds=("park",)))
+
+
+@pytest.mark.parametrize(
+    ("name", "geometric", "alignment_weight"),
+    [
+        ("both", LossConfig(), 0.0),
+        ("paper", LossConfig(robust=False), 0.0),
+        ("point-to-plane", LossConfig(plane_to_plane=False), 0.0),
+        ("plane-to-plane", LossConfig(point_to_plane=False), 0.0),
+        ("alignment", None, 1.0),
+    ],
+)
+def test_named_losses(name, geometric, alignment_weight):
+    config = load_train_config(None, LOSSES[name]).training
+    assert (config.geometric, config.alignment_weight) == (geometric, alignment_weight)
 
 
 def train(*arguments: object) -> Result:

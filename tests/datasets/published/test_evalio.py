@@ -205,6 +205,11 @@ def test_what_is_not_downloaded_names_the_command(evalio_data: Path) -> None:
         open_recording(Path("evalio:hilti_2022/basement_2"))
 
 
+def test_the_command_names_a_folder_of_its_own(evalio_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"evalio -D {tmp_path} dl hilti_2022/basement_2$"):
+        open_recording(tmp_path / "hilti_2022" / "basement_2")
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

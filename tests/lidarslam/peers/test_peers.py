@@ -11,7 +11,7 @@ import pytest
 
 from lidarslam.compare.methods import scene_range_m
 from lidarslam.compare.peers.estimation import estimate, is_covered
-from lidarslam.compare.peers.interface import Poses, Sweep
+from lidarslam.compare.peers.interface import PeerError, Poses, Sweep
 from lidarslam.compare.peers.registry import PEERS
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.imu import ImuSamples
@@ -79,6 +79,13 @@ def test_scans_in_a_gap_or_far_outside_the_poses_have_none() -> None:
     instants = np.array([0.0, 3.0, 3.1, 3.2, 3.3])
     stamps = np.array([-1.0, 0.0, 1.5, 2.9, 3.0, 3.35, 3.5, 4.0])
     np.testing.assert_array_equal(is_covered(instants, stamps), [False, False, False, False, True, True, True, False])
+
+
+def test_poses_that_are_none_are_an_error() -> None:
+    exact = _Exact()
+    exact.finish = lambda: Poses(np.arange(2.0), np.full((2, 4, 4), np.nan))  # type: ignore[method-assign]
+    with pytest.raises(PeerError, match="not finite"):
+        estimate(_peer(exact), _scans(3))
 
 
 def test_ct_icps_poses_stand_at_the_starts_but_for_the_first_and_the_second() -> None:
