@@ -1,5 +1,6 @@
 """From odometry to a pose: what the motion during a sweep is taken for, and the way through the whole pipeline."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -10,9 +11,10 @@ import pytest
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
@@ -168,6 +170,23 @@ def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:
         mapper.process(mapper.sample(room_scans[0]), Prior())
         assert type(mapper.local_map) is kind
     assert isinstance(make_localiser(Config(mapping=MappingConfig(method="off"))), OdometryAlone)
+
+
+@pytest.mark.parametrize("method", ["surfels", "loam"])
+def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
+    room_scans: list[Scan], room_truth: Trajectory, method: MappingName
+) -> None:
+    config = Config(mapping=MappingConfig(method=method))
+    motions = [np.eye(4), *room_truth.relative_motions()]
+    estimates = [ScanOdometry(scan, Motion(T, 100), 0.1) for scan, T in zip(room_scans[:8], motions, strict=False)]
+    whole, resumed = make_localiser(config), make_localiser(config)
+    for estimated in estimates[:5]:
+        whole.localise(estimated, None)
+    resumed.restore(Saved(copy.deepcopy(whole.state())))
+    for estimated in estimates[5:]:
+        first, second = whole.localise(estimated, None), resumed.localise(estimated, None)
+        np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
+        np.testing.assert_array_equal(first.T_odom_lidar, second.T_odom_lidar)
 
 
 def test_scans_may_be_thinned_ahead_of_their_poses(room_scans: list[Scan], room_truth: Trajectory) -> None:

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.config import KeyframeConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
@@ -77,3 +79,15 @@ def test_a_map_that_has_forgotten_goes_on(rng, through_disk, monkeypatch, tidied
         found = restored.match(queries, np.eye(4))
         for name, value in vars(whole.match(queries, np.eye(4))).items():
             np.testing.assert_array_equal(getattr(found, name), value)
+
+
+def test_keyframes_are_chosen_as_before(rng, through_disk):
+    points = rng.uniform(-5.0, 5.0, (2000, 3))
+    selector, restored = KeyframeSelector(KeyframeConfig()), KeyframeSelector(KeyframeConfig())
+    selector.take(np.eye(4), points)
+    restored.restore(through_disk(selector.state()))
+    poses = [exp([0.0, 0.0, turn, way, 0.0, 0.0]) for turn in (0.0, 0.3, 1.0) for way in (0.0, 0.5, 0.9, 2.0)]
+    answers = [selector.is_due(pose, points) for pose in poses]
+    assert set(answers) == {True, False}
+    assert [restored.is_due(pose, points) for pose in poses] == answers
+    assert restored.is_due(np.eye(4), points + 3.0) == selector.is_due(np.eye(4), points + 3.0)
