@@ -8,7 +8,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import KeyframeConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
