@@ -44,11 +44,11 @@ TRANSFORM = Shape(4, 4)
 
 
 class Saved:
-    """A tree read back from a file."""
+    """A tree read back from a file; the place of the tree and the remedy are for errors."""
 
-    def __init__(self, values: Mapping[str, Any], place: str = "the state") -> None:
+    def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:
         self._values = values
-        self.place = place  # for errors
+        self.place, self.remedy = place, remedy
 
     def value(self, name: str) -> Any:
         """The tree under a name; InputError where there is none."""
@@ -66,11 +66,11 @@ class Saved:
 
     def branch(self, tree: Any) -> "Saved":
         """A branch at this place."""
-        return Saved(tree, self.place)
+        return Saved(tree, self.place, self.remedy)
 
     def refuse(self, reason: str) -> InputError:
         """The error for a tree of another version of the program."""
-        return InputError(f"{self.place}: is not what this program saves ({reason}); begin again with --overwrite")
+        return InputError(f"{self.place}: is not what this program saves ({reason}); {self.remedy}")
 
 
 @typing.runtime_checkable
@@ -273,7 +273,7 @@ class BlockFile(Stateful):
         is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
         for index, checksum in enumerate(self._checksums):
             if is_short or zlib.crc32(self.read(index)) != checksum:
-                raise InputError(f"{self._path}: is damaged (block {index}); begin again with --overwrite")
+                raise InputError(f"{self._path}: is damaged (block {index}); {saved.remedy}")
 
     def __len__(self) -> int:
         return len(self._checksums)

@@ -21,6 +21,8 @@ _DAMAGE = (
     zipfile.BadZipFile, zlib.error, MemoryError, OverflowError,  # a damaged shape
 )  # fmt: skip
 
+_REMEDY = "begin again with --overwrite"
+
 
 def write_state(path: Path, state: State) -> None:
     """Write the file, or raise an OutputError; after a power failure, the earlier one or the whole new one exists."""
@@ -44,8 +46,8 @@ def read_state(path: Path) -> Saved:
         raise InputError(f"{path}: no such file") from None
     except _DAMAGE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: is damaged ({reason}); begin again with --overwrite") from error
-    return Saved(values, str(path))
+        raise InputError(f"{path}: is damaged ({reason}); {_REMEDY}") from error
+    return Saved(values, str(path), _REMEDY)
 
 
 def _encoded(value: Any, arrays: list[NDArray[Any]]) -> Any:
