@@ -243,6 +243,15 @@ class _Kept:
 
 
 @dataclass(frozen=True, eq=False)
+class _Candidate:
+    """The latest scan."""
+
+    number: int
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]
+    points: Annotated[FloatArray, Shape(None, 3)]
+
+
+@dataclass(frozen=True, eq=False)
 class PairTest:
     """Votes of a pair of scans for shifts along a direction."""
 
@@ -287,8 +296,7 @@ class ConsistencyCheck(Stateful):
 
     tests: list[PairTest]
     _kept: list[_Kept]
-    # number, pose and points of the latest scan, unless it was kept
-    _latest: tuple[int, Annotated[FloatArray, TRANSFORM], Annotated[FloatArray, Shape(None, 3)]] | None
+    _latest: _Candidate | None  # unless it was kept
     _since_due: int
     _due: int
     _T_due: Annotated[FloatArray, TRANSFORM] | None
@@ -301,7 +309,7 @@ class ConsistencyCheck(Stateful):
     def add(self, points: FloatArray, number: int, T_world_lidar: FloatArray) -> None:
         """Add the next scan of the map, compensated points (N, 3); some are kept and paired with the ones before."""
         self._since_due += 1
-        self._latest = number, T_world_lidar, points
+        self._latest = _Candidate(number, T_world_lidar, points)
         if self._T_due is not None and self._since_due < _EVERY_SCANS:
             way = T_world_lidar[:3, 3] - self._T_due[:3, 3]
             if float(np.linalg.norm(way)) < _EVERY_M:
@@ -317,8 +325,7 @@ class ConsistencyCheck(Stateful):
         latest, self._latest = self._latest, None
         if latest is None:
             return
-        number, T_world_lidar, points = latest
-        new = _Kept(number, T_world_lidar, Surfels.of(points))
+        new = _Kept(latest.number, latest.T_world_lidar, Surfels.of(latest.points))
         for kept in self._kept:
             self.tests += _tests(kept, new)
         self._kept = [*self._kept, new][-_PARTNERS:]

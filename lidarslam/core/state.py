@@ -200,7 +200,7 @@ def _encode_list(kind: Any, values: list[Any]) -> Any:
         return np.stack(values)
     if _is_columnar(bare):
         columns = {name: (hint, [getattr(one, name) for one in values]) for name, hint in _hints(bare).items()}
-        return {"count": len(values)} | {name: _encode_list(*column) for name, column in columns.items()}
+        return {name: _encode_list(*column) for name, column in columns.items()}
     return [encode(kind, value) for value in values]
 
 

@@ -193,8 +193,9 @@ def redrawn(run: Path, least_through: int) -> tuple[PointCloud, int]:
             views.add(thinned.points, index)
     if drawn is None:
         raise InputError(f"{run}: no scan of its recording has points")
-    moved = np.zeros(len(drawn.points()), dtype=np.bool_)
+    points = drawn.points()
+    moved = np.zeros(len(points), dtype=np.bool_)
     if least_through:
-        moved = seen_through(drawn.points(), views.placed(poses), drawn.voxel_size_m, least_through)
+        moved = seen_through(points, views.placed(poses), drawn.voxel_size_m, least_through)
     cloud = drawn.cloud(moved)
     return PointCloud(cloud.points, cloud.normals, cloud.attributes.only(config.fields)), int(moved.sum())

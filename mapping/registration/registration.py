@@ -14,8 +14,9 @@ from lidarslam.core.tracking import Degeneracy, lever_scale
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
 from lidarslam.mapping.registration.gauss_newton import DEGENERATE_INFORMATION, degenerate_directions
+from lidarslam.mapping.registration.large_surfaces import INFLATION, inflation_of_small
 from lidarslam.mapping.registration.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
-from lidarslam.mapping.registration.local_map import INFLATION, LEVELS, LocalMap, Matcher, Surfaces, inflation_of_small
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.

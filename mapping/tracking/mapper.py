@@ -25,8 +25,8 @@ from lidarslam.mapping.motion.prediction import (
     MotionState,
     Prediction,
     Prior,
-    velocity_error,
 )
+from lidarslam.mapping.motion.velocity_bias import velocity_error
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap

@@ -16,6 +16,7 @@ from lidarslam.mapping.motion.prediction import (
     ProcessNoise,
     predict,
 )
+from lidarslam.mapping.surfels.stability import constraining_points
 from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.mapped_scan import Attempt
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
@@ -23,7 +24,6 @@ from lidarslam.mapping.tracking.start_poses import (
     SCORED_POINTS,
     best_supported,
     best_velocity,
-    constraining_points,
     positions_around,
 )
 from lidarslam.mapping.tracking.tracking_state import TrackingState

@@ -6,7 +6,8 @@ from lidarslam.core.geometry import displacement_m, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior, VelocityBias
+from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
+from lidarslam.mapping.motion.velocity_bias import VelocityBias
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.budget import Budget
@@ -15,7 +16,7 @@ from lidarslam.mapping.tracking.mapped_scan import Attempt, MappedScan, best_of,
 from lidarslam.mapping.tracking.near_search import WEAK_CAUTION, NearSearch
 from lidarslam.mapping.tracking.relocalisation import ArchivedMaps, SpreadSearch, search_nearby
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
-from lidarslam.mapping.tracking.tracking_state import ERROR_DECAY, TrackingState
+from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
@@ -95,10 +96,9 @@ class Tracker(Stateful):
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not relocalised:
             tracking = tracking.moved(last, state, motion, prior, self._config)
-        velocity_known, error_m = not (jumped or relocalised), displacement_m(attempt.correction, scan.range_m)
-        error_m = max(ERROR_DECAY * tracking.prediction_error_m, error_m)
-        tracking = replace(tracking, velocity_known=velocity_known, velocity_bias=bias, prediction_error_m=error_m)
-        self.tracking = tracking
+        tracking = tracking.with_prediction_error(displacement_m(attempt.correction, scan.range_m))
+        velocity_known = not (jumped or relocalised)
+        self.tracking = tracking = replace(tracking, velocity_known=velocity_known, velocity_bias=bias)
         if not velocity_known:
             velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
             state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)

@@ -13,9 +13,9 @@ from lidarslam.mapping.motion.prediction import (
     Prediction,
     Prior,
     ProcessNoise,
-    VelocityBias,
     predict,
 )
+from lidarslam.mapping.motion.velocity_bias import VelocityBias
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 
 # After a gap of this length between scans the pose is uncertain.
@@ -33,7 +33,7 @@ _LASTING_CONFLICT = 6
 GIVE_UP_AFTER = 20
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
 # error is forgotten by a factor per scan.
-_FINE_ERROR_CELLS, ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
+_FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
 
 
 @dataclass(frozen=True)
@@ -146,3 +146,7 @@ class TrackingState:
         lasting = axis if conflicts >= _LASTING_CONFLICT else None
         noise = replace(self, process_noise=process_noise, odometry_noise=odometry_noise)
         return replace(noise, conflicts=conflicts, lasting_conflict=lasting)
+
+    def with_prediction_error(self, error_m: float) -> "TrackingState":
+        """With the error of the latest prediction."""
+        return replace(self, prediction_error_m=max(_ERROR_DECAY * self.prediction_error_m, error_m))

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from lidarslam.mapping.motion.prediction import MotionState, VelocityBias
+from lidarslam.mapping.motion.prediction import MotionState
+from lidarslam.mapping.motion.velocity_bias import VelocityBias
 
 INTERVAL_S = 0.1
 VELOCITY = np.array([0.02, -0.01, 0.1, 5.0, 0.2, -0.1])  # rad/s, m/s
