@@ -13,12 +13,16 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.inertial.inertial import Inertial
 
+# Where the first two sweeps turn so differently that points at the median range are displaced this far within a sweep,
+# in cells, the first turn is estimated apart. On drives it is below 0.5, where a robot begins to turn 3.
+_LEAST_BEND_CELLS = 2.0
 # Scans that are smoothed, and those of them that show whether that is needed, where a sweep makes a map.
 SMOOTHED, SHOWING = 20, 8
 _FEWEST_KNOWN, _LEAST_OK = 6, 0.7
@@ -42,6 +46,7 @@ class _Tracking:
 
     def __init__(self, config: MappingConfig, inertial: "Inertial | None") -> None:
         self._mapper, self._inertial = Mapper(config), inertial
+        self._sampled: list[SampledScan] = []  # the first two
         self.results: list[MappedScan] = []
         self.has_rings = True
 
@@ -51,11 +56,22 @@ class _Tracking:
             prior = self._inertial.prior(scan, prior)
         sampled = self._mapper.sample(scan)
         self.has_rings &= sampled.has_rings
+        self._sampled = [*self._sampled, sampled][:2]
         mapped = self._mapper.process(sampled, prior)
         if self._inertial is not None:
             self._inertial.update(scan, mapped)
         self.results.append(mapped)
         return mapped
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the first sweep turned so differently from the second that the latter's motion would bend it."""
+        (first, second), (_, moved) = self._sampled, self.results[:2]
+        if first.is_followed_by(second):
+            return False
+        before = np.zeros(6) if moved.first_velocity is None else moved.first_velocity
+        turned = (moved.state.velocity - before)[:3] * (first.seen_from_s + first.seen_until_s)
+        return bool(np.linalg.norm(turned) * first.range_m > _LEAST_BEND_CELLS * first.cell_m)
 
 
 def smoothed_start(
@@ -65,8 +81,9 @@ def smoothed_start(
 
     The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
     scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
-    and the motions of the first half are those that this map shows. None is known where that loses track. A new
-    IMU's samples are used in both directions of time.
+    and the motions of the first half are those that this map shows, as is the first sweep's turn rate where the motion
+    to the second would bend it. None is known where that loses track. A new IMU's samples are used in both directions
+    of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
     ordered, taken, needed, least = _Tracking(unlimited, inertial), list[Scan](), False, np.inf
@@ -79,10 +96,10 @@ def smoothed_start(
                 ordered, needed = _likeliest(taken, unlimited, inertial, _quality), True
             elif not all(one.fit is None or one.fit.is_constrained for one in ordered.results):
                 ordered, needed, least = _likeliest(taken, unlimited, inertial, _constraint), True, _LEAST_CONSTRAINT
-        if len(taken) == SMOOTHED or (len(taken) == SHOWING and not needed):
+        if len(taken) == SMOOTHED or (len(taken) == SHOWING and not (needed or ordered.is_bent)):
             break
     forwards = ordered.results
-    if not needed or len(taken) < SHOWING:
+    if len(taken) < SHOWING or not (needed or ordered.is_bent):
         return {}
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
     is_plausible = sum(one.status is Status.OK for one in known) >= _LEAST_OK * len(known) or _constraint(known) > least
@@ -93,8 +110,11 @@ def smoothed_start(
     backwards = _backwards(taken, _motions(known), reverse)
     if len(_tracked_at_last(backwards)) < len(backwards):
         return {}
+    first = {taken[0].stamp: Prior(turn_rate=-backwards[-1].state.velocity[:3])} if ordered.is_bent else {}
+    if not needed:
+        return first
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
-    return {now: Prior(T, body_velocity(T, now - before), _COVARIANCE) for (before, now), T in moved}
+    return first | {now: Prior(T, body_velocity(T, now - before), _COVARIANCE) for (before, now), T in moved}
 
 
 def _quality(results: list[MappedScan]) -> float:

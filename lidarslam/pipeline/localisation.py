@@ -186,6 +186,8 @@ class ScanToMap(Stateful):
         before = self._start.get(odometry.scan.stamp, before)
         after = None if following is None else self._start.get(following.scan.stamp) or following
         velocity = SweepMotion(before.velocity, after.velocity if after else None).mean(odometry.scan)
+        if before.turn_rate is not None and velocity is not None:
+            velocity = np.concatenate([before.turn_rate, velocity[3:]])
         return replace(before, velocity=velocity)
 
 

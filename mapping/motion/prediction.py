@@ -64,6 +64,7 @@ class Prior:
     # deviations
     covariance: FloatArray | None = None
     inertial: "MotionState | None" = None  # the state that an IMU predicts
+    turn_rate: FloatArray | None = None  # (3,) of the first sweep, where it was estimated apart, in the LiDAR frame
     caution: float = 10.0  # factor on the odometry's own standard deviations: its errors are correlated in time
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:

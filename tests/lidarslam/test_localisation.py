@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lidarslam.config.settings import Config
-from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
@@ -17,6 +18,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import ConstantVelocity, Motion, Odometry
@@ -84,11 +86,13 @@ def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> No
     np.testing.assert_allclose(SweepMotion(BEFORE, AFTER).compensate(scan), expected, atol=1e-12)
 
 
-def localise_all(scans: list[Scan], motions: list[Motion]) -> list[ScanEstimate]:
-    localiser = ScanToMap(Mapper(MappingConfig()))
+def localise_all(
+    scans: list[Scan], motions: list[Motion], interval_s: float = 0.1, start: dict[float, Prior] | None = None
+) -> list[ScanEstimate]:
+    localiser = ScanToMap(Mapper(MappingConfig()), start=start)
     measured = [motion.failure is None for motion in motions]
     estimates = [
-        ScanOdometry(scan, motion, 0.1 if k and measured[k] and measured[k - 1] else None)
+        ScanOdometry(scan, motion, interval_s if k and measured[k] and measured[k - 1] else None)
         for k, (scan, motion) in enumerate(zip(scans, motions, strict=True))
     ]
     return [
@@ -118,6 +122,28 @@ def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_m
     moved = np.linalg.norm(localised[-1].T_odom_lidar[:3, 3])
     true_path = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar[-1]
     assert moved == pytest.approx(np.linalg.norm(true_path[:3, 3]), abs=0.2)
+
+
+def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any) -> None:
+    """From 20 to 180 deg/s around the first sweep: the odometry's motion to the second is not the first one's."""
+
+    def turning(times: FloatArray) -> FloatArray:
+        since = times + 0.1
+        degrees = 20.0 * since + 400.0 * np.clip(since, 0.0, 0.2) ** 2 + 160.0 * np.maximum(since - 0.2, 0.0)
+        return make_transform(
+            Rotation.from_rotvec(np.deg2rad(degrees)[:, None] * [0.0, 0.0, 1.0]).as_matrix(), np.zeros(3)
+        )
+
+    stamps = 0.2 * np.arange(SMOOTHED)
+    scans, truth = [room.ring_sweep(turning, stamp) for stamp in stamps], turning(stamps)
+    start = smoothed_start(scans, MappingConfig())
+    assert list(start) == [0.0]
+    assert np.rad2deg(start[0.0].turn_rate) == pytest.approx([0.0, 0.0, 100.0], abs=10.0)
+    motions = [np.eye(4), *(inverse(truth[:-1]) @ truth[1:])]
+    localised = localise_all(scans, [Motion(T, 100, covariance=1e-6 * np.eye(6)) for T in motions], 0.2, start)
+    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
+    assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.02
+    assert np.rad2deg(rotation_angle(errors)).max() < 0.5
 
 
 def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanEstimate], Pipeline]:
