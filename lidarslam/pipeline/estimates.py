@@ -9,13 +9,16 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.motion.deskew import body_velocity, deskew
+from lidarslam.mapping.motion.deskew import body_velocity, deskew, even
 from lidarslam.mapping.motion.prediction import GravityDirection
 from lidarslam.mapping.pose_graph.edges import GraphScan
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.odometry.interface import Motion
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
+
+# Larger accelerations, rad/s^2 and m/s^2, are errors of the odometry.
+_MOST_ACCELERATION = np.array([np.deg2rad(2000.0)] * 3 + [20.0] * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,20 @@ class ScanOdometry:
     def velocity(self) -> FloatArray | None:
         """(6,) body velocity since the previous stamp, rotation first; None when no motion was measured."""
         return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
+
+    def acceleration(self, following: "ScanOdometry | None") -> FloatArray | None:
+        """(6,) at the stamp, by the motions since the previous scan and to the next, rotation first.
+
+        None where one of them was not measured, or has no covariance.
+        """
+        if following is None or self.interval_s is None or following.interval_s is None:
+            return None
+        if self.motion.covariance is None or following.motion.covariance is None:
+            return None
+        before = body_velocity(self.motion.T_prev_curr, self.interval_s)
+        after = body_velocity(following.motion.T_prev_curr, following.interval_s)
+        acceleration = 2.0 * (after - before) / (self.interval_s + following.interval_s)
+        return np.asarray(np.clip(acceleration, -_MOST_ACCELERATION, _MOST_ACCELERATION), dtype=np.float64)
 
     def estimated(self, stage_ms: dict[str, float], **values: Any) -> "ScanEstimate":
         """The scan with its pose and quality, and the wall time of a further stage."""
@@ -51,6 +68,8 @@ class SweepMotion:
 
     before: Annotated[FloatArray, Shape(6)] | None
     after: Annotated[FloatArray, Shape(6)] | None
+    # (6,) during the sweep, by which the sweep was evened before these velocities were estimated; None where it was not
+    acceleration: Annotated[FloatArray, Shape(6)] | None = None
 
     @property
     def latest(self) -> FloatArray | None:
@@ -63,9 +82,12 @@ class SweepMotion:
         Most recordings stamp a sweep at its start, so that most of it moves with the velocity after the stamp.
         """
         known = [velocity for velocity in (self.before, self.after) if velocity is not None]
-        if scan.time_offsets is None or not known:
+        if scan.time_offsets is None or not known or not len(scan):
             return scan.points
-        return deskew(scan.points, scan.time_offsets, known[0], known[-1])
+        points, times = scan.points, scan.time_offsets
+        if self.acceleration is not None:
+            points = even(points, times, self.acceleration, 0.5 * float(times.min() + times.max()))
+        return deskew(points, times, known[0], known[-1])
 
     def mean(self, scan: Scan) -> FloatArray | None:
         """One velocity (6,) for the sweep: both, weighted by the shares of the sweep before and after the stamp."""

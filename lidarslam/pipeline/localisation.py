@@ -151,6 +151,10 @@ class ScanToMap(Stateful):
         if self._inertial is not None:
             prior = self._inertial.prior(odometry.scan, prior)
         sampled = self.sample(odometry.scan) if odometry.sampled is None else odometry.sampled
+        # An IMU shows more of the turns within a sweep, which is even already.
+        acceleration = odometry.acceleration(following) if sampled is not None and self._inertial is None else None
+        if sampled is not None and acceleration is not None:
+            sampled = sampled.evened(acceleration)
         mapped = self._mapper.process(odometry.scan if sampled is None else sampled, prior)
         if self._elevation is not None and sampled is not None:
             self._elevation.add(sampled, mapped)
@@ -165,7 +169,7 @@ class ScanToMap(Stateful):
             T_world_lidar=mapped.state.T_world_lidar,
             T_odom_lidar=self._T_odom_lidar,
             covariance=mapped.state.covariance[:6, :6] if mapped.registered else None,
-            motion=SweepMotion(mapped.state.velocity, mapped.state.velocity),
+            motion=SweepMotion(mapped.state.velocity, mapped.state.velocity, acceleration),
             first_velocity=mapped.first_velocity,
             status=mapped.status,
             message=mapped.message,

@@ -1,7 +1,7 @@
 """Motion compensation (deskewing) of sweeps to the scan's stamp."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -42,6 +42,12 @@ class Sweep:
         kinds = None if self.kinds is None else self.kinds.take(chosen)
         return Sweep(self.points.take(chosen, axis=0), times, kinds)
 
+    def evened(self, acceleration: FloatArray, middle_s: float) -> "Sweep":
+        """The sweep as if the sensor had moved with its mean velocity all the time; see `even`."""
+        if self.times is None:
+            return self
+        return replace(self, points=even(self.points, self.times, acceleration, middle_s))
+
     def compensated(self, velocity: FloatArray) -> FloatArray:
         """The points (N, 3) in the LiDAR frame at the stamp, for a constant velocity (6,)."""
         return self.points if self.times is None else move(self.points, self.times, velocity)
@@ -50,6 +56,18 @@ class Sweep:
 def body_velocity(T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
     """Constant body velocity (6,), rotation first, of a motion (4, 4) over an interval."""
     return log(T_prev_curr) / interval_s
+
+
+def even(points: FloatArray, times: FloatArray, acceleration: FloatArray, middle_s: float) -> FloatArray:
+    """Points (N, 3) as a sensor would measure them that moves with the mean velocity of the sweep all the time.
+
+    Args:
+        points: (N, 3) as measured, each in the LiDAR frame of its own instant.
+        times: (N,) seconds from the stamp.
+        acceleration: (6,) during the sweep, rotation first, in the LiDAR frame.
+        middle_s: seconds from the stamp to the middle of the sweep, where the velocity is the mean one.
+    """
+    return move(points, (0.5 * times - middle_s) * times, acceleration)
 
 
 def deskew(

@@ -1,6 +1,6 @@
 """A thinned scan: points that are inserted into the map, and keypoints that are registered to it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -72,6 +72,12 @@ class SampledScan:
         """Time from the first point to the stamp; 0 when the scan is compensated already."""
         times = self.sweep.times
         return 0.0 if times is None or not len(times) else max(0.0, -float(times.min()))
+
+    def evened(self, acceleration: FloatArray) -> "SampledScan":
+        """The scan as if the sensor had not accelerated, by (6,) in the LiDAR frame, during the sweep."""
+        middle_s = 0.5 * (self.seen_until_s - self.seen_from_s)
+        sweep, keypoints = (part.evened(acceleration, middle_s) for part in (self.sweep, self.keypoints))
+        return replace(self, sweep=sweep, keypoints=keypoints)
 
     def is_followed_by(self, following: "SampledScan") -> bool:
         """Whether another sweep begins within a sweep's duration after this one's end."""

@@ -146,6 +146,26 @@ def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any
     assert np.rad2deg(rotation_angle(errors)).max() < 0.5
 
 
+def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> None:
+    """Three degrees of pitch and roll at two steps a second: the rates change by 50 deg/s within a sweep."""
+
+    def swaying(times: FloatArray) -> FloatArray:
+        angle, zero = 3.0 * np.pi * times, np.zeros(len(times))
+        turns = np.stack([np.sin(0.5 * angle), np.sin(angle), zero], axis=1)
+        return make_transform(
+            Rotation.from_rotvec(np.deg2rad(3.0) * turns).as_matrix(), [0.3, 0.0, 0.0] * times[:, None]
+        )
+
+    stamps = 0.1 * np.arange(30)
+    scans, truth = [room.ring_sweep(swaying, stamp) for stamp in stamps], swaying(stamps)
+    motions = [np.eye(4), *(inverse(truth[:-1]) @ truth[1:])]
+    localised = localise_all(scans, [Motion(T, 100, covariance=1e-5 * np.eye(6)) for T in motions])
+    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
+    errors = errors[:-1]  # the motion to a next scan is unknown at the last one
+    assert np.rad2deg(rotation_angle(errors)).max() < 0.08
+    assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.01
+
+
 def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanEstimate], Pipeline]:
     pipeline = Pipeline(odometry, ScanToMap(Mapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
     return list(pipeline.run(scans)), pipeline
