@@ -39,7 +39,8 @@ class ScanOdometry:
     def acceleration(self, following: "ScanOdometry | None") -> FloatArray | None:
         """(6,) at the stamp, by the motions since the previous scan and to the next, rotation first.
 
-        None where one of them was not measured, or has no covariance.
+        Less what their noise explains, as a Wiener filter has it; None where one was not measured, or has no
+        covariance.
         """
         if following is None or self.interval_s is None or following.interval_s is None:
             return None
@@ -47,8 +48,12 @@ class ScanOdometry:
             return None
         before = body_velocity(self.motion.T_prev_curr, self.interval_s)
         after = body_velocity(following.motion.T_prev_curr, following.interval_s)
-        acceleration = 2.0 * (after - before) / (self.interval_s + following.interval_s)
-        return np.asarray(np.clip(acceleration, -_MOST_ACCELERATION, _MOST_ACCELERATION), dtype=np.float64)
+        apart_s = 0.5 * (self.interval_s + following.interval_s)
+        acceleration = np.clip((after - before) / apart_s, -_MOST_ACCELERATION, _MOST_ACCELERATION)
+        variance = np.diag(self.motion.covariance) / self.interval_s**2
+        variance = (variance + np.diag(following.motion.covariance) / following.interval_s**2) / apart_s**2
+        signal = np.maximum(acceleration**2 - variance, 0.0)
+        return np.asarray(acceleration * signal / np.maximum(acceleration**2, 1e-12), dtype=np.float64)
 
     def estimated(self, stage_ms: dict[str, float], **values: Any) -> "ScanEstimate":
         """The scan with its pose and quality, and the wall time of a further stage."""
