@@ -17,8 +17,8 @@ from lidarslam.odometry.interface import Motion
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
-# Larger accelerations, rad/s^2 and m/s^2, are errors of the odometry.
-_MOST_ACCELERATION = np.array([np.deg2rad(2000.0)] * 3 + [20.0] * 3)
+# Larger angular accelerations are errors of the odometry.
+_MOST_RAD_S2 = np.deg2rad(2000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class ScanOdometry:
         """(6,) body velocity since the previous stamp, rotation first; None when no motion was measured."""
         return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
 
-    def acceleration(self, following: "ScanOdometry | None") -> FloatArray | None:
-        """(6,) at the stamp, by the motions since the previous scan and to the next, rotation first.
+    def turn_acceleration(self, following: "ScanOdometry | None") -> FloatArray | None:
+        """Angular acceleration (3,) at the stamp, by the turns since the previous scan and to the next, rad/s^2.
 
         Less what their noise explains, as a Wiener filter has it; None where one was not measured, or has no
         covariance.
@@ -46,12 +46,12 @@ class ScanOdometry:
             return None
         if self.motion.covariance is None or following.motion.covariance is None:
             return None
-        before = body_velocity(self.motion.T_prev_curr, self.interval_s)
-        after = body_velocity(following.motion.T_prev_curr, following.interval_s)
+        before = body_velocity(self.motion.T_prev_curr, self.interval_s)[:3]
+        after = body_velocity(following.motion.T_prev_curr, following.interval_s)[:3]
         apart_s = 0.5 * (self.interval_s + following.interval_s)
-        acceleration = np.clip((after - before) / apart_s, -_MOST_ACCELERATION, _MOST_ACCELERATION)
-        variance = np.diag(self.motion.covariance) / self.interval_s**2
-        variance = (variance + np.diag(following.motion.covariance) / following.interval_s**2) / apart_s**2
+        acceleration = np.clip((after - before) / apart_s, -_MOST_RAD_S2, _MOST_RAD_S2)
+        variance = np.diag(self.motion.covariance)[:3] / self.interval_s**2
+        variance = (variance + np.diag(following.motion.covariance)[:3] / following.interval_s**2) / apart_s**2
         signal = np.maximum(acceleration**2 - variance, 0.0)
         return np.asarray(acceleration * signal / np.maximum(acceleration**2, 1e-12), dtype=np.float64)
 
@@ -73,8 +73,8 @@ class SweepMotion:
 
     before: Annotated[FloatArray, Shape(6)] | None
     after: Annotated[FloatArray, Shape(6)] | None
-    # (6,) during the sweep, by which the sweep was evened before these velocities were estimated; None where it was not
-    acceleration: Annotated[FloatArray, Shape(6)] | None = None
+    # (3,) rad/s^2, for which the sweep was evened before these velocities were estimated; None where it was not
+    turn_acceleration: Annotated[FloatArray, Shape(3)] | None = None
 
     @property
     def latest(self) -> FloatArray | None:
@@ -90,8 +90,8 @@ class SweepMotion:
         if scan.time_offsets is None or not known or not len(scan):
             return scan.points
         points, times = scan.points, scan.time_offsets
-        if self.acceleration is not None:
-            points = even(points, times, self.acceleration, 0.5 * float(times.min() + times.max()))
+        if self.turn_acceleration is not None:
+            points = even(points, times, self.turn_acceleration, 0.5 * float(times.min() + times.max()))
         return deskew(points, times, known[0], known[-1])
 
     def mean(self, scan: Scan) -> FloatArray | None:

@@ -151,10 +151,9 @@ class ScanToMap(Stateful):
         if self._inertial is not None:
             prior = self._inertial.prior(odometry.scan, prior)
         sampled = self.sample(odometry.scan) if odometry.sampled is None else odometry.sampled
-        # An IMU shows more of the turns within a sweep, which is even already.
-        acceleration = odometry.acceleration(following) if sampled is not None and self._inertial is None else None
-        if sampled is not None and acceleration is not None:
-            sampled = sampled.evened(acceleration)
+        turn_acceleration = None if sampled is None else self._turn_acceleration(odometry, following)
+        if sampled is not None and turn_acceleration is not None:
+            sampled = sampled.evened(turn_acceleration)
         mapped = self._mapper.process(odometry.scan if sampled is None else sampled, prior)
         if self._elevation is not None and sampled is not None:
             self._elevation.add(sampled, mapped)
@@ -169,7 +168,7 @@ class ScanToMap(Stateful):
             T_world_lidar=mapped.state.T_world_lidar,
             T_odom_lidar=self._T_odom_lidar,
             covariance=mapped.state.covariance[:6, :6] if mapped.registered else None,
-            motion=SweepMotion(mapped.state.velocity, mapped.state.velocity, acceleration),
+            motion=SweepMotion(mapped.state.velocity, mapped.state.velocity, turn_acceleration),
             first_velocity=mapped.first_velocity,
             status=mapped.status,
             message=mapped.message,
@@ -183,6 +182,11 @@ class ScanToMap(Stateful):
             cell_m=mapped.cell_m,
             turn_rate=mapped.turn_rate,
         )
+
+    def _turn_acceleration(self, odometry: ScanOdometry, following: ScanOdometry | None) -> FloatArray | None:
+        """By the odometry; None where a smoothed start replaces it, and with an IMU, for which sweeps are even."""
+        is_replaced = odometry.scan.stamp in self._start
+        return None if self._inertial is not None or is_replaced else odometry.turn_acceleration(following)
 
     def _prior(self, odometry: ScanOdometry, following: ScanOdometry | None) -> Prior:
         measured = odometry.motion.T_prev_curr if odometry.interval_s is not None else None

@@ -42,11 +42,11 @@ class Sweep:
         kinds = None if self.kinds is None else self.kinds.take(chosen)
         return Sweep(self.points.take(chosen, axis=0), times, kinds)
 
-    def evened(self, acceleration: FloatArray, middle_s: float) -> "Sweep":
-        """The sweep as if the sensor had moved with its mean velocity all the time; see `even`."""
+    def evened(self, turn_acceleration: FloatArray, middle_s: float) -> "Sweep":
+        """The sweep as if the sensor had turned at its mean rate all the time; see `even`."""
         if self.times is None:
             return self
-        return replace(self, points=even(self.points, self.times, acceleration, middle_s))
+        return replace(self, points=even(self.points, self.times, turn_acceleration, middle_s))
 
     def compensated(self, velocity: FloatArray) -> FloatArray:
         """The points (N, 3) in the LiDAR frame at the stamp, for a constant velocity (6,)."""
@@ -58,16 +58,18 @@ def body_velocity(T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
     return log(T_prev_curr) / interval_s
 
 
-def even(points: FloatArray, times: FloatArray, acceleration: FloatArray, middle_s: float) -> FloatArray:
-    """Points (N, 3) as a sensor would measure them that moves with the mean velocity of the sweep all the time.
+def even(points: FloatArray, times: FloatArray, turn_acceleration: FloatArray, middle_s: float) -> FloatArray:
+    """Points (N, 3) as if the sensor had turned at the mean rate of the sweep all the time.
+
+    Its other acceleration displaces points by millimetres only, and is not counted.
 
     Args:
         points: (N, 3) as measured, each in the LiDAR frame of its own instant.
         times: (N,) seconds from the stamp.
-        acceleration: (6,) during the sweep, rotation first, in the LiDAR frame.
-        middle_s: seconds from the stamp to the middle of the sweep, where the velocity is the mean one.
+        turn_acceleration: (3,) angular, during the sweep, in the LiDAR frame, rad/s^2.
+        middle_s: seconds from the stamp to the middle of the sweep, where the rate is the mean one.
     """
-    return move(points, (0.5 * times - middle_s) * times, acceleration)
+    return move(points, (0.5 * times - middle_s) * times, np.pad(turn_acceleration, (0, 3)))
 
 
 def deskew(

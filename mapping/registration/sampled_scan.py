@@ -73,10 +73,10 @@ class SampledScan:
         times = self.sweep.times
         return 0.0 if times is None or not len(times) else max(0.0, -float(times.min()))
 
-    def evened(self, acceleration: FloatArray) -> "SampledScan":
-        """The scan as if the sensor had not accelerated, by (6,) in the LiDAR frame, during the sweep."""
+    def evened(self, turn_acceleration: FloatArray) -> "SampledScan":
+        """The scan as if the sensor had turned at its mean rate during the whole sweep; see `even`."""
         middle_s = 0.5 * (self.seen_until_s - self.seen_from_s)
-        sweep, keypoints = (part.evened(acceleration, middle_s) for part in (self.sweep, self.keypoints))
+        sweep, keypoints = (part.evened(turn_acceleration, middle_s) for part in (self.sweep, self.keypoints))
         return replace(self, sweep=sweep, keypoints=keypoints)
 
     def is_followed_by(self, following: "SampledScan") -> bool:

@@ -147,15 +147,15 @@ def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.0, 1.0), (0.5e-3, 0.5), (1e-2, 0.0)])
-def test_an_acceleration_counts_as_far_as_noise_does_not_explain_it(sigma: float, share: float) -> None:
+def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma: float, share: float) -> None:
     """The variances of both velocities, 100 sigma^2 each, add up."""
     change = np.full(6, 0.01)
     before, after = (
         ScanOdometry(sweep(0.0, 0.1), Motion(exp(0.1 * velocity), 100, covariance=sigma**2 * np.eye(6)), 0.1)
         for velocity in (BEFORE, BEFORE + change)
     )
-    assert before.acceleration(after) == pytest.approx(share * change / 0.1, abs=1e-9)
-    assert before.acceleration(None) is None
+    assert before.turn_acceleration(after) == pytest.approx(share * change[:3] / 0.1, abs=1e-9)
+    assert before.turn_acceleration(None) is None
 
 
 def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> None:

@@ -46,14 +46,14 @@ def test_a_velocity_makes_its_motion_in_its_time(rng):
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
-def test_a_sweep_of_a_sensor_that_accelerates_is_even_afterwards(room, stamp_at):
-    """As on a walking robot: up to 20 deg/s faster and 0.4 m/s slower at the end of the sweep than at its beginning."""
-    velocity, acceleration = np.array([0.1, 0.5, 0.2, 1.0, 0.2, 0.0]), np.array([1.0, 3.5, -1.0, -4.0, 2.0, 1.0])
+def test_a_sweep_of_a_sensor_that_turns_ever_faster_is_even_afterwards(room, stamp_at):
+    """As on a walking robot: 20 deg/s faster at the end of the sweep than at its beginning."""
+    velocity, acceleration = np.array([0.1, 0.5, 0.2, 1.0, 0.2, 0.0]), np.array([1.0, 3.5, -1.0, 0.0, 0.0, 0.0])
 
     def T_room_lidar_at(times: FloatArray) -> FloatArray:
         return exp(times[:, None] * velocity + 0.5 * times[:, None] ** 2 * acceleration)
 
     scan, middle_s = room.sweep(T_room_lidar_at, 0.0, stamp_at), 0.1 * (0.5 - stamp_at)
     sweep, mean = Sweep(scan.points, scan.time_offsets), velocity + middle_s * acceleration
-    assert room.distance_to_surface(sweep.evened(acceleration, middle_s).compensated(mean)).max() < 0.002
+    assert room.distance_to_surface(sweep.evened(acceleration[:3], middle_s).compensated(mean)).max() < 0.002
     assert room.distance_to_surface(sweep.compensated(mean)).max() > 0.02, "not so without"
