@@ -57,9 +57,10 @@ _LEAST_WAY_M = 0.2
 # a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
-# Least contradicting pairs of a stretch in runs of at least this many; one in others, or one of so many votes that
-# another confirms: fewer are chance in the sparse scans of a Mid-360.
-_LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE = 2, 4, 10.0
+# Least contradicting pairs of a stretch. A single one counts where another confirms it and it has so many votes, or, in
+# runs of fewer tested pairs, where the pose has less than this share of them. In the sparse scans of a Mid-360, chance
+# makes one of 9.9 or 10.9 votes, with a quarter of them at the pose; slips leave next to none.
+_LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 2, 4, 10.0, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,12 +378,16 @@ def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) ->
             stretches[-1].append(one)
         else:
             stretches.append([one])
-    least = _LEAST_PAIRS if len(known) >= _FEW_PAIRS else 1
-    return tuple(_together(pairs) for pairs in stretches if len(pairs) >= least or _is_confirmed(pairs[0], known))
+    return tuple(_together(pairs) for pairs in stretches if len(pairs) >= _LEAST_PAIRS or _counts(pairs[0], known))
 
 
-def _is_confirmed(pair: Contradiction, known: Sequence[Contradiction]) -> bool:
-    """Whether another pair with the same first scan peaks at the same shift, though not as clearly."""
+def _counts(pair: Contradiction, known: Sequence[Contradiction]) -> bool:
+    """Whether a single pair counts: in a short run, a clear one; else where another one confirms it.
+
+    That is a pair with the same first scan that peaks at the same shift, though not as clearly.
+    """
+    if len(known) < _FEW_PAIRS and pair.votes_at_pose < _LARGEST_SHARE_OF_ONE * pair.votes:
+        return True
     if pair.votes < _LEAST_VOTES_OF_ONE:
         return False
     others = (other for other in known if other is not pair and other.first == pair.first)

@@ -184,9 +184,14 @@ class ScanToMap(Stateful):
         )
 
     def _turn_acceleration(self, odometry: ScanOdometry, following: ScanOdometry | None) -> FloatArray | None:
-        """By the odometry; None where a smoothed start replaces it, and with an IMU, for which sweeps are even."""
-        is_replaced = odometry.scan.stamp in self._start
-        return None if self._inertial is not None or is_replaced else odometry.turn_acceleration(following)
+        """By the odometry; None where a smoothed start replaces it, and with an IMU, for which sweeps are even.
+
+        The first sweep cannot be compensated, and those of a young map hold together as they are.
+        """
+        local_map = None if self.mapper is None else self.mapper.local_map
+        if self._inertial is not None or odometry.scan.stamp in self._start or local_map is None or local_map.is_young:
+            return None
+        return odometry.turn_acceleration(following)
 
     def _prior(self, odometry: ScanOdometry, following: ScanOdometry | None) -> Prior:
         measured = odometry.motion.T_prev_curr if odometry.interval_s is not None else None

@@ -123,20 +123,26 @@ def test_a_bare_tunnel_says_nothing(street):
     assert found(near, poses([0.5 * STEP_M] * (SCANS - 1))) == ()
 
 
+def pair(first, second, shift_m, votes, votes_at_pose):
+    near = np.zeros(41)
+    near[20], near[20 + round(10 * shift_m)] = votes_at_pose, votes
+    return PairTest(first, second, np.array([1.0, 0.0, 0.0]), np.zeros(3), shift_m, votes, near)
+
+
 @pytest.mark.parametrize(("confirmed", "votes", "stretches"), [(True, 14.0, 1), (False, 14.0, 0), (True, 9.0, 0)])
 def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, votes, stretches):
     shift_m, standing = 0.4, np.tile(np.eye(4), (31, 1, 1))
-
-    def pair(first, second, shift_m, votes, votes_at_pose):
-        near = np.zeros(41)
-        near[20], near[20 + round(10 * shift_m)] = votes_at_pose, votes
-        return PairTest(first, second, np.array([1.0, 0.0, 0.0]), np.zeros(3), shift_m, votes, near)
-
     contradicting, weaker = pair(0, 20, shift_m, votes, 4.0), pair(0, 10, shift_m, 16.0, 12.0)
     other = weaker if confirmed else pair(0, 10, 0.0, 12.0, 12.0)
     agreeing = [pair(10, 20, 0.0, 20.0, 20.0), pair(20, 30, 0.0, 20.0, 20.0)]
     found = find_contradictions([contradicting, other, *agreeing], standing)
     assert [one.shift_m for one in found] == [shift_m] * stretches
+
+
+@pytest.mark.parametrize(("votes_at_pose", "stretches"), [(0.5, 1), (2.5, 0)])
+def test_the_only_pair_of_a_short_run_counts_where_next_to_nothing_fits_at_the_pose(votes_at_pose, stretches):
+    standing = np.tile(np.eye(4), (11, 1, 1))
+    assert len(find_contradictions([pair(0, 10, 0.4, 10.0, votes_at_pose)], standing)) == stretches
 
 
 def test_poses_that_were_corrected_are_judged_as_corrected(scans):
