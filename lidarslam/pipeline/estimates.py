@@ -1,7 +1,7 @@
 """A scan in the stages of the pipeline: with its odometry, then with its pose."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,14 @@ STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
 # Larger angular accelerations are errors of the odometry.
 _MOST_RAD_S2 = np.deg2rad(2000.0)
+
+
+class _Turn(NamedTuple):
+    """Mean turn rate (3,) over an interval, rad/s, and its variances (3,)."""
+
+    interval_s: float
+    rate: FloatArray
+    variance: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +50,20 @@ class ScanOdometry:
         Less what their noise explains, as a Wiener filter has it; None where one was not measured, or has no
         covariance.
         """
-        if following is None or self.interval_s is None or following.interval_s is None:
+        before, after = self._turn, None if following is None else following._turn
+        if before is None or after is None:
             return None
-        if self.motion.covariance is None or following.motion.covariance is None:
-            return None
-        before = body_velocity(self.motion.T_prev_curr, self.interval_s)[:3]
-        after = body_velocity(following.motion.T_prev_curr, following.interval_s)[:3]
-        apart_s = 0.5 * (self.interval_s + following.interval_s)
-        acceleration = np.clip((after - before) / apart_s, -_MOST_RAD_S2, _MOST_RAD_S2)
-        variance = np.diag(self.motion.covariance)[:3] / self.interval_s**2
-        variance = (variance + np.diag(following.motion.covariance)[:3] / following.interval_s**2) / apart_s**2
-        signal = np.maximum(acceleration**2 - variance, 0.0)
+        apart_s = 0.5 * (before.interval_s + after.interval_s)
+        acceleration = np.clip((after.rate - before.rate) / apart_s, -_MOST_RAD_S2, _MOST_RAD_S2)
+        signal = np.maximum(acceleration**2 - (before.variance + after.variance) / apart_s**2, 0.0)
         return np.asarray(acceleration * signal / np.maximum(acceleration**2, 1e-12), dtype=np.float64)
+
+    @property
+    def _turn(self) -> "_Turn | None":
+        velocity, covariance = self.velocity, self.motion.covariance
+        if self.interval_s is None or velocity is None or covariance is None:
+            return None
+        return _Turn(self.interval_s, velocity[:3], np.diag(covariance)[:3] / self.interval_s**2)
 
     def estimated(self, stage_ms: dict[str, float], **values: Any) -> "ScanEstimate":
         """The scan with its pose and quality, and the wall time of a further stage."""
@@ -87,12 +97,12 @@ class SweepMotion:
         Most recordings stamp a sweep at its start, so that most of it moves with the velocity after the stamp.
         """
         known = [velocity for velocity in (self.before, self.after) if velocity is not None]
-        if scan.time_offsets is None or not known or not len(scan):
+        if scan.time_offsets is None or not known:
             return scan.points
-        points, times = scan.points, scan.time_offsets
+        points = scan.points
         if self.turn_acceleration is not None:
-            points = even(points, times, self.turn_acceleration, 0.5 * float(times.min() + times.max()))
-        return deskew(points, times, known[0], known[-1])
+            points = even(points, scan.time_offsets, self.turn_acceleration, scan.middle_offset_s)
+        return deskew(points, scan.time_offsets, known[0], known[-1])
 
     def mean(self, scan: Scan) -> FloatArray | None:
         """One velocity (6,) for the sweep: both, weighted by the shares of the sweep before and after the stamp."""

@@ -3,6 +3,7 @@
 import logging
 from collections import deque
 from concurrent.futures import Future
+from dataclasses import replace
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
@@ -87,7 +88,7 @@ class MapBuilder(Stateful):
         thinned, estimate = pending
         points = estimate.points
         if following is not None and following.status is Status.LOST:
-            points = SweepMotion(estimate.motion.before, None).compensate(thinned)
+            points = replace(estimate.motion, after=None).compensate(thinned)
         elif following is not None and following.first_velocity is not None:
             points = SweepMotion(following.first_velocity, None).compensate(thinned)
         if self.global_map is None:
