@@ -79,15 +79,19 @@ class ElevationBias:
 
 
 def combined(biases: Sequence[ElevationBias]) -> ElevationBias | None:
-    """The weighted mean; None of none."""
-    if not biases:
+    """The weighted mean; None of fewer than two, as one stretch alone may be bent by what moves in it.
+
+    The scatter is raised where the stretches differ by more than their own (the ratio of Birge).
+    """
+    if len(biases) < 2:
         return None
     angles, scatters, systematic = np.array([(one.angle, one.scatter, one.systematic) for one in biases]).T
     weights = 1.0 / (scatters**2 + systematic**2)
     weights /= weights.sum()
-    return ElevationBias(
-        float(weights @ angles), float(np.linalg.norm(weights * scatters)), float(weights @ systematic)
-    )
+    angle = float(weights @ angles)
+    spread = np.linalg.norm((angles - angle) / scatters) / np.sqrt(len(biases) - 1.0)
+    scatter = max(1.0, float(spread)) * float(np.linalg.norm(weights * scatters))
+    return ElevationBias(angle, scatter, float(weights @ systematic))
 
 
 def estimate_bias(scans: Sequence[PlacedPoints], edge_m: float) -> ElevationBias | None:
@@ -236,7 +240,7 @@ class ElevationEstimator(Stateful):
             self._end()
 
     def bias(self) -> ElevationBias | None:
-        """The bias by all scans so far; None where they show none."""
+        """The bias by all scans so far; None where fewer than two stretches show one."""
         return combined(self._with_latest())
 
     def _end(self) -> None:

@@ -28,7 +28,7 @@ def low(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
     pillars = tuple((x + side, 5.0 * side, 0.7) for x in range(-56, 56, 6) for side in (-1, 1))
     street = replace(room, half_size=(60.0, 9.0, 3.0), pillars=pillars, points=20_000)
     for number in range(SCANS):
-        T = exp(np.array([0.0, 0.0, 0.0, -8.0 + 0.5 * number, 0.0, -1.0]))
+        T = exp(np.array([0.0, 0.0, 0.0, -20.0 + 1.2 * number, 0.0, -1.0]))
         points = street.sweep(lambda times, T=T: np.tile(T, (len(times), 1, 1)), 0.1 * number).points  # type: ignore[misc]
         np.save(folder / f"{number:06d}.npy", correct_elevation(points, -LOW_DEG))
     return folder

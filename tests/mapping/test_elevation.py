@@ -69,7 +69,15 @@ def test_a_common_offset_of_ranges_is_within_the_standard_deviation(street):
 def test_what_is_systematic_does_not_average_out():
     bias = combined([ElevationBias(0.003, 0.001, 0.0005)] * 100)
     assert (bias.angle, bias.scatter, bias.systematic) == pytest.approx((0.003, 0.0001, 0.0005))
-    assert combined([]) is None
+
+
+def test_one_stretch_alone_shows_no_bias():
+    assert combined([ElevationBias(0.003, 0.001, 0.0005)]) is None
+
+
+def test_stretches_that_disagree_widen_the_scatter():
+    apart = combined([ElevationBias(angle, 0.001, 0.0) for angle in (-0.005, 0.005)])
+    assert (apart.angle, apart.scatter) == pytest.approx((0.0, 0.005))
 
 
 def registered(T: FloatArray, status: Status = Status.OK) -> MappedScan:
@@ -86,10 +94,10 @@ def sampled(street: Any) -> list[SampledScan]:
 
 def test_a_saved_estimator_goes_on_as_before(sampled, through_disk):
     whole, first, second = ElevationEstimator(), ElevationEstimator(), ElevationEstimator()
-    for number, (scan, T) in enumerate(zip(sampled, poses(), strict=True)):
+    for number, (scan, T) in enumerate(4 * list(zip(sampled, poses(), strict=True))):
         whole.add(scan, registered(T))
-        (first if number < 5 else second).add(scan, registered(T))
-        if number == 4:
+        (first if number < 25 else second).add(scan, registered(T))
+        if number == 24:
             second.restore(through_disk(first.state()))
     assert whole.bias() == second.bias()
     bias = whole.bias()
