@@ -82,8 +82,8 @@ def smoothed_start(
     The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
     scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
     and the motions of the first half are those that this map shows, as is the first sweep's turn rate where the motion
-    to the second would bend it. None is known where that loses track. A new IMU's samples are used in both directions
-    of time.
+    to the second would bend it. None is known where that loses track, or where those scans fit worse than in order, as on
+    stairs. A new IMU's samples are used in both directions of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
     ordered, taken, needed, least = _Tracking(unlimited, inertial), list[Scan](), False, np.inf
@@ -108,7 +108,9 @@ def smoothed_start(
     end_s = taken[-1].stamp
     reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))
     backwards = _backwards(taken, _motions(known), reverse)
-    if len(_tracked_at_last(backwards)) < len(backwards):
+    earlier = len(taken) - len(known)  # scans; the first of them has nothing to fit
+    is_better = _quality(backwards[len(known) : -1]) >= _quality(forwards[1:earlier])
+    if len(_tracked_at_last(backwards)) < len(backwards) or not is_better:
         return {}
     first = {taken[0].stamp: Prior(turn_rate=-backwards[-1].state.velocity[:3])} if ordered.is_bent else {}
     if not needed:
