@@ -44,7 +44,7 @@ class Attempt:
     fit: Fit  # of the scan to the map
     status: Status  # by the fit
     relocalised: bool = False  # whether it began elsewhere than at the prediction
-    ambiguous: bool = False  # whether another displacement fits nearly as well while the velocity is unknown
+    rival: FloatArray | None = None  # (3,) from here to another place that fits nearly as well, in the world, metres
 
     @property
     def is_reliable(self) -> bool:
@@ -65,12 +65,17 @@ class Attempt:
 
     @cached_property
     def unconstrained(self) -> tuple[str, ...]:
-        """Names of the LiDAR frame's axes that nothing, or no more than the noise of normals, constrains."""
-        degenerate = () if self.registration is None else self.registration.degeneracy.names
-        if self.fit.is_constrained or self.fit.weakest is None:
-            return degenerate
-        along = np.abs(self.T_world_lidar[:3, :3].T @ np.array(self.fit.weakest))
-        return tuple(name for name in AXES if name in (*degenerate, AXES[3 + int(along.argmax())]))
+        """Names of the LiDAR frame's axes that nothing, or no more than the noise of normals, constrains.
+
+        Where a rival fits as well, the axis to that, too.
+        """
+        names = set() if self.registration is None else set(self.registration.degeneracy.names)
+        weakest = None if self.fit.is_constrained else self.fit.weakest
+        for direction in (weakest, self.rival):
+            if direction is not None:
+                along = np.abs(self.T_world_lidar[:3, :3].T @ np.array(direction))
+                names.add(AXES[3 + int(along.argmax())])
+        return tuple(name for name in AXES if name in names)
 
     @cached_property
     def correction(self) -> FloatArray:
@@ -111,14 +116,14 @@ class Attempt:
         assert self.registration is not None
         return self.registration.velocity if continuous_time and scan.sweep.times is not None else np.zeros(6)
 
-    def has_rivals(self, others: Iterable["Attempt"]) -> bool:
-        """Whether the scan fits nearly as well at another place."""
+    def rival_of(self, others: Iterable["Attempt"]) -> FloatArray | None:
+        """(3,) from here to the best other place where the scan fits nearly as well, in the world, metres."""
         apart_m = _RIVAL_CELLS * self.local_map.cell_m
-        return any(
-            np.linalg.norm(other.T_world_lidar[:3, 3] - self.T_world_lidar[:3, 3]) > apart_m
-            and _RIVAL_QUALITY * other.quality > self.quality
-            for other in others
-        )
+        for other in sorted(others, key=lambda other: -other.quality):
+            away: FloatArray = other.T_world_lidar[:3, 3] - self.T_world_lidar[:3, 3]
+            if np.linalg.norm(away) > apart_m and _RIVAL_QUALITY * other.quality > self.quality:
+                return away
+        return None
 
 
 def best_of(attempts: Iterable[Attempt]) -> Attempt | None:
@@ -175,7 +180,7 @@ def judge(
         (attempt.relocalised, f"relocalised in the map, {where}; {NOT_CONFIRMED}"),
         (attempt.has_jumped, where),
         (is_unconfirmed, f"relocalised a moment ago; {NOT_CONFIRMED}"),
-        (attempt.ambiguous, "the scene is repetitive: another motion since the last scan fits nearly as well"),
+        (attempt.rival is not None, "the scene is repetitive: another motion since the last scan fits nearly as well"),
         (unexpected, "registered, but neither odometry nor last motion predicted this pose"),
         (adrift, "in a new map; its pose in the map before is unknown"),
         (degenerate, f"degenerate along {', '.join(degenerate)}: the prediction was kept"),

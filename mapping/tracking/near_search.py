@@ -42,6 +42,9 @@ _YAW_RATES = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
 # cells, within reach of the coarse cells.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
+# Where the velocity is known, but the position not to this many cells and not measured, those within so many standard
+# deviations, at most so many on each side.
+_OPEN_CELLS, _OPEN_SIGMAS, _MOST_DISPLACED = 3.0, 3.0, 8
 # Most points that constrain directions that few others do, by which a displacement is chosen.
 _MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells.
@@ -137,8 +140,9 @@ class NearSearch:
         return other if other.quality > near.quality and not is_similar else near
 
     def at_any_speed(self, near: Attempt) -> Attempt:
-        """Where the velocity is unknown or the odometry poor: displaced; ambiguous where another place fits as well."""
-        if self.state.velocity_known and not self._is_poor(near):
+        """Where velocity or position is open, or the odometry poor: displaced; a rival is a place that fits as well."""
+        is_open = not self.state.velocity_known or self._is_open
+        if not is_open and not self._is_poor(near):
             return near
         displaced = self.matcher.budget.run(self._displaced())
         if displaced is None:
@@ -147,8 +151,7 @@ class NearSearch:
         for other in others:
             if (other.is_reliable or not self.state.velocity_known) and other.quality > _CLEARLY_BETTER * best.quality:
                 best = other
-        is_settled = best.registration is None or self.state.velocity_known
-        return best if is_settled else replace(best, ambiguous=best.has_rivals(others))
+        return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
 
     def _displaced(self) -> Steps[list[Attempt]]:
         """Attempts with status ok from displacements since the last scan in every horizontal direction.
@@ -161,11 +164,14 @@ class NearSearch:
         if interval_s <= 0.0:
             return []
         radius_m, up = min(_FASTEST_M_S * interval_s, scan.range_m), local_map.vertical()
-        starts = []
+        spacing_m, starts = _DISPLACED_CELLS * local_map.cell_m, []
+        if self.state.velocity_known and self._is_open:
+            radius_m = min(radius_m, _OPEN_SIGMAS * self._sigma_m)
+            spacing_m = max(spacing_m, radius_m / _MOST_DISPLACED)
         for rotation in (self.prediction.T_world_lidar, last.T_world_lidar):
             T = last.T_world_lidar.copy()
             T[:3, :3] = rotation[:3, :3]
-            starts.append(positions_around(T, up, radius_m, _DISPLACED_CELLS * local_map.cell_m))
+            starts.append(positions_around(T, up, radius_m, spacing_m))
         few = constraining_points(scan.sweep.points, scan.elevations, local_map.cell_m, _MOST_CONSTRAINING)
         parts = self.matcher.some(SCORED_POINTS), scan.sweep.take(few)
         points = np.concatenate([part.compensated(last.velocity) for part in parts])
@@ -212,6 +218,17 @@ class NearSearch:
             start = start.displaced(cells * cell_m * np.array(near.fit.weakest))
             others.append(self.matcher.attempt(near.prediction, start, coarse_first=False))
         return _clearly_best(near, (other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m))
+
+    @property
+    def _sigma_m(self) -> float:
+        """Largest standard deviation of the predicted position."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.prediction.covariance[3:6, 3:6])[-1]))
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether the position is predicted worse than a registration converges, and not measured."""
+        is_measured = self.prior.T_prev_curr is not None or self.prediction.is_inertial
+        return not is_measured and self._sigma_m > _OPEN_CELLS * self.matcher.local_map.cell_m
 
     def _is_poor(self, near: Attempt) -> bool:
         """Whether a scan fits poorly where an odometry measured its motion."""

@@ -48,7 +48,7 @@ def search_map(matcher: ScanMatcher, prediction: Prediction) -> Steps[Attempt | 
     starts = yield from view.find(points, matcher.last.T_world_lidar, reach_m, _PLACES)
     attempts = yield from _attempts_from(starts, matcher, prediction)
     best = best_of(attempts)
-    return best if best is not None and best.is_reliable and not best.has_rivals(attempts) else None
+    return best if best is not None and best.is_reliable and best.rival_of(attempts) is None else None
 
 
 def _attempts_from(starts: FloatArray, matcher: ScanMatcher, prediction: Prediction) -> Steps[list[Attempt]]:
