@@ -65,6 +65,7 @@ class Prior:
     covariance: FloatArray | None = None
     inertial: "MotionState | None" = None  # the state that an IMU predicts
     turn_rate: FloatArray | None = None  # (3,) of the first sweep, where it was estimated apart, in the LiDAR frame
+    is_smoothed: bool = False  # whether the smoothed start estimated it
     caution: float = 10.0  # factor on the odometry's own standard deviations: its errors are correlated in time
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
@@ -202,14 +203,15 @@ class Prediction(MotionState):
 
     contradicted: bool = False  # whether the odometry's motion fails the innovation test against the last velocity
     is_inertial: bool = False  # whether an IMU has a part in it
+    is_smoothed: bool = False  # whether the smoothed start has
 
     def is_held_within(self, distance_m: float) -> bool:
         """Whether it is an IMU's, with no larger standard deviation of the position."""
         return self.is_inertial and bool(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1] < distance_m**2)
 
     def holds(self, T_world_lidar: FloatArray, within_m: float) -> bool:
-        """Whether it is an IMU's, known to a distance, and a pose (4, 4) agrees with it."""
-        if not self.is_held_within(within_m):
+        """Whether it is smoothed, or an IMU's known to a distance, and a pose (4, 4) agrees with it."""
+        if not (self.is_smoothed or self.is_held_within(within_m)):
             return False
         away = log(inverse(self.T_world_lidar) @ T_world_lidar)
         return float(away @ np.linalg.solve(self.covariance[:6, :6], away)) < _GATE
@@ -263,10 +265,10 @@ def predict(
     if prior.inertial is not None:
         state = state.fused(prior.inertial)
     state.covariance[:6, :6] += np.diag(LEAST_SIGMA**2)
-    is_inertial = prior.inertial is not None
     return Prediction(
-        stamp, state.T_world_lidar, state.velocity, state.covariance, contradicted=contradicted, is_inertial=is_inertial
-    )
+        stamp, state.T_world_lidar, state.velocity, state.covariance, contradicted=contradicted,
+        is_inertial=prior.inertial is not None, is_smoothed=prior.is_smoothed,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

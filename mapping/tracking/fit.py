@@ -106,12 +106,14 @@ class Fit:
     def status(self, config: TrackingConfig, is_young: bool = False, is_held: bool = False) -> Status:
         """Tracking status of the scan.
 
-        In a young map, low support alone does not make it lost; where an IMU holds the pose, support is ignored.
+        In a young map, low support alone does not make it lost; where a prediction holds the pose, support is ignored,
+        and in a young map, which is thin, a scan is degraded at worst.
         """
         support = 1.0 if self.support is None or is_held else self.support
         if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP:
             return Status.LOST
-        if self.inlier_ratio < config.lost_below or (support < _LOST_SUPPORT and not is_young):
+        is_lost = self.inlier_ratio < config.lost_below or (support < _LOST_SUPPORT and not is_young)
+        if is_lost and not (is_held and is_young):
             return Status.LOST
         poor = self.inlier_ratio < config.degraded_below or support < _DEGRADED_SUPPORT
         return Status.DEGRADED if poor else Status.OK

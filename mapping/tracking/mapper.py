@@ -179,10 +179,14 @@ class Mapper(Stateful):
             if not mapped.registered or displacement_m(log(motion), scan.range_m) < local_map.cell_m:
                 break
             share = min(1.0, last.seen_until_s / (scan.stamp - last.stamp))
-            last = replace(last, velocity=last.velocity + velocity_error(last, mapped.state, share))
-            local_map = self._new_map(first, last)
+            moving = replace(last, velocity=last.velocity + velocity_error(last, mapped.state, share))
             self._tracker.rewind(before)
-            mapped = self._track(scan, prior, last, local_map)
+            again = self._track(scan, prior, moving, self._new_map(first, moving))
+            if not again.registered:  # which it was before
+                self._tracker.rewind(before)
+                mapped = self._track(scan, prior, last, self._new_map(first, last))
+                break
+            last, mapped = moving, again
         return replace(mapped, first_velocity=last.velocity)
 
     def _lose(
