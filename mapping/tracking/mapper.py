@@ -38,8 +38,9 @@ from lidarslam.mapping.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
 
-# Times that the first sweep is inserted again, with the motion that the second one showed.
-_REDRAWS = 2
+# Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
+# quality that this keeps: the velocity within a sparse sweep may be far off.
+_REDRAWS, _LEAST_KEPT = 2, 0.5
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 _SEARCHING = "the search for its place goes on with the next scan"
 
@@ -182,7 +183,7 @@ class Mapper(Stateful):
             moving = replace(last, velocity=last.velocity + velocity_error(last, mapped.state, share))
             self._tracker.rewind(before)
             again = self._track(scan, prior, moving, self._new_map(first, moving))
-            if not again.registered:  # which it was before
+            if not again.registered or _quality(again) < _LEAST_KEPT * _quality(mapped):
                 self._tracker.rewind(before)
                 mapped = self._track(scan, prior, last, self._new_map(first, last))
                 break
@@ -218,6 +219,10 @@ class Mapper(Stateful):
         if self.kept_scans:
             recent.append(Insertion(self._scans, points, scan.elevations, state.T_world_lidar[:3, 3]))
         self._recent = recent
+
+
+def _quality(mapped: MappedScan) -> float:
+    return 0.0 if mapped.fit is None else mapped.fit.quality
 
 
 def _sparse_message(scan: SampledScan) -> str:
