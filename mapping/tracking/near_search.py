@@ -144,7 +144,7 @@ class NearSearch:
         is_open = not self.state.velocity_known or self._is_open
         if not is_open and not self._is_poor(near):
             return near
-        displaced = self.matcher.budget.run(self._displaced())
+        displaced = self.matcher.budget.run(self._displaced(near))
         if displaced is None:
             return near
         best, (others,) = near, displaced
@@ -153,8 +153,8 @@ class NearSearch:
                 best = other
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
 
-    def _displaced(self) -> Steps[list[Attempt]]:
-        """Attempts with status ok from displacements since the last scan in every horizontal direction.
+    def _displaced(self, near: Attempt) -> Steps[list[Attempt]]:
+        """Attempts with status ok, where a map is young and the scan lost at least degraded, from displacements since the last scan in every horizontal direction.
 
         A sensor at speed at the first scan, or with a wrong odometry, is out of reach of the predicted pose, and most
         of a street fits there too. The rotations are the predicted and the last one.
@@ -183,7 +183,10 @@ class NearSearch:
             moving = replace(last, velocity=velocity, covariance=UNKNOWN_VELOCITY)
             prediction = predict(moving, scan.stamp, Prior(), ProcessNoise(), self.matcher.config, scan.seen_from_s)
             attempts.append(self.matcher.attempt(prediction, prediction, patient=True))
-        return [attempt for attempt in attempts if attempt.status is Status.OK]
+        # The map of one sparse sweep is thin, so that even the right place fits poorly.
+        is_thin = local_map.is_young and not scan.has_rings and near.status is Status.LOST
+        least = Status.DEGRADED if is_thin else Status.OK
+        return [attempt for attempt in attempts if attempt.status in (Status.OK, least)]
 
     def from_odometry(self, near: Attempt) -> Attempt:
         """Where the prediction is uncertain along the weakest direction: from the odometry's motion.
