@@ -116,7 +116,9 @@ def smoothed_start(
     if not needed:
         return first
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
-    return first | {now: Prior(T, body_velocity(T, now - before), _COVARIANCE, is_smoothed=True) for (before, now), T in moved}
+    return first | {
+        now: Prior(T, body_velocity(T, now - before), _COVARIANCE, is_smoothed=True) for (before, now), T in moved
+    }
 
 
 def _quality(results: list[MappedScan]) -> float:

@@ -196,7 +196,9 @@ class ScanToMap(Stateful):
     def _prior(self, odometry: ScanOdometry, following: ScanOdometry | None) -> Prior:
         measured = odometry.motion.T_prev_curr if odometry.interval_s is not None else None
         before = Prior(measured, odometry.velocity, odometry.motion.covariance)
-        before = self._start.get(odometry.scan.stamp, before)
+        smoothed = self._start.get(odometry.scan.stamp, before)
+        if before.T_prev_curr is None or smoothed.T_prev_curr is None or before.allows(smoothed.T_prev_curr):
+            before = smoothed
         after = None if following is None else self._start.get(following.scan.stamp) or following
         velocity = SweepMotion(before.velocity, after.velocity if after else None).mean(odometry.scan)
         if before.turn_rate is not None and velocity is not None:

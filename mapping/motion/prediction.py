@@ -30,6 +30,8 @@ _VELOCITY_INFLATION = 2.0
 _UNEVEN = 1.0 / 8.0
 # Smoothing of the odometry's normalised squared error, and its gate: chi square, six degrees of freedom, 1 in 10,000.
 _ODOMETRY_SMOOTHING, _GATE = 0.2, 27.9
+# Factor on the odometry's own standard deviations beyond which a smoothed motion contradicts it.
+_SMOOTHED_CAUTION = 3.0
 # Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
 _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
 # An odometry conflicts with a registration where their translations differ by more than this squared Mahalanobis
@@ -74,6 +76,14 @@ class Prior:
             return np.asarray(self.caution**2 * self.covariance, dtype=np.float64)
         sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
         return np.asarray(np.diag(sigmas**2), dtype=np.float64)
+
+
+    def allows(self, T_prev_curr: FloatArray) -> bool:
+        """Whether a motion (4, 4) is within the odometry's own uncertainty; true where it has none."""
+        if self.covariance is None or self.T_prev_curr is None:
+            return True
+        error = log(inverse(self.T_prev_curr) @ T_prev_curr)
+        return float(error @ np.linalg.solve(_SMOOTHED_CAUTION**2 * self.covariance, error)) < _GATE
 
 
 @dataclass(frozen=True, eq=False)
