@@ -77,7 +77,6 @@ class Prior:
         sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
         return np.asarray(np.diag(sigmas**2), dtype=np.float64)
 
-
     def allows(self, T_prev_curr: FloatArray) -> bool:
         """Whether a motion (4, 4) is within the odometry's own uncertainty; true where it has none."""
         if self.covariance is None or self.T_prev_curr is None:
