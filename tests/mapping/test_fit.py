@@ -86,6 +86,14 @@ def test_the_share_of_inliers_decides_on_the_status(inlier_ratio, status):
     assert Fit(1_000, 0.9, 0.01, inlier_ratio).status(config) is status
 
 
+def test_in_a_young_map_a_scan_that_is_held_is_degraded_at_worst():
+    poor = Fit(1_000, 0.9, 0.01, 0.3, support=0.2)
+    assert poor.status(CONFIG, is_young=True, is_held=True) is Status.DEGRADED
+    assert poor.status(CONFIG, is_young=True) is Status.LOST
+    assert poor.status(CONFIG, is_held=True) is Status.LOST
+    assert Fit(50, 0.05, 0.001, 1.0).status(CONFIG, is_young=True, is_held=True) is Status.LOST
+
+
 def test_a_scan_that_hardly_meets_the_map_is_lost_however_it_fits():
     assert Fit(50, 0.05, 0.001, 1.0).status(CONFIG) is Status.LOST
     assert Fit(50, 0.05, 0.001, 1.0).explain(CONFIG) == "only 5 % of the scan overlaps the map"

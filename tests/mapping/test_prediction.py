@@ -221,3 +221,20 @@ def test_an_odometry_that_measures_a_clearly_different_motion_conflicts():
     assert OdometryNoise().conflict(replace(prior, T_prev_curr=fast), faster, 0.2) is None, "a fifth"
     assert OdometryNoise().conflict(replace(prior, covariance=None), still, 0.1) is None
     assert OdometryNoise().conflict(Prior(), still, 0.1) is None
+
+
+def test_a_smoothed_motion_is_held_and_another_one_is_not():
+    smoothed = predicted(Prior(MOVED, covariance=np.diag([1e-6] * 3 + [2.5e-5] * 3), is_smoothed=True))
+    near, far = (smoothed.T_world_lidar @ exp(np.array([0.0, 0.0, 0.0, away, 0.0, 0.0])) for away in (0.02, 0.5))
+    assert smoothed.holds(near, 0.0)
+    assert not smoothed.holds(far, 0.0)
+    assert not predicted(Prior(MOVED)).holds(near, 1.0)
+
+
+def test_a_motion_is_allowed_within_a_few_of_the_odometrys_deviations():
+    covariance = np.diag([1e-6] * 3 + [0.01**2] * 3)
+    near, far = (MOVED @ exp(np.array([0.0, 0.0, 0.0, away, 0.0, 0.0])) for away in (0.05, 0.3))
+    assert Prior(MOVED, covariance=covariance).allows(near)
+    assert not Prior(MOVED, covariance=covariance).allows(far)
+    assert Prior(MOVED).allows(far)
+    assert Prior().allows(far)
