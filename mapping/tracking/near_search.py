@@ -154,7 +154,7 @@ class NearSearch:
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
 
     def _displaced(self, near: Attempt) -> Steps[list[Attempt]]:
-        """Attempts with status ok from displacements since the last scan in every horizontal direction.
+        """Attempts that fit, from displacements since the last scan in every horizontal direction.
 
         A sensor at speed at the first scan, or with a wrong odometry, is out of reach of the predicted pose, and most
         of a street fits there too. The rotations are the predicted and the last one.
