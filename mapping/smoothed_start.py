@@ -123,7 +123,7 @@ def smoothed_start(
 
 def _quality(results: list[MappedScan]) -> float:
     """How well scans fit: the mean share of inliers times support."""
-    return float(np.mean([0.0 if one.fit is None else one.fit.quality for one in results]))
+    return float(np.mean([one.quality for one in results]))
 
 
 def _constraint(results: list[MappedScan]) -> float:

@@ -81,8 +81,7 @@ class Prior:
         """Whether a motion (4, 4) is within the odometry's own uncertainty; true where it has none."""
         if self.covariance is None or self.T_prev_curr is None:
             return True
-        error = log(inverse(self.T_prev_curr) @ T_prev_curr)
-        return float(error @ np.linalg.solve(_SMOOTHED_CAUTION**2 * self.covariance, error)) < _GATE
+        return _squared_error(self, T_prev_curr, _SMOOTHED_CAUTION**2 * self.covariance) < _GATE
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,13 +170,15 @@ class OdometryNoise:
         """The noise after a registered motion (4, 4), by the odometry's normalised squared error."""
         if prior.T_prev_curr is None:
             return self
-        squared = _squared_error(prior, T_prev_curr, config)
+        squared = _squared_error(prior, T_prev_curr, prior.motion_covariance(config))
         variance = max(1.0, self.variance + _ODOMETRY_SMOOTHING * (squared / 6.0 - self.variance))
         return OdometryNoise(variance, self.agreed + 1 if squared < _GATE * self.variance else 0)
 
     def agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool | None:
         """Whether a registered motion (4, 4) passes the gate of a proven odometry; None where there is none."""
-        return _squared_error(prior, T_prev_curr, config) <= _GATE * self.variance if self.is_proven(prior) else None
+        if not self.is_proven(prior):
+            return None
+        return _squared_error(prior, T_prev_curr, prior.motion_covariance(config)) <= _GATE * self.variance
 
     def conflict(self, prior: Prior, T_prev_curr: FloatArray, interval_s: float) -> str | None:
         """The axis along which the odometry's translation differs most from a registered motion's (4, 4).
@@ -199,11 +200,11 @@ class OdometryNoise:
         return prior.T_prev_curr is not None and self.agreed >= _PROVEN_AFTER
 
 
-def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> float:
-    """Squared Mahalanobis distance of the odometry's motion from another one (4, 4)."""
+def _squared_error(prior: Prior, T_prev_curr: FloatArray, covariance: FloatArray) -> float:
+    """Squared Mahalanobis distance of the odometry's motion from another one (4, 4), by its covariance (6, 6)."""
     assert prior.T_prev_curr is not None
     error = log(inverse(prior.T_prev_curr) @ T_prev_curr)
-    return float(error @ np.linalg.solve(prior.motion_covariance(config), error))
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,9 +215,14 @@ class Prediction(MotionState):
     is_inertial: bool = False  # whether an IMU has a part in it
     is_smoothed: bool = False  # whether the smoothed start has
 
+    @property
+    def sigma_m(self) -> float:
+        """Largest standard deviation of the position."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1]))
+
     def is_held_within(self, distance_m: float) -> bool:
         """Whether it is an IMU's, with no larger standard deviation of the position."""
-        return self.is_inertial and bool(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1] < distance_m**2)
+        return self.is_inertial and self.sigma_m < distance_m
 
     def holds(self, T_world_lidar: FloatArray, within_m: float) -> bool:
         """Whether it is smoothed, or an IMU's known to a distance, and a pose (4, 4) agrees with it."""

@@ -154,6 +154,11 @@ class MappedScan:
     cell_m: float | None = None  # edge of the finest cells of a local map
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU
 
+    @property
+    def quality(self) -> float:
+        """Score of the fit; 0 without one."""
+        return 0.0 if self.fit is None else self.fit.quality
+
     @classmethod
     def lost(cls, prediction: Prediction, reason: str, fit: Fit | None = None, fading: float = 1.0) -> "MappedScan":
         """A scan that stays at its prediction, out of the map; its velocity fades by a factor."""

@@ -183,7 +183,7 @@ class Mapper(Stateful):
             moving = replace(last, velocity=last.velocity + velocity_error(last, mapped.state, share))
             self._tracker.rewind(before)
             again = self._track(scan, prior, moving, self._new_map(first, moving))
-            if not again.registered or _quality(again) < _LEAST_KEPT * _quality(mapped):
+            if not again.registered or again.quality < _LEAST_KEPT * mapped.quality:
                 self._tracker.rewind(before)
                 mapped = self._track(scan, prior, last, self._new_map(first, last))
                 break
@@ -219,10 +219,6 @@ class Mapper(Stateful):
         if self.kept_scans:
             recent.append(Insertion(self._scans, points, scan.elevations, state.T_world_lidar[:3, 3]))
         self._recent = recent
-
-
-def _quality(mapped: MappedScan) -> float:
-    return 0.0 if mapped.fit is None else mapped.fit.quality
 
 
 def _sparse_message(scan: SampledScan) -> str:

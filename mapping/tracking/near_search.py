@@ -166,7 +166,7 @@ class NearSearch:
         radius_m, up = min(_FASTEST_M_S * interval_s, scan.range_m), local_map.vertical()
         spacing_m, starts = _DISPLACED_CELLS * local_map.cell_m, []
         if self.state.velocity_known and self._is_open:
-            radius_m = min(radius_m, _OPEN_SIGMAS * self._sigma_m)
+            radius_m = min(radius_m, _OPEN_SIGMAS * self.prediction.sigma_m)
             spacing_m = max(spacing_m, radius_m / _MOST_DISPLACED)
         for rotation in (self.prediction.T_world_lidar, last.T_world_lidar):
             T = last.T_world_lidar.copy()
@@ -223,15 +223,10 @@ class NearSearch:
         return _clearly_best(near, (other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m))
 
     @property
-    def _sigma_m(self) -> float:
-        """Largest standard deviation of the predicted position."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.prediction.covariance[3:6, 3:6])[-1]))
-
-    @property
     def _is_open(self) -> bool:
         """Whether the position is predicted worse than a registration converges, and not measured."""
         is_measured = self.prior.T_prev_curr is not None or self.prediction.is_inertial
-        return not is_measured and self._sigma_m > _OPEN_CELLS * self.matcher.local_map.cell_m
+        return not is_measured and self.prediction.sigma_m > _OPEN_CELLS * self.matcher.local_map.cell_m
 
     def _is_poor(self, near: Attempt) -> bool:
         """Whether a scan fits poorly where an odometry measured its motion."""
