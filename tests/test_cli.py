@@ -143,6 +143,7 @@ def test_the_mapping_is_chosen_on_the_command_line(recording: Path, arguments: l
     assert take_config(context.params, recording).mapping.method == method
 
 
+@pytest.mark.long
 def test_merge_says_who_is_left_out(recording: Path, tmp_path: Path) -> None:
     shutil.copytree(recording, tmp_path / "again")
     out = tmp_path / "merged"
@@ -245,6 +246,7 @@ def test_options_that_view_cannot_follow_are_named(arguments: list[object], said
     assert said in result.stderr
 
 
+@pytest.mark.long
 def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path: Path, recording: Path) -> None:
     """A ROS overlay, for example, puts its packages in front of ours."""
     for name in ("odometry", "mapping", "evaluation"):

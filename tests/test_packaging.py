@@ -28,6 +28,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
     return ZipFile(next(folder.glob("*.whl")))
 
 
+@pytest.mark.long
 def test_everything_below_the_package_is_in_the_wheel(wheel: ZipFile) -> None:
     walked = os.walk(REPOSITORY / "lidarslam", followlinks=True)
     files = {Path(folder, name).relative_to(REPOSITORY).as_posix() for folder, _, names in walked for name in names}

@@ -14,6 +14,7 @@ def test_benchmarks_have_the_peers_that_need_no_imu() -> None:
     assert not any(PEERS[name].needs_imu for name in NAMES)
 
 
+@pytest.mark.long
 def test_a_peer_runs_in_a_process_of_its_own(room_scans: list[Scan], room_truth: Trajectory) -> None:
     pytest.importorskip("small_gicp", reason="needs the extra peers")
     found = run_peer("small-gicp", room_scans[:5])

@@ -222,6 +222,7 @@ def test_who_compiles_anew_at_every_start_is_told_so_once(
     assert caplog.text.count(warning) == 1
 
 
+@pytest.mark.long
 def test_a_user_without_a_home_keeps_code_in_a_temporary_folder(tmp_path: Path) -> None:
     (tmp_path / "sums.py").write_text(SOURCE)
     (tmp_path / "__pycache__").write_text("a file, where no folder can be made")

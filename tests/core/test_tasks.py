@@ -76,6 +76,7 @@ def test_results_are_in_order_whoever_is_first(tasks: Tasks) -> None:
     assert list(tasks.run(square, [])) == []
 
 
+@pytest.mark.long
 def test_an_error_of_a_task_is_that_of_the_user(tasks: Tasks) -> None:
     with pytest.raises(InputError, match="three 3"):
         list(tasks.run(fail_at_three, [1.0, 2.0, 3.0, 4.0]))

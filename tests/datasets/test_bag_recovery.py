@@ -267,6 +267,7 @@ def join(folder, file, later):
     metadata.write_text(text.replace("message_count: 6\n", "message_count: 12\n"))
 
 
+@pytest.mark.long
 def test_damage_in_one_file_of_a_folder_costs_no_other(write_drive):
     file, folder, _ = write_drive("mcap", **BIG)
     later, _, _ = write_drive("mcap", **BIG, name="later", first=6)

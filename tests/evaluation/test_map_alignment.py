@@ -100,6 +100,7 @@ def test_a_guess_that_fits_needs_no_search(building: FloatArray) -> None:
     assert align_map(seen, building, {"trajectory": T_true}, search=True).method == "trajectory"
 
 
+@pytest.mark.long
 def test_another_place_is_refused(building: FloatArray) -> None:
     rng = np.random.default_rng(3)
     elsewhere = rng.uniform(0.0, 12.0, (4_000, 3))
@@ -119,6 +120,7 @@ def test_a_place_with_two_fitting_poses_is_refused() -> None:
         align_map(seen, box, {}, search=True)
 
 
+@pytest.mark.long
 def test_the_pose_is_the_same_for_any_number_of_threads() -> None:
     """Sums of several threads have no fixed order."""
     root = str(Path(__file__).parents[2])

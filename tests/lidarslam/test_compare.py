@@ -143,6 +143,7 @@ def test_whatever_a_method_dies_of_is_its_row(
     assert "kiss-icp@1: aborted (signal 6)" in format_comparison(outcome.comparison, tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_the_method_at_work_and_writes_what_there_is(
     recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
@@ -189,6 +190,7 @@ def test_a_file_can_be_the_reference(
     assert "the times do not overlap" in prior.message
 
 
+@pytest.mark.long
 def test_without_any_reference_there_is_still_a_table(
     recording: Path, tmp_path: Path, told: Told, room_scans: list[Scan]
 ) -> None:
@@ -267,6 +269,7 @@ def test_a_bound_that_is_not_met_has_a_status_of_its_own(finished: Finished, rec
     assert "room prior         kitti  could not be computed  <= 1    FAIL" in failed.stdout
 
 
+@pytest.mark.long
 def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, tmp_path: Path) -> None:
     prior = tmp_path / "short.tum"
     prior.write_text("0.1 0 0 0 0 0 0 1\n0.2 0 0 0 0 0 0 1\n")

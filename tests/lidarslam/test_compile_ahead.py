@@ -48,6 +48,7 @@ for loop, types in called().items():
 """
 
 
+@pytest.mark.long
 def test_a_rehearsal_compiles_all_that_a_run_calls(tmp_path: Path) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()

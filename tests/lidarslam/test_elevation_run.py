@@ -53,6 +53,7 @@ def test_a_run_reports_the_bias_and_what_to_set(low: Path, tmp_path: Path) -> No
     assert any(f"reader.elevation_correction_deg={bias_deg:.2f}" in warning for warning in found["warnings"])
 
 
+@pytest.mark.long
 def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     found = summary(low, out, "reader.elevation_correction_deg=auto")
@@ -67,6 +68,7 @@ def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
     assert again.exit_code == 0, again.output
 
 
+@pytest.mark.long
 def test_without_a_map_there_is_no_estimate(small_recording: Path, tmp_path: Path) -> None:
     command = ["run", str(small_recording), "--out", str(tmp_path / "run"), "--odometry", "kiss-icp", "--no-mapping"]
     pytest.importorskip("kiss_icp")

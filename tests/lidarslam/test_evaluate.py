@@ -97,6 +97,7 @@ def test_every_alignment_is_told(run: Path, tmp_path: Path, alignment: str) -> N
         assert evaluation.map.json["accuracy_mean_m"] < 0.02  # type: ignore[operator]
 
 
+@pytest.mark.long
 def test_the_map_alone_of_a_run_without_truth(run: Path, recording: Path, surfaces: FloatArray) -> None:
     write_cloud(run.parent / "site.ply", PointCloud(surfaces, np.zeros_like(surfaces)))
     (recording / "ground_truth.tum").unlink()

@@ -90,6 +90,7 @@ def test_shaken_sweeps_are_straightened(recording: Path, run: Any) -> None:
     assert errors["imu"] < 0.15
 
 
+@pytest.mark.long
 def test_an_imu_that_nobody_asks_for_changes_nothing(recording: Path, run: Any, tmp_path: Path) -> None:
     bare = tmp_path / "room"
     bare.mkdir()
@@ -126,6 +127,7 @@ def test_the_mounting_is_found_where_the_recording_has_none(tmp_path: Path, room
     assert rotation_error_deg(out, source) < 0.2
 
 
+@pytest.mark.long
 def test_an_unknown_mounting_is_not_guessed_but_may_be_given(tmp_path: Path, room: Any, run: Any) -> None:
     source = record(tmp_path / "room", room, scans=20, mounting=False)
     result, _ = run(source, "--odometry", "imu", name="guess")
@@ -238,6 +240,7 @@ def test_samples_are_checked(tmp_path: Path) -> None:
         slam.register_imu(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
 
 
+@pytest.mark.long
 def test_without_samples_scans_are_registered_all_the_same(longer: Path, tmp_path: Path) -> None:
     with lidarslam.Slam({"odometry.method": "imu", "mapping.keypoints": 800}) as slam:
         register_all(slam, longer, until=lambda _: False)

@@ -31,6 +31,7 @@ def position_errors(run: Path, source: Path) -> FloatArray:
     return np.asarray(np.linalg.norm(T[:, :3, 3], axis=1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("more", [[], ["--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2"]])
 def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
     out = tmp_path / "run"

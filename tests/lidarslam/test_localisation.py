@@ -124,6 +124,7 @@ def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_m
     assert moved == pytest.approx(np.linalg.norm(true_path[:3, 3]), abs=0.2)
 
 
+@pytest.mark.long
 def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any) -> None:
     """From 20 to 180 deg/s around the first sweep: the odometry's motion to the second is not the first one's."""
 

@@ -72,6 +72,7 @@ def test_poses_are_in_the_frame_of_the_map(tmp_path: Path, recording: Path, mapp
     assert len(run.map_points) == len(load_run(mapped).map_points)
 
 
+@pytest.mark.long
 def test_a_recording_of_another_place_is_refused(tmp_path: Path, room: Any, drive: Drive, mapped: Path) -> None:
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     elsewhere, out = record(tmp_path / "elsewhere", other, drive), tmp_path / "out"

@@ -37,6 +37,7 @@ def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str)
     return result, json.loads((out / "summary.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path, room_truth: Trajectory) -> None:
     good, fine = run(recording, room_truth, tmp_path / "good", 1.0)
     assert good.exit_code == 0, good.output

@@ -71,6 +71,7 @@ def run(source: Path, out: Path, *arguments: str) -> str:
     return result.output
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", WAYS)
 def test_the_map_has_the_intensities_and_colours_of_its_surfaces(
     source: Path, tmp_path: Path, drive: Callable[[FloatArray], FloatArray], way: str
@@ -96,6 +97,7 @@ def test_the_map_has_the_intensities_and_colours_of_its_surfaces(
     assert len(dict(load_run(tmp_path / "run").map_attributes.present())) == 2
 
 
+@pytest.mark.long
 def test_rings_and_times_are_those_of_the_first_point(
     source: Path, tmp_path: Path, drive: Callable[[FloatArray], FloatArray]
 ) -> None:
@@ -127,6 +129,7 @@ def test_geometry_does_not_depend_on_the_fields(source: Path, tmp_path: Path) ->
         assert (tmp_path / "none" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
 
 
+@pytest.mark.long
 def test_further_formats(source: Path, tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     out = tmp_path / "run"

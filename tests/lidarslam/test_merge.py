@@ -238,6 +238,7 @@ def rooms(tmp_path: Path, room_scans: list[Scan]) -> list[Path]:
     return [write_recording(tmp_path / f"in room {number}", room_scans[:5]) for number in range(3)]
 
 
+@pytest.mark.long
 def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     merge(request(out, *rooms, settings=FAST), quiet)
@@ -253,6 +254,7 @@ def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_pat
     assert not list(out.rglob(".partial*"))
 
 
+@pytest.mark.long
 def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: list[Path], tmp_path: Path) -> None:
     (rooms[0] / "000003.npy").write_bytes(b"not an array")
     for scan in rooms[1].glob("*.npy"):
@@ -267,6 +269,7 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: l
     assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
 
 
+@pytest.mark.long
 def test_an_interrupted_merge_goes_on_where_it_was(
     rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
 ) -> None:
@@ -399,6 +402,7 @@ def test_what_a_killed_overwrite_of_a_merge_was_to_replace_is_given_back(
         assert timeless(out) == timeless(counted)
 
 
+@pytest.mark.long
 def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(InputError, match="two recordings or more"):

@@ -90,6 +90,7 @@ def of_person(points: FloatArray) -> FloatArray:
     return chosen
 
 
+@pytest.mark.long
 def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
     said = run(source, tmp_path / "without")
     run(source, tmp_path / "with", "--set", "global_map.leave_out_moved=false")
@@ -105,6 +106,7 @@ def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
     assert f"voxels of 10 cm; {left_out:,} points of moving objects removed" in said
 
 
+@pytest.mark.long
 def test_the_last_map_that_rerun_shows_is_the_written_one(source: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
@@ -144,6 +146,7 @@ def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
     assert T_world_lidar[last, 0, 3] == pytest.approx(placed.T_world_lidar[-1, 0, 3], abs=1e-6)
 
 
+@pytest.mark.long
 def test_moved_points_are_removed_again_with_other_settings(source: Path, tmp_path: Path) -> None:
     run(source, tmp_path / "run")
     kept = {}

@@ -68,6 +68,7 @@ def test_a_loop_and_a_run_have_the_same_poses(slam: Slam, room_scans: list[Scan]
     np.testing.assert_array_equal([result.T_world_lidar for result in register(slam, room_scans)], of_run)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["learned", "kiss-icp"])
 def test_every_odometry_works_at_once(method: str, room_scans: list[Scan], room_truth: Trajectory) -> None:
     with Slam({"odometry.method": method, "odometry.kiss_icp.voxel_size_m": 0.2}) as slam:
@@ -102,6 +103,7 @@ def test_asking_for_the_map_on_the_way_changes_no_pose(room_scans: list[Scan]) -
     assert poses[0][1] == poses[1][1]
 
 
+@pytest.mark.long
 def test_saved_runs_are_like_others(slam: Slam, tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> None:
     register(slam, room_scans[:10])
     out = tmp_path / "run"
@@ -130,6 +132,7 @@ def test_saved_runs_are_like_others(slam: Slam, tmp_path: Path, room_scans: list
     assert not (out / "metrics.json").exists(), "nothing is written"
 
 
+@pytest.mark.long
 def test_a_pose_graph_is_saved(tmp_path: Path, room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
     with Slam(GRAPH) as slam:
         register(slam, room_scans)

@@ -36,6 +36,7 @@ def serve() -> "Iterator[Serve]":
         process.communicate()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("request_to_end", [signal.SIGINT, signal.SIGTERM])
 def test_a_view_ends_well(serve: Serve, finished_run: Path, request_to_end: signal.Signals) -> None:
     process, address = serve("view", finished_run, "--web")
@@ -70,6 +71,7 @@ def test_a_run_is_served_while_it_goes_on_and_afterwards(serve: Serve, small_rec
     assert (process.returncode, err) == (0, "")
 
 
+@pytest.mark.long
 def test_a_run_that_is_interrupted_does_not_stay(serve: Serve, small_recording: Path, tmp_path: Path) -> None:
     process, _ = serve("run", small_recording, "--out", tmp_path / "run", "--rerun", "web")
     process.send_signal(signal.SIGINT)

@@ -300,6 +300,7 @@ def test_a_killed_run_comes_to_the_same_results(
     assert resumed in ended.said
 
 
+@pytest.mark.long
 def test_the_graph_that_is_resumed_has_loops(whole: Callable[[str], Whole]) -> None:
     """Else the test above would tell nothing about them."""
     assert json.loads((whole("pose graph").out / "summary.json").read_text())["loop_closures"] > 0
@@ -385,6 +386,7 @@ def test_a_run_may_be_killed_while_it_writes(
     kill_and_resume(run, expected, source, tmp_path / "run", kill_at=round(share * expected.ended.events))
 
 
+@pytest.mark.long
 def test_a_run_that_is_stopped_can_be_resumed_as_well(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path
 ) -> None:
@@ -422,6 +424,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -467,6 +470,7 @@ def test_another_recording_is_not_taken_for_it(
     assert ended.said.count("\n") == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["state.npz", "run.json"])
 def test_damage_is_told_in_one_line(
     run: Run, whole: Callable[[str], Whole], source: Path, killed: Path, name: str

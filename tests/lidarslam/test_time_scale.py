@@ -69,6 +69,7 @@ def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: 
     assert all(f"times are {fault}" in text for text in warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mounting", ["auto", "upright", "left"])
 def test_the_scale_holds_for_any_mounting(walk: Path, mounting: str) -> None:
     configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))

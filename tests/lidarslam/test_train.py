@@ -142,6 +142,7 @@ def copied_before_each_change(out: Path, copies: Path) -> Iterator[None]:
         yield
 
 
+@pytest.mark.long
 def test_a_killed_training_goes_on_to_the_same_weights(room_folder, tmp_path, ready, whole):
     parts, copies = tmp_path / "parts", tmp_path / "copies"
     with copied_before_each_change(parts, copies):
@@ -292,6 +293,7 @@ def train(*arguments: object) -> Result:
     return lidarslam("train", *arguments)
 
 
+@pytest.mark.long
 def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     out = tmp_path / "out"
     options = ("--out", out, "--prepared", ready, "--device", "cpu")

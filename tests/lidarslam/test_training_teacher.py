@@ -29,6 +29,7 @@ def drive() -> tuple[list[Scan], Trajectory]:
     return list(simulation.scans()), simulation.ground_truth
 
 
+@pytest.mark.long
 def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(drive):
     scans, truth = drive
     teacher = MapTeacher()

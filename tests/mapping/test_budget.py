@@ -145,6 +145,7 @@ def results(mapper: Mapper, faulty: Faulty, clock: FakeClock, first: int = 0) ->
         clock.taken_ms.append(1e3 * (clock.s - started))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["carried", pytest.param("covered", marks=pytest.mark.slow)])
 def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(simulation, clock, fault):
     if fault == "carried":
@@ -171,6 +172,7 @@ def test_without_a_budget_the_same_search_takes_one_scan(simulation, clock):
     assert mapped[AT].message.startswith("relocalised")
 
 
+@pytest.mark.long
 def test_a_search_that_was_under_way_begins_anew_after_a_resumption(simulation, clock):
     faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
     config = MappingConfig(budget_ms=BUDGET_MS)

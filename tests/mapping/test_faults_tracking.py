@@ -119,6 +119,7 @@ def polluted_share(results: list[MappedScan], recorded: Faulty, simulation: Simu
     return float((simulation.distance_to_surfaces(np.concatenate(drawn)) > 0.2).mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cover", ["near", "stray"])
 def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(mapper, drive_by, cover):
     """For one second, while it moves on; more scans than after which a map is given up."""
@@ -232,6 +233,7 @@ def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> 
     return Faulty(tuple(simulation.scans()), simulation.ground_truth, np.zeros(scans, dtype=np.bool_), 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["office", pytest.param("forest", marks=pytest.mark.slow)])
 def test_nothing_drifts_while_the_sensor_stands_still(name):
     """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 50 scans."""

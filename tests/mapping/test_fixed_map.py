@@ -97,6 +97,7 @@ def test_scans_before_the_place_are_placed_by_the_recordings_own_map(localised):
     assert off_m.max() < 0.1
 
 
+@pytest.mark.long
 def test_another_room_is_refused_with_a_reason(room, room_map):
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     localiser = MapLocaliser(MappingConfig(), room_map)
@@ -107,6 +108,7 @@ def test_another_room_is_refused_with_a_reason(room, room_map):
     assert all(reason for _, reason in localiser.refusals)
 
 
+@pytest.mark.long
 def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room):
     empty = type(room)(pillars=())  # as it is, and turned by half a turn
     empty_map = draw_map(empty)

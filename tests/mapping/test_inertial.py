@@ -272,6 +272,7 @@ def test_reversed_time_gives_the_reversed_motion(rng):
     assert np.linalg.norm(log(inverse(state.T_world_lidar) @ true)[3:]) < 0.01
 
 
+@pytest.mark.long
 def test_a_wrong_mounting_or_clock_is_noticed(walked, rng):
     imu, turned = samples(walk, 7.0), T_LIDAR_IMU @ exp([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
     late = replace(imu, stamps=imu.stamps + 0.3)
@@ -282,6 +283,7 @@ def test_a_wrong_mounting_or_clock_is_noticed(walked, rng):
         assert any("the IMU's mounting or clock is wrong" in warning for warning in inertial.warnings)
 
 
+@pytest.mark.long
 def test_scaled_accelerations_and_an_unknown_lever_arm_are_recovered(rng):
     """Gravity is not scaled; the prediction is as good as without."""
     T_turned = make_transform(T_LIDAR_IMU[:3, :3], np.zeros(3))
@@ -375,6 +377,7 @@ def test_a_prediction_follows_the_imu_where_the_motion_is_uncertain():
     assert not predict(last, 0.1, Prior(), ProcessNoise(), MappingConfig()).is_held_within(100.0)
 
 
+@pytest.mark.long
 def test_large_biases_are_reported(rng):
     biased = samples(walk, 15.0, bias=np.deg2rad([1.0, -1.0, 0.5]), force_bias=np.array([0.4, 0.8, -0.3]))
     inertial = Inertial(biased, T_LIDAR_IMU)

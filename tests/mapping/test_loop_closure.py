@@ -137,6 +137,7 @@ def test_nothing_is_closed_on_a_way_without_return(hall):
     assert accepted(closures) == []
 
 
+@pytest.mark.long
 def test_segments_are_joined_whatever_their_worlds_and_mounts(hall):
     first, second = round_trip(0.6), round_trip(0.9)[9:] @ exp([0, 0, 0.2, 0.3, -0.2, 0.0]) @ UPSIDE_DOWN
     submaps = submaps_of(hall, first, 0) + submaps_of(hall, second, 1, len(first))
@@ -189,6 +190,7 @@ def test_a_planted_falsehood_is_refused(twice, monkeypatch):
     assert any(not c.accepted for c in closures)
 
 
+@pytest.mark.long
 def test_what_drift_cannot_explain_is_refused(twice):
     submaps, truth = twice
     config = LoopConfig(min_way_m=10.0, drift_percent=0.01)

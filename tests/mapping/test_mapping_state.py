@@ -37,6 +37,7 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
         assert getattr(found, name) == getattr(expected, name), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "recording", "resumed_after"), [("surfels", "scans", (1, 6, 8)), ("loam", "ring_scans", (1, 7))]
 )

@@ -185,6 +185,7 @@ def test_a_forbidden_loop_is_not_found(walk, closed):
     assert barred.tolist() == [False, True, True, False, False]
 
 
+@pytest.mark.long
 def test_a_given_loop_is_closed_from_a_wrong_estimate(walk):
     """No loop is tried by itself; the estimate is off by more than a room, without a word of it."""
     T_off, lost = exp([0.0, 0.0, 1.2, 6.0, -4.0, 0.5]), 140
@@ -249,6 +250,7 @@ def redrawn(walk: Walk) -> list[tuple[int, SurfelMap]]:
     return drawn
 
 
+@pytest.mark.long
 def test_the_local_map_is_drawn_anew_where_the_second_round_is(walk, redrawn):
     """Surfaces of the first round lie where the truth has them relative to the sensor, which has drifted away."""
     assert 1 <= len(redrawn) <= 3
@@ -307,6 +309,7 @@ def test_a_run_without_a_scan_has_nothing_to_correct():
     graph.close()
 
 
+@pytest.mark.long
 def test_a_graph_that_is_restored_goes_on_to_the_same_result(walk, closed, through_disk, tmp_path):
     """After loops were closed, which the present poses show without a change of the graph."""
     scans, file = list(walk.scans()), tmp_path / "submaps.bin"
@@ -374,6 +377,7 @@ def test_a_second_recording_finds_itself_in_the_first(walk, second_walk, two):
     assert 0 < len(drawn) < len(graph.draw_map(result, VOXEL_M).points())
 
 
+@pytest.mark.long
 def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace(walk, second_walk, two, monkeypatch):
     graph, joined = two
 

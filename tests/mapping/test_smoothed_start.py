@@ -30,6 +30,7 @@ def strokes() -> tuple[list[Scan], FloatArray]:
     return walk("mid-360", 40)
 
 
+@pytest.mark.long
 def test_motions_of_a_sensor_without_rings_are_true(strokes):
     scans, truth = strokes
     smoothed = smoothed_start(scans, MappingConfig())
@@ -40,6 +41,7 @@ def test_motions_of_a_sensor_without_rings_are_true(strokes):
         assert motion.velocity == pytest.approx(log(motion.T_prev_curr) / 0.1)
 
 
+@pytest.mark.long
 def test_registration_in_order_suffices_where_a_sweep_makes_a_map():
     scans, _ = walk("os0-64", 40, 10)
     assert smoothed_start(iter(scans), MappingConfig()) == {}

@@ -51,6 +51,7 @@ def worst_m(results: list[MappedScan], truth: FloatArray) -> float:
     return float(np.linalg.norm((inverse(truth) @ estimated)[:, :3, 3], axis=1).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("step", "metres"), [(1, 0.05), (3, 0.1)])
 def test_without_an_odometry_its_way_is_found(scans, truth, step, metres):
     """Three scans apart it is three metres: out of reach of the pose expected of a car that stands."""

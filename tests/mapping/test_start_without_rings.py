@@ -16,6 +16,7 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_drone_takes_off(seed):
     world = build_world("street", seed)

@@ -148,6 +148,7 @@ def test_far_away_and_outside_the_rows_nothing_is_seen():
     assert seen_through(np.empty((0, 3)), placed(images), VOXEL_M).shape == (0,)
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
 def test_the_verdict_is_that_of_all_views(seed, count):

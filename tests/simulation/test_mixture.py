@@ -63,6 +63,7 @@ def simulation(excerpt: Excerpt) -> Simulation:
     return excerpt.whole
 
 
+@pytest.mark.long
 def test_recordings_are_as_their_ingredients_say(drawn):
     for number, excerpt in enumerate(drawn):
         of, made = ingredients_of(number, SEED), simulation(excerpt)

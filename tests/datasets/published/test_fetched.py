@@ -168,6 +168,7 @@ def breaking_server() -> Iterator[str]:
         http.shutdown()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("changes", [False, True], ids=["the same file", "another meanwhile"])
 @pytest.mark.parametrize("has_ranges", [True, False], ids=["from the middle", "from the start alone"])
 def test_a_download_that_broke_off_is_continued(

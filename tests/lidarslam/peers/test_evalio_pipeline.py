@@ -76,6 +76,7 @@ class Room(Dataset):
 """
 
 
+@pytest.mark.long
 def test_evalio_runs_it_and_saves_the_imus_poses_at_the_starts_of_the_sweeps(
     tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory
 ) -> None:

@@ -123,6 +123,7 @@ def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: A
     assert error_m(0.0) < min(error_m(-0.5 * SWEEP_S), error_m(0.5 * SWEEP_S))
 
 
+@pytest.mark.long
 def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recording: Path, tmp_path: Path) -> None:
     pytest.importorskip("small_gicp", reason="needs the extra peers")
     out = tmp_path / "compared"
