@@ -41,8 +41,8 @@ from lidarslam.mapping.surfels.voxel_hash import (
 _COUNT, _FIRST, _SECOND, _ELEVATION, _VIEW = 0, slice(1, 4), slice(4, 10), slice(10, 12), slice(12, 15)
 _SUMS, _SURFELS = 16, 15
 # Columns of surfels: mean in the world, unit axes of least (towards the sensor) and of largest extent, standard
-# deviations along the principal axes (ascending) and of the elevation (radians), weighted number of points, whether it
-# is a plane.
+# deviations along the principal axes (ascending) and of the elevation (radians; -1 without rings), weighted number of
+# points, whether it is a plane.
 MEAN, NORMAL, DIRECTION, SPREADS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 ELEVATION_SPREAD, COUNT, IS_PLANE = 12, 13, 14
 

@@ -266,7 +266,7 @@ def _compute(row: int, around: NDArray[np.int32], cells: Cells, surfels: FloatAr
     for axis in range(3):
         surfel[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m
     elevation = total[10] / count
-    surfel[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0))
+    surfel[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0)) if total[11] > 0.0 else -1.0
     surfel[13] = count
     thickness, width, length = surfel[9], surfel[10], surfel[11]
     enough = surfel[13] >= _FEWEST_POINTS

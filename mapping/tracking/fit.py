@@ -46,6 +46,7 @@ class Fit:
     # noise of their normals; None where that noise is unknown, or there are none.
     evidence: float | None = None
     weakest: tuple[float, float, float] | None = None  # that direction, unit, in the world
+    unsupported: tuple[float, float, float] | None = None  # direction of too little support, unit, in the world
 
     @classmethod
     def of(
@@ -73,14 +74,16 @@ class Fit:
             noise = float((weights / (1.0 + distances**2)) @ tilt**2)
             values, axes = np.linalg.eigh(information[1])
             evidence, weakest = float(values[0]) / max(noise, 1e-12), tuple(axes[:, 0].tolist())
+        support, least = directional_support(*information)
         return cls(
             matched=len(distances),
             overlap=len(distances) / points,
             residual_m=residual_m,
             inlier_ratio=float(ratios.min() if len(ratios) else inlier.mean()),
-            support=directional_support(*information),
+            support=support,
             evidence=evidence,
             weakest=weakest,
+            unsupported=tuple(least.tolist()) if support < _DEGRADED_SUPPORT else None,
         )
 
     @property
@@ -134,8 +137,8 @@ class Fit:
 NO_FIT = Fit(0, 0.0, None, None)
 
 
-def directional_support(information: FloatArray, supported: FloatArray, share: float) -> float:
-    """The least inlier ratio over all directions of translation, points weighted by their constraint on it.
+def directional_support(information: FloatArray, supported: FloatArray, share: float) -> tuple[float, FloatArray]:
+    """The least inlier ratio over all directions (3,) of translation, points weighted by their constraint on it.
 
     The smallest generalised eigenvalue of the sums (3, 3) of `translation_information`, whose mean weight is the share.
     """
@@ -143,7 +146,9 @@ def directional_support(information: FloatArray, supported: FloatArray, share: f
     # The ridge is supported as well as the whole.
     root = np.linalg.cholesky(information + ridge)
     half = np.linalg.solve(root, supported + share * ridge)
-    return float(np.linalg.eigvalsh(np.linalg.solve(root, half.T))[0])
+    values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+    direction = np.linalg.solve(root.T, vectors[:, 0])
+    return float(values[0]), np.asarray(direction / np.linalg.norm(direction))
 
 
 def translation_information(

@@ -67,11 +67,12 @@ class Attempt:
     def unconstrained(self) -> tuple[str, ...]:
         """Names of the LiDAR frame's axes that nothing, or no more than the noise of normals, constrains.
 
-        Where a rival fits as well, the axis to that, too.
+        Where few of the points that constrain a direction fit, or a rival fits as well, that axis, too.
         """
         names = set() if self.registration is None else set(self.registration.degeneracy.names)
         weakest = None if self.fit.is_constrained else self.fit.weakest
-        for direction in (weakest, self.rival):
+        unsupported = self.fit.unsupported if self.status is Status.DEGRADED else None
+        for direction in (weakest, unsupported, self.rival):
             if direction is not None:
                 along = np.abs(self.T_world_lidar[:3, :3].T @ np.array(direction))
                 names.add(AXES[3 + int(along.argmax())])

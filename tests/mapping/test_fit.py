@@ -119,7 +119,7 @@ def street_normals(rng: np.random.Generator, along: int) -> FloatArray:
 
 
 def support_of(normals: FloatArray, distances: FloatArray) -> float:
-    return directional_support(*translation_information(normals, distances))
+    return directional_support(*translation_information(normals, distances))[0]
 
 
 def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supported(rng):
@@ -132,6 +132,8 @@ def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supporte
     assert support_of(normals, held) > 0.99
     assert support_of(normals, slid) < 0.2
     assert np.mean(slid < 1.0) > 0.9
+    _, direction = directional_support(*translation_information(normals, slid))
+    assert abs(direction[0]) > 0.99
     tunnel = street_normals(rng, along=0)
     assert support_of(tunnel, np.full(len(tunnel), 0.1)) > 0.98
 
