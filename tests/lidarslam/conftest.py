@@ -19,7 +19,22 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 
-from ..conftest import succeeds, write_recording
+from ..conftest import lidarslam, succeeds, write_recording
+
+FAST = ("--odometry", "constant-velocity", "--no-report")
+
+
+def refused(*arguments: object) -> str:
+    """The one line of a command that ends with exit status 1."""
+    result = lidarslam(*arguments)
+    assert result.exit_code == 1, result.output
+    assert result.stderr.startswith("lidarslam: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+def summary_of(run: Path) -> dict[str, Any]:
+    return dict(json.loads((run / "summary.json").read_text()))
 
 
 def scan_estimate(stamp: float, T_world_lidar: FloatArray, status: Status = Status.OK, **values: Any) -> ScanEstimate:

@@ -3,7 +3,6 @@
 import json
 import os
 import pickle
-import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import Result
 from safetensors import safe_open
 from safetensors.torch import save_file
 
@@ -22,17 +20,7 @@ from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights
 
 from ..conftest import lidarslam
-
-
-def one_line_of(result: Result) -> str:
-    assert result.exit_code == 1
-    assert result.stdout == ""
-    assert result.stderr.startswith("lidarslam: ")
-    assert result.stderr.count("\n") == 1
-    assert len(result.stderr) < 2_200
-    assert result.stderr.strip().isprintable()
-    return result.stderr
-
+from .conftest import refused, summary_of
 
 _PAIRS = zip("abcdefgh", "bcdefghi", strict=True)
 LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for b, c in _PAIRS)
@@ -41,14 +29,8 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "odometry: {kiss_icp: {voxel_size: 1}}",
-            "no odometry.kiss_icp.voxel_size; did you mean voxel_size_m?",
-        ),
-        (
-            "odometry: {kiss_icp: {voxel_size_m: [1]}}",
-            "voxel_size_m=[1]: input should be a valid number",
-        ),
+        ("odometry: {kiss_icp: {voxel_size: 1}}", "no odometry.kiss_icp.voxel_size; did you mean voxel_size_m?"),
+        ("odometry: {kiss_icp: {voxel_size_m: [1]}}", "voxel_size_m=[1]: "),
         (LAUGHS + "mapping: *i\n", "mapping=["),
         ("odometry: &a\n  kiss_icp: *a\n", "there is no odometry.kiss_icp.kiss_icp"),
         ("odometry: {kiss_icp: {voxel_size_m: '" + "x" * 100_000 + "'}}", "xxx...xxx"),
@@ -58,9 +40,11 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
 )
 def test_a_bad_configuration_file(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "config.yaml").write_text(text)
-    said = one_line_of(lidarslam("config", "--config", tmp_path / "config.yaml"))
+    said = refused("config", "--config", tmp_path / "config.yaml")
     assert message in said
     assert "config.yaml" in said
+    assert len(said) < 2_200
+    assert said.strip().isprintable()
 
 
 class Bomb:
@@ -80,7 +64,7 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, small_recording: Path, name: s
         torch.save(Bomb(opened), tmp_path / name)
     else:
         (tmp_path / name).write_bytes(pickle.dumps(Bomb(opened), protocol=form))  # type: ignore[arg-type]
-    said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / name))
+    said = refused("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / name)
     assert "is no safetensors file" in said
     assert not opened.exists()
     assert not (tmp_path / "run").exists()
@@ -97,6 +81,11 @@ def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    with safe_open(path, "pt") as file:
+        return file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+
+
 def _first(tensors: dict[str, torch.Tensor]) -> str:
     return min(tensors)
 
@@ -107,30 +96,26 @@ TENSORS: dict[str, tuple[Callable[[dict[str, torch.Tensor]], object], str]] = {
     "shape": (lambda t: t.update({_first(t): torch.zeros(1, 2, 3)}), "size mismatch for"),
     "nan": (lambda t: t.update({_first(t): t[_first(t)] * np.nan}), "not finite"),
     "integers": (lambda t: t.update({_first(t): t[_first(t)].to(torch.int32)}), "is torch.int32"),
-    "complex": (lambda t: t.update({_first(t): t[_first(t)].to(torch.complex64)}), "is torch.complex64"),
 }
 CONTENTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "another network": (lambda c: c["network"].update(name="delora"), "Missing key"),
-    "no such network": (lambda c: c["network"].update(name="gpt"), "does not fit this program"),
     "images": (lambda c: c["images"].update(rows=10**9), "does not fit this program"),
 }
 
 
 @pytest.mark.parametrize("name", [*TENSORS, *CONTENTS])
 def test_weights_that_do_not_fit(tmp_path: Path, small_recording: Path, small_weights: Path, name: str) -> None:
-    with safe_open(small_weights, "pt") as file:
-        header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    header, tensors = read_weights(small_weights)
     content = json.loads(header["content"])
     if name in TENSORS:
         TENSORS[name][0](tensors)
     else:
         CONTENTS[name][0](content)
     save_file(tensors, tmp_path / "w.safetensors", metadata=header | {"content": json.dumps(content)})
-    said = one_line_of(
-        lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
-    )
+    said = refused("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
     assert "w.safetensors: " in said
     assert (TENSORS | CONTENTS)[name][1] in said  # type: ignore[operator]
+    assert said.strip().isprintable()
     assert not (tmp_path / "run").exists()
 
 
@@ -141,14 +126,13 @@ def test_weights_that_are_cut_off_or_lie_about_their_header(
     content = default_weights().read_bytes()
     content = (start or content[:8]) + content[8:]
     (tmp_path / "w.safetensors").write_bytes(content[: int(kept * len(content))])
-    one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors"))
+    refused("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
 
 
 def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(
     tmp_path: Path, small_recording: Path, small_weights: Path
 ) -> None:
-    with safe_open(small_weights, "pt") as file:
-        header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    header, tensors = read_weights(small_weights)
     tensors = {key: 1e30 * value if value.is_floating_point() else value for key, value in tensors.items()}
     save_file(tensors, tmp_path / "w.safetensors", metadata=header)
     command = ("run", small_recording, "--weights", tmp_path / "w.safetensors")
@@ -166,60 +150,52 @@ def _edited(table: np.ndarray, name: str) -> str:
         table = table[:1]
     if name == "one stamp":
         table[:, 0] = 0.3
+    if name == "another time":
+        table[:, 0] += 1_000.0
     return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in table)
 
 
 BAD_TRAJECTORIES = {
     "NaN": "holds numbers that are no poses",
     "light years": "expected metres",
-    "one pose": "two poses or more|one of them is too short",
-    "one stamp": "two poses or more|one of them is too short",
+    "one pose": "two poses or more",
+    "one stamp": "two poses or more",
+    "another time": "is it of this recording",
 }
 
 
+@pytest.mark.parametrize("name", BAD_TRAJECTORIES)
+def test_a_prior_that_is_none(tmp_path: Path, small_recording: Path, name: str) -> None:
+    (tmp_path / "bad.tum").write_text(_edited(np.loadtxt(small_recording / "ground_truth.tum"), name))
+    said = refused("run", small_recording, "--out", tmp_path / "new", "--prior", tmp_path / "bad.tum")
+    assert BAD_TRAJECTORIES[name] in said
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize(
-    ("name", "role"), [*((name, "prior") for name in BAD_TRAJECTORIES), ("NaN", "reference"), ("one pose", "reference")]
+    ("name", "message"), [("NaN", BAD_TRAJECTORIES["NaN"]), ("one pose", "one of them is too short")]
 )
-def test_a_trajectory_that_is_none(
-    tmp_path: Path, small_recording: Path, finished_run: Path, name: str, role: str
+def test_a_reference_that_is_none(
+    tmp_path: Path, small_recording: Path, finished_run: Path, name: str, message: str
 ) -> None:
-    bad = tmp_path / "bad.tum"
-    bad.write_text(_edited(np.loadtxt(small_recording / "ground_truth.tum"), name))
-    if role == "prior":
-        said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "new", "--prior", bad))
-        assert not (tmp_path / "new").exists()
-    else:
-        shutil.copy(finished_run / "metrics.json", tmp_path / "before.json")
-        said = one_line_of(lidarslam("evaluate", finished_run, "--reference", bad))
-        assert (finished_run / "metrics.json").read_text() == (tmp_path / "before.json").read_text()
-    assert any(message in said for message in BAD_TRAJECTORIES[name].split("|"))
-
-
-def shifted_prior(folder: Path, recording: Path, offset_s: float) -> Path:
-    """The true trajectory, so many seconds later."""
-    table = np.loadtxt(recording / "ground_truth.tum")
-    table[:, 0] += offset_s
-    np.savetxt(folder / "prior.tum", table, fmt="%.9f")
-    return folder / "prior.tum"
-
-
-@pytest.mark.parametrize("offset_s", [1_000.0, -1_000.0])
-def test_a_prior_of_another_time_is_refused(tmp_path: Path, small_recording: Path, offset_s: float) -> None:
-    prior = shifted_prior(tmp_path, small_recording, offset_s)
-    said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "new", "--prior", prior))
-    assert "is it of this recording" in said
+    (tmp_path / "bad.tum").write_text(_edited(np.loadtxt(small_recording / "ground_truth.tum"), name))
+    before = (finished_run / "metrics.json").read_text()
+    assert message in refused("evaluate", finished_run, "--reference", tmp_path / "bad.tum")
+    assert (finished_run / "metrics.json").read_text() == before
 
 
 @pytest.mark.parametrize("mapping", ["off", "surfels"])
-def test_scans_without_a_prior_are_counted(tmp_path: Path, small_recording: Path, mapping: str) -> None:
-    """Without a mapping they are lost."""
-    prior = shifted_prior(tmp_path, small_recording, 0.25)
+def test_scans_without_a_prior_are_counted_and_without_a_mapping_lost(
+    tmp_path: Path, small_recording: Path, mapping: str
+) -> None:
+    out, late = tmp_path / "run", np.loadtxt(small_recording / "ground_truth.tum")
+    late[:, 0] += 0.25
+    np.savetxt(tmp_path / "late.tum", late, fmt="%.9f")
     result = lidarslam(
-        "run", small_recording, "--out", tmp_path / "run", "--prior", prior, "--mapping", mapping, "--no-report"
+        "run", small_recording, "--out", out, "--prior", tmp_path / "late.tum", "--mapping", mapping, "--no-report"
     )
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert "the prior does not cover 2 of 6 scans" in summary["warnings"]
+    assert "the prior does not cover 2 of 6 scans" in summary_of(out)["warnings"]
     if mapping == "off":
         assert result.exit_code == 3
         assert "the prior does not cover this scan" in result.stdout
-        assert summary["lost_scans"] == 2
+        assert summary_of(out)["lost_scans"] == 2
