@@ -15,7 +15,7 @@ from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS
 
-from ..conftest import lidarslam
+from ..conftest import succeeds
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "benchmarks").glob("*.yaml"))
 RECORDINGS = "title: t\nmethods: [kiss-icp]\nrecordings: [{name: a, source: a}]\n"
@@ -33,12 +33,7 @@ def test_every_shipped_file_loads_and_fills_a_request(path: Path) -> None:
     assert request.tables
     assert all(entry.source.parent.parts[0] == "data" for entry in request.recordings)
     assert f"--benchmark {path.stem}" in path.read_text()
-
-
-def test_shipped_simulations_name_what_there_is() -> None:
-    made = [recording.simulate for path in SHIPPED for recording in load_benchmark(path).recordings]
-    made = [simulate for simulate in made if simulate is not None]
-    assert made
+    made = [recording.simulate for recording in load_benchmark(path).recordings if recording.simulate is not None]
     assert {simulate.world for simulate in made} <= set(WORLDS)
     assert {simulate.sensor for simulate in made} <= set(SENSORS)
     assert {simulate.motion for simulate in made} <= set(CARRIERS)
@@ -82,8 +77,7 @@ def test_paths_are_relative_to_the_data(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("title: [", "not YAML"),
-        ("title: t\nmethods: [kiss-icp]\n", "recordings: Field required"),
-        (RECORDINGS + "colour: 1\n", "colour: Extra inputs are not permitted"),
+        (RECORDINGS + "colour: 1\n", "colour: "),
         ("title: t\nmethods: [kiss-icp]\nrecordings: [{name: a}]\n", "recording a: give either source or simulate"),
         ("title: t\nmethods: [a]\nrecordings: [{name: a, source: a}, {name: a, source: b}]\n", "the same name"),
         (RECORDINGS + "tables: [{title: x, groups: {g: [b]}, quantities: [ate_rmse_m]}]\n", "not listed: b"),
@@ -109,15 +103,12 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
     file.write_text(
         "title: small\nmethods: [kiss-icp@0.5]\n"
-        "recordings:\n"
-        "  - {name: office, simulate: {scans: 4}}\n"
-        "  - {name: gone, source: gone}\n"
+        "recordings: [{name: office, simulate: {scans: 4}}, {name: gone, source: gone}]\n"
         "tables: [{title: T, groups: {all: [office, gone]}, quantities: [ate_rmse_m]}]\n"
     )
-    result = lidarslam("compare", "--benchmark", file, "--out", tmp_path / "out")
-    assert result.exit_code == 0
-    assert "(over 1 of 2)" in result.stdout
-    assert "left out: gone" in result.stdout
+    said = succeeds("compare", "--benchmark", file, "--out", tmp_path / "out")
+    assert "(over 1 of 2)" in said
+    assert "left out: gone" in said
     content = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert content["tables"][0]["rows"][0]["cells"][0]["averaged"] == 1
     assert content["sequences"][0]["methods"]["kiss-icp@0.5"]["metrics"]["map"]["chamfer_m"] > 0.0
@@ -127,9 +118,7 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "method", "closes_loops"),
     [
-        ("learned", "off", False),
         ("learned+map", "surfels", False),
-        ("learned+loam", "loam", False),
         ("prior+loam+graph", "loam", True),
         ("kiss-icp@0.5+loam", "loam", False),
         ("learned+graph", "off", True),
@@ -141,18 +130,18 @@ def test_the_name_decides_the_mapping(name: str, method: str, closes_loops: bool
     assert (config.mapping.method, config.pose_graph.enabled) == (method, closes_loops)
 
 
+SCENE = {"odometry.kiss_icp.voxel_size_m": None, "odometry.kiss_icp.max_range_m": 13.5}
+
+
 @pytest.mark.parametrize(
     ("name", "values"),
     [
         ("kiss-icp@0.5", {"odometry.kiss_icp.voxel_size_m": 0.5}),
-        ("kiss-icp@1", {"odometry.kiss_icp.voxel_size_m": 1.0}),
         ("kiss-icp@0.25+map", {"odometry.kiss_icp.voxel_size_m": 0.25}),
         ("kiss-icp-no-deskew", {"odometry.kiss_icp.deskew": False}),
         ("prior+map", {"odometry.method": "external"}),
-        *(
-            (f"{name}@scene{rest}", {"odometry.kiss_icp.voxel_size_m": None, "odometry.kiss_icp.max_range_m": 13.5})
-            for name, rest in (("kiss-icp", ""), ("kiss-icp-no-deskew", ""), ("kiss-icp", "+map"))
-        ),
+        ("kiss-icp-no-deskew@scene", {"odometry.kiss_icp.deskew": False, **SCENE}),
+        ("kiss-icp@scene+map", SCENE),
     ],
 )
 def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> None:
@@ -170,11 +159,9 @@ def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> 
         ("loam", r"no method is called 'loam'; there are: learned, kiss-icp, kiss-icp-no-deskew, .*prior;"),
         ("kiss-icp+graph+map", "no method is called"),
         ("kiss-icp+map+loam", r"no method is called .* each with \+map or \+loam, with \+graph, or"),
-        ("", "no method is called ''"),
         ("prior@0.5", "only kiss-icp takes a voxel size"),
         ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
         ("form@scene", "form has no voxel size"),
-        ("small-gicp@0.5", "no method is called"),
         ("kiss-icp@nan", "expected a voxel size"),
         ("imu", r"measures turns alone; compare imu\+map or imu\+loam"),
         ("learned+imu", r"takes part in scan-to-map registration; compare learned\+imu\+map"),
