@@ -3,14 +3,17 @@
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lidarslam.config.settings import load_config
+from lidarslam.core.geometry import FloatArray
 from lidarslam.pipeline import compile_ahead
 from lidarslam.pipeline.compile_ahead import PARTS, CompileAhead, parts_of
+
+from ..conftest import Room, write_recording
 
 REPOSITORY = Path(__file__).parents[2]
 # Loops that only some runs need, and that take no more than a second to compile.
@@ -49,16 +52,10 @@ for loop, types in called().items():
 
 
 @pytest.mark.long
-def test_a_rehearsal_compiles_all_that_a_run_calls(tmp_path: Path) -> None:
-    folder = tmp_path / "scans"
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    angles, heights = np.meshgrid(np.linspace(-np.pi, np.pi, 600), np.deg2rad(np.linspace(-15.0, 15.0, 16)))
-    rays = np.stack([np.cos(heights) * np.cos(angles), np.cos(heights) * np.sin(angles), np.sin(heights)], axis=-1)
-    rays = rays.reshape(-1, 3)
-    for number in range(4):
-        ranges = (np.array([9.0, 7.0, 2.0]) / np.abs(rays)).min(axis=1) + rng.normal(0.0, 0.01, len(rays))
-        np.save(folder / f"{number:06d}.npy", ranges[:, None] * rays - np.array([0.1 * number, 0.0, 0.0]))
+def test_a_rehearsal_compiles_all_that_a_run_calls(
+    tmp_path: Path, room: Room, drive: Callable[[FloatArray], FloatArray]
+) -> None:
+    folder = write_recording(tmp_path / "scans", [room.ring_sweep(drive, 0.1 * number) for number in range(1, 5)])
     command = [sys.executable, "-c", REHEARSE_AND_RUN, str(folder), str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr

@@ -1,6 +1,5 @@
 """The elevation bias in a run: reported, corrected beforehand, and by a setting of any reader."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
 
-from ..conftest import lidarslam
+from ..conftest import succeeds
+from .conftest import FAST, summary_of
 
 LOW_DEG, SCANS = 0.4, 36
 KEYS = ("elevation_bias_deg", "elevation_sigma_deg", "elevation_correction_deg")
@@ -34,18 +34,10 @@ def low(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
     return folder
 
 
-def summary(source: Path, out: Path, *settings: str) -> dict[str, Any]:
-    command = ["run", str(source), "--out", str(out), "--odometry", "constant-velocity"]
-    for setting in settings:
-        command += ["--set", setting]
-    result = lidarslam(*command)
-    assert result.exit_code == 0, result.output
-    return json.loads((out / "summary.json").read_text())  # type: ignore[no-any-return]
-
-
 @pytest.mark.long
 def test_a_run_reports_the_bias_and_what_to_set(low: Path, tmp_path: Path) -> None:
-    found = summary(low, tmp_path / "run")
+    succeeds("run", low, "--out", tmp_path / "run", *FAST)
+    found = summary_of(tmp_path / "run")
     bias_deg, sigma_deg, correction_deg = (found[key] for key in KEYS)
     assert bias_deg == pytest.approx(LOW_DEG, abs=0.08)
     assert abs(bias_deg - LOW_DEG) < 3.0 * sigma_deg
@@ -56,24 +48,22 @@ def test_a_run_reports_the_bias_and_what_to_set(low: Path, tmp_path: Path) -> No
 @pytest.mark.long
 def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    found = summary(low, out, "reader.elevation_correction_deg=auto")
+    command = ("run", low, "--out", out, *FAST, "--set", "reader.elevation_correction_deg=auto")
+    succeeds(*command)
+    found = summary_of(out)
     correction_deg = found["elevation_correction_deg"]
     assert correction_deg == pytest.approx(LOW_DEG, abs=0.08)
     assert found["elevation_bias_deg"] == pytest.approx(LOW_DEG, abs=0.08)
     assert not any("elevation" in warning for warning in found["warnings"])
     # The run says what it used, and is still the one that was asked for.
     assert read_yaml(out / "config.yaml")["reader"]["elevation_correction_deg"] == correction_deg
-    command = ["run", str(low), "--out", str(out), "--odometry", "constant-velocity", "--resume"]
-    again = lidarslam(*command, "--set", "reader.elevation_correction_deg=auto")
-    assert again.exit_code == 0, again.output
+    succeeds(*command, "--resume")
 
 
 @pytest.mark.long
 def test_without_a_map_there_is_no_estimate(small_recording: Path, tmp_path: Path) -> None:
-    command = ["run", str(small_recording), "--out", str(tmp_path / "run"), "--odometry", "kiss-icp", "--no-mapping"]
-    pytest.importorskip("kiss_icp")
-    assert lidarslam(*command).exit_code == 0
-    found = json.loads((tmp_path / "run" / "summary.json").read_text())
+    succeeds("run", small_recording, "--out", tmp_path / "run", "--odometry", "kiss-icp", "--no-mapping")
+    found = summary_of(tmp_path / "run")
     assert [found[key] for key in KEYS] == [None] * 3
 
 

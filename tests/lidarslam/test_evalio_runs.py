@@ -96,14 +96,11 @@ def test_run_and_what_follows_it(sequence: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "evalio:hilti_2022").exists()
 
 
-def test_info_as_json(sequence: Path) -> None:
+def test_info_and_python_know_the_name(sequence: Path) -> None:
     known = json.loads(succeeds("info", SOURCE, "--json"))
     assert (known["reader"], known["scans"], known["source"]) == ("evalio", SCANS, str(sequence))
     assert known["first_scan"]["has_rings"]
     assert known["point_time"]["last_s"] == pytest.approx(0.1, abs=1e-3)
-
-
-def test_python_opens_the_name(sequence: Path) -> None:
     recording = lidarslam.open(SOURCE, stop=2)
     assert len(list(recording)) == len(recording) == 2
     assert recording.ground_truth is not None

@@ -19,7 +19,8 @@ from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
 from lidarslam.exports.bag import RosMessages, nanoseconds
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
-from ..conftest import Room, lidarslam
+from ..conftest import Room, lidarslam, succeeds
+from .conftest import FAST, refused
 
 pyproj = pytest.importorskip("pyproj")
 
@@ -29,12 +30,16 @@ FIRST_STAMP = 1_700_000_000.0
 SCANS = 120
 
 
+def in_utm(T: FloatArray) -> FloatArray:
+    """Poses in UTM of those in a world that heads south-east."""
+    east, north = pyproj.Transformer.from_crs(4326, 32756, always_xy=True).transform(PLACE[1], PLACE[0])
+    return make_transform(exp([0.0, 0.0, -0.8, 0.0, 0.0, 0.0])[:3, :3], [east, north, PLACE[2]]) @ T
+
+
 @pytest.fixture(scope="module")
 def truth() -> FloatArray:
-    """Poses in UTM of a curve of 110 m, heading south-east at first."""
-    motion = exp(np.multiply.outer(np.arange(SCANS) * 0.1, [0.0, 0.0, 0.12, 9.0, 0.0, 0.1]))
-    east, north = pyproj.Transformer.from_crs(4326, 32756, always_xy=True).transform(PLACE[1], PLACE[0])
-    return make_transform(exp([0.0, 0.0, -0.8, 0.0, 0.0, 0.0])[:3, :3], [east, north, PLACE[2]]) @ motion
+    """Poses in UTM of a curve of 110 m."""
+    return in_utm(exp(np.multiply.outer(np.arange(SCANS) * 0.1, [0.0, 0.0, 0.12, 9.0, 0.0, 0.1])))
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +94,7 @@ def write_bag(
 def test_trajectory_and_map_are_in_utm(run: Path, truth: FloatArray, tmp_path: Path) -> None:
     import laspy
 
-    done = lidarslam("export-geo", run, "--out", tmp_path / "utm")
-    assert done.exit_code == 0, done.output
-    assert "WGS 84 / UTM zone 56S, EPSG:32756" in done.stdout
+    assert "WGS 84 / UTM zone 56S, EPSG:32756" in succeeds("export-geo", run, "--out", tmp_path / "utm")
     written = read_tum(tmp_path / "utm" / "trajectory_utm.tum")
     np.testing.assert_allclose(written.positions, truth[:, :3, 3], atol=0.02)
     about = json.loads((tmp_path / "utm" / "georeference.json").read_text())
@@ -99,42 +102,35 @@ def test_trajectory_and_map_are_in_utm(run: Path, truth: FloatArray, tmp_path: P
     assert about["gnss_positions"] == SCANS - 5
     assert about["lidar_antenna_m"] == pytest.approx(ANTENNA)
     las = laspy.read(tmp_path / "utm" / "map.laz")
-    crs = las.header.parse_crs()
-    assert crs is not None
-    assert crs.to_epsg() == 32756
+    assert las.header.parse_crs().to_epsg() == 32756
     np.testing.assert_allclose(las.xyz, truth[:, :3, 3] + truth[0, :3, :3] @ [0.0, 5.0, 0.0], atol=0.02)
     normals = np.column_stack([las[name] for name in ("NormalX", "NormalY", "NormalZ")])
     np.testing.assert_allclose(normals, np.tile(truth[0, :3, 1], (SCANS, 1)), atol=1e-3)
 
 
 def test_the_path_for_maps_on_the_web(run: Path, tmp_path: Path) -> None:
-    lidarslam("export-geo", run, "--out", tmp_path)
+    succeeds("export-geo", run, "--out", tmp_path)
     (feature,) = json.loads((tmp_path / "trajectory.geojson").read_text())["features"]
     first = feature["geometry"]["coordinates"][0]
     assert first[2] == pytest.approx(PLACE[2], abs=0.02)
     assert first[:2] == pytest.approx([PLACE[1], PLACE[0]], abs=1e-6)
     assert len(feature["properties"]["times"]) == len(feature["geometry"]["coordinates"]) == SCANS
     line = ElementTree.parse(tmp_path / "trajectory.kml").find(".//{http://www.opengis.net/kml/2.2}coordinates")
-    assert line is not None
-    points = [[float(number) for number in point.split(",")] for point in str(line.text).split()]
+    points = [[float(number) for number in point.split(",")] for point in line.text.split()]
     np.testing.assert_allclose(points, np.array(feature["geometry"]["coordinates"])[:, :2], atol=1e-9)
 
 
 def test_what_cannot_be_placed_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert lidarslam("export-geo", run, "--out", tmp_path / "utm").exit_code == 0
-    again = lidarslam("export-geo", run, "--out", tmp_path / "utm")
-    assert (again.exit_code, "--overwrite" in again.stderr) == (1, True)
+    succeeds("export-geo", run, "--out", tmp_path / "utm")
+    assert "--overwrite" in refused("export-geo", run, "--out", tmp_path / "utm")
     short = tmp_path / "short"
     short.mkdir()
     (short / "config.yaml").write_text((run / "config.yaml").read_text())
     write_tum(short / "trajectory.tum", read_tum(run / "trajectory.tum").select(slice(0, 12)))
-    refused = lidarslam("export-geo", short, "--out", tmp_path / "other")
-    assert refused.exit_code == 1
-    assert "too short to determine the heading" in refused.stderr
+    assert "too short to determine the heading" in refused("export-geo", short, "--out", tmp_path / "other")
     assert not (tmp_path / "other").exists()
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    absent = lidarslam("export-geo", run, "--out", tmp_path / "other")
-    assert (absent.exit_code, "pip install 'lidarslam[geo]'" in absent.stderr) == (1, True)
+    assert "pip install 'lidarslam[geo]'" in refused("export-geo", run, "--out", tmp_path / "other")
 
 
 def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path: Path, room: Room) -> None:
@@ -143,26 +139,20 @@ def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path: Path, room: Room) ->
         places = np.stack([2.5 * np.sin(0.6 * t), 1.5 * np.cos(0.9 * t) - 1.5, 0.0 * t], axis=-1)
         return make_transform(exp(np.multiply.outer(0.1 * t, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))[..., :3, :3], places)
 
-    east, north = pyproj.Transformer.from_crs(4326, 32756, always_xy=True).transform(PLACE[1], PLACE[0])
-    T_utm_world = make_transform(exp([0.0, 0.0, -0.8, 0.0, 0.0, 0.0])[:3, :3], [east, north, PLACE[2]])
     times = 0.1 * np.arange(1, 61)
-    truth = T_utm_world @ walk(times)
+    truth = in_utm(walk(times))
     still = replace(room, points=4000, period_s=0.001)
     clouds = [still.sweep(walk, float(time)).points for time in times]
     fixes = truth.copy()
     fixes[30:36, :3, 3] += [4.0, -3.0, 5.0]  # of a reflection
     write_bag(tmp_path / "walk.bag", FIRST_STAMP + times, truth, clouds, fixes, variance=1e-4)
     out = tmp_path / "run"
-    options = ["--odometry", "constant-velocity", "--no-report", "--set", "mapping.keypoints=800"]
-    done = lidarslam("run", tmp_path / "walk.bag", "--out", out, "--gnss", *options)
-    assert done.exit_code == 0, done.output
+    succeeds("run", tmp_path / "walk.bag", "--out", out, "--gnss", *FAST, "--set", "mapping.keypoints=800")
     written = read_tum(out / "utm" / "trajectory_utm.tum")
     np.testing.assert_allclose(written.positions, truth[:, :3, 3], atol=0.05)
     assert (out / "utm" / "map.laz").exists()
 
 
 def test_gnss_needs_positions_and_the_graph(small_recording: Path, tmp_path: Path) -> None:
-    done = lidarslam("run", small_recording, "--out", tmp_path / "run", "--gnss")
-    assert done.exit_code == 1
-    assert "has no GNSS positions" in done.output
+    assert "has no GNSS positions" in refused("run", small_recording, "--out", tmp_path / "run", "--gnss")
     assert lidarslam("run", small_recording, "--gnss", "--no-pose-graph").exit_code == 2

@@ -4,34 +4,24 @@ import os
 from pathlib import Path
 
 import pytest
-from click.testing import Result
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.odometry.network.exported import DESCRIPTION, read_exported
 from lidarslam.storage.comparison_folder import run_directories
 
-from ..conftest import lidarslam
+from ..conftest import succeeds
+from .conftest import refused
 
 DEEP = "[" * 100_000
 LONG = "9" * 5_000
 
 
-def refused(result: Result, *words: str) -> None:
-    assert result.exit_code == 1
-    said = result.stderr.strip().splitlines()[-1]
-    assert said.startswith("lidarslam: ")
-    assert not [word for word in words if word not in said], said
-
-
 SUMMARIES = [
     DEEP,
     '{"scans": 1e999}',
-    '{"scans": [6]}',
-    '{"pose_graph": {"loops": 5}}',
     '{"pose_graph": {"loops": [{"first_scan": 1e30, "second_scan": 0, "accepted": true}]}}',
     '{"localisation": {"map": "\\u0000"}}',
-    '{"localisation": {"map": 5}}',
     f'{{"scans": {LONG}}}',
 ]
 
@@ -39,7 +29,8 @@ SUMMARIES = [
 @pytest.mark.parametrize("text", SUMMARIES, ids=range(len(SUMMARIES)))
 def test_a_forged_summary(finished_run: Path, text: str) -> None:
     (finished_run / "summary.json").write_text(text)
-    refused(lidarslam("view", finished_run, "--save", finished_run / "view.rrd"), "summary.json: not a run's summary")
+    said = refused("view", finished_run, "--save", finished_run / "view.rrd")
+    assert "summary.json: not a run's summary" in said
 
 
 COMPARISONS = [DEEP, '{"methods": {"a": {"run": "../../x"}}}', '{"methods": {"a": {"run": "/etc"}}}', '{"methods": 5}',
@@ -84,22 +75,17 @@ def test_a_name_in_a_benchmark_stays_in_the_folder(
     source = "simulate: {scans: 2}" if of == "simulated" else f"source: {os.fspath(small_recording)}"
     recordings = f"[{{name: {'a' if of == 'method' else quoted}, {source}}}]"
     (tmp_path / "forged.yaml").write_text(f"title: t\nmethods: {methods}\nrecordings: {recordings}\n")
-    refused(lidarslam("compare", "--benchmark", "forged.yaml", "--out", "deep/er/out"))
+    refused("compare", "--benchmark", "forged.yaml", "--out", "deep/er/out")
     assert {path.name for path in tmp_path.iterdir()} == {"forged.yaml"}
 
 
 def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
-    rerun_recording = pytest.importorskip("lidarslam.viewer.rerun_recording")
     file = finished_run / "recording.rrd"
-    assert lidarslam("view", finished_run, "--save", file).exit_code == 0
+    succeeds("view", finished_run, "--save", file)
     whole = file.read_bytes()
-    forged = {b"": "not a Rerun recording", whole[:-1]: "is cut off", whole[: len(whole) // 2]: "is cut off",
-              whole + b"more": "is cut off", b"RRF1" + whole[4:]: "not a Rerun recording"}  # fmt: skip
+    forged = {b"": "not a Rerun recording", b"RRF1" + whole[4:]: "not a Rerun recording"}
+    forged |= dict.fromkeys((whole[:-1], whole[: len(whole) // 2], whole + b"more"), "is cut off")
     for content, message in forged.items():
         file.write_bytes(content)
-        with pytest.raises(InputError, match=message):
-            rerun_recording.show_file_in_window(file)
-        refused(lidarslam("view", file), message)
-    with pytest.raises(InputError, match="no such file"):
-        rerun_recording.show_file_in_window(tmp_path)
-    assert lidarslam("view", finished_run, "--save", tmp_path / "view.rrd").exit_code == 0
+        assert message in refused("view", file)
+    succeeds("view", finished_run, "--save", tmp_path / "view.rrd")

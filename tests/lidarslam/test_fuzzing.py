@@ -26,6 +26,7 @@ from lidarslam.simulation.writers import FORMATS, write_kitti, write_ply_scans
 from lidarslam.storage.finished_run import load_map
 
 from ..conftest import write_recording
+from .conftest import FAST
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +38,6 @@ fuzzed = settings(
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
-FAST = ("--odometry", "constant-velocity", "--no-report")
 # More than all commands here take on the undamaged files, beyond what is loaded already.
 MOST_MEMORY_KB = 1 << 20
 NUMBERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**64 - 1)
@@ -136,43 +136,10 @@ def write_npy(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
     write_recording(folder, [simulated.scan for simulated in scans], truth, is_timed=True)
 
 
-def write_pcd(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
-    """The first two in text, the others in binary."""
-    folder.mkdir()
-    for number, simulated in enumerate(scans):
-        points, path = simulated.scan.points.astype("f4"), folder / f"{number}.pcd"
-        if number > 1:
-            write_cloud(path, PointCloud(points.astype(np.float64), np.tile([0.0, 0.0, 1.0], (len(points), 1))))
-            continue
-        header = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
-        rows = "\n".join(" ".join(f"{value:.4f}" for value in point) for point in points)
-        path.write_text(f"{header}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n{rows}\n")
-
-
-def write_raw(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
-    """A drive of KITTI raw."""
-    drive = folder / "2011_09_26" / "drive_sync"
-    (drive / "velodyne_points" / "data").mkdir(parents=True)
-    (drive / "oxts" / "data").mkdir(parents=True)
-    lines = [f"2011-09-26 13:02:2{number}.950000000\n" for number in range(len(scans))]
-    for number, simulated in enumerate(scans):
-        points = np.column_stack([simulated.scan.points, simulated.intensities]).astype("<f4")
-        (drive / "velodyne_points" / "data" / f"{number:010d}.bin").write_bytes(points.tobytes())
-        numbers = [49.0 + 1e-6 * number, 8.4, 110.0, 0.01, 0.02, 0.1 * number, *[0.1] * 24]
-        (drive / "oxts" / "data" / f"{number:010d}.txt").write_text(" ".join(map(str, numbers)) + "\n")
-    for name in ("velodyne_points/timestamps.txt", "oxts/timestamps.txt"):
-        (drive / name).write_text("".join(lines))
-    extrinsic = "R: 1 0 0 0 1 0 0 0 1\nT: 0.8 -0.3 0.8\n"
-    (folder / "2011_09_26" / "calib_imu_to_velo.txt").write_text(extrinsic)
-    (folder / "2011_09_26" / "calib_velo_to_cam.txt").write_text(extrinsic)
-
-
 # The writer, the source within its folder, and the files of it that are damaged.
 RECORDINGS: dict[str, tuple[Callable[..., None], str, tuple[str, ...]]] = {
     "kitti": (write_kitti, ".", ("**/000001.bin", "**/times.txt", "**/calib.txt", "poses/*.txt")),
-    "raw": (write_raw, "2011_09_26/drive_sync", ("**/*1.bin", "**/*.txt")),
     "ply": (write_ply_scans, ".", ("*1.ply", "timestamps.txt", "imu.csv")),
-    "pcd": (write_pcd, ".", ("1.pcd", "2.pcd")),
     "npy": (write_npy, ".", ("*1.npy", "timestamps.txt", "ground_truth.tum")),
     "rosbag1": (FORMATS["rosbag1"].write, ".", ("*.bag",)),
     "rosbag2": (FORMATS["rosbag2"].write, ".", ("*.db3", "metadata.yaml")),
@@ -234,21 +201,11 @@ def damage(folder: Path, patterns: tuple[str, ...], which: float, made: list[Cha
 
 
 DEEP = "[" * 100_000
-_PLY = (
-    "ply\nformat {} 1.0\nelement face {}\nproperty int a\nelement vertex 1\nproperty float x\nend_header\n1\n2\n3.0\n"
-)
-_PCD = (
-    "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n1 2 3\n"
-)
-_NPY = b"\x93NUMPY\1\0v\0{'descr': '<f8', 'fortran_order': False, 'shape': (%d, 4), }"
+_PLY = "ply\nformat ascii 1.0\nelement face 99999999999999999999\nproperty int a\nelement vertex 1\nproperty float x\n"
 # Faults of earlier days: the pattern of the file, as a share of them, and its content.
 SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
-    "ply": [
-        *[(0.0, seed(_PLY.format(kind, 10**20 - 1))) for kind in ("ascii", "binary_little_endian")],
-        (0.4, seed("1e999\n" * 4)),
-    ],
-    "pcd": [(0.0, seed(_PCD.format(10**12, kind))) for kind in ("ascii", "binary", "binary_compressed")],
-    "npy": [(0.0, seed((_NPY % 10**12).ljust(127) + b"\n")), (0.4, seed(b"\xff" * 64))],
+    "ply": [(0.4, seed("1e999\n" * 4))],
+    "npy": [(0.4, seed(b"\xff" * 64))],
     "rosbag2": [(0.6, seed(DEEP)), (0.6, seed("rosbag2_bagfile_information: &a [*a]\n"))],
     "kitti": [(0.3, seed("nan\n" * 4))],
 }
@@ -274,23 +231,13 @@ def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pyte
     fuzzed(given(st.floats(0.0, 1.0, exclude_max=True), changes)(check))()
 
 
-RUN_FILES = (
-    "run/summary.json",
-    "run/trajectory.tum",
-    "run/map.ply",
-    "run/config.yaml",
-    "run/scans.csv",
-    "run/metrics.json",
-)
+RUN_FILES = ("summary.json", "trajectory.tum", "map.ply", "config.yaml", "scans.csv", "metrics.json")
 
 
 @fuzzed
-@given(st.sampled_from(RUN_FILES), changes)
-@example("run/summary.json", seed(DEEP))
-@example("run/summary.json", seed('{"scans": 1e999}'))
-@example("run/summary.json", seed('{"localisation": {"map": "\\u0000"}}'))
+@given(st.sampled_from([f"run/{name}" for name in RUN_FILES]), changes)
 @example("run/config.yaml", seed("run: " + DEEP))
-@example("run/map.ply", seed(_PLY.format("ascii", 10**20 - 1)))
+@example("run/map.ply", seed(_PLY + "end_header\n1\n2\n3.0\n"))
 def test_a_damaged_run(
     tmp_path: Path, small_recording: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch, name: str, made: list
 ) -> None:
@@ -341,14 +288,8 @@ def keys(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
             yield from keys(value, f"{prefix}{name}.")
 
 
-values = st.one_of(
-    st.sampled_from(
-        [*NUMBERS, "null", "true", "off", "[]", "{}", "[1, 2, 3]", "1e-9", "1e9", ".inf", "-0.0", "''", "~"]
-    ),
-    st.integers(),
-    st.floats(),
-    st.text(max_size=20),
-)
+ODD = [*NUMBERS, "null", "true", "off", "[]", "{}", "[1, 2, 3]", "1e-9", "1e9", ".inf", "-0.0", "''", "~"]
+values = st.one_of(st.sampled_from(ODD), st.integers(), st.floats(), st.text(max_size=20))
 
 
 @fuzzed

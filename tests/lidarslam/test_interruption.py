@@ -5,17 +5,20 @@ import logging
 import signal
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from lidarslam.cli import main
 from lidarslam.core.trajectory import read_tum
 from lidarslam.run import interruption
 from lidarslam.run.interruption import Interruptions, ended_like_interrupted
+from lidarslam.run.scan_log import ScanLog
+
+from ..conftest import lidarslam
+from .conftest import FAST
 
 pytestmark = pytest.mark.usefixtures("interruptible")
 
@@ -33,13 +36,12 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interruption, "_APART_S", 0.0)
 
 
-@pytest.fixture
-def run(tmp_path: Path, small_recording: Path) -> Callable[..., Result]:
-    def run(*options: str) -> Result:
-        command = ["run", str(small_recording), "--out", str(tmp_path / "run"), "--odometry", "constant-velocity"]
-        return CliRunner().invoke(main, [*command, "--no-report", *options])
+Run = Callable[..., Result]
 
-    return run
+
+@pytest.fixture
+def run(tmp_path: Path, small_recording: Path) -> Run:
+    return lambda *options: lidarslam("run", small_recording, "--out", tmp_path / "run", *FAST, *options)
 
 
 def pressed_at(monkeypatch: pytest.MonkeyPatch, place: str, times: int) -> None:
@@ -57,8 +59,6 @@ def pressed_at(monkeypatch: pytest.MonkeyPatch, place: str, times: int) -> None:
 
 def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """Press Ctrl-C after a scan."""
-    from lidarslam.run.scan_log import ScanLog
-
     add = ScanLog.add
 
     def pressing(self: ScanLog, *given: object) -> None:
@@ -71,12 +71,11 @@ def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
 
 @pytest.mark.usefixtures("hasty")
 def test_the_second_and_third_wait_for_the_results(
-    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     at_scan(monkeypatch, 4)
     pressed_at(monkeypatch, "lidarslam.run.run.write_results", 2)
-    result = run()
-    assert result.exit_code == 1
+    assert run().exit_code == 1
     told = [record.message for record in caplog.records if WRITING in record.message]
     assert [line.split("; ")[1] for line in told] == [
         "2 more Ctrl-C, half a second apart, abandon them",
@@ -88,7 +87,7 @@ def test_the_second_and_third_wait_for_the_results(
 
 @pytest.mark.usefixtures("hasty")
 def test_the_last_scan_is_done_and_ctrl_c_only_waits(
-    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pressed_at(monkeypatch, "lidarslam.run.results.corrected_map", 1)
     assert run().exit_code == 0
@@ -98,7 +97,7 @@ def test_the_last_scan_is_done_and_ctrl_c_only_waits(
 
 @pytest.mark.usefixtures("hasty")
 def test_who_insists_abandons_the_results_and_can_resume(
-    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_scan(monkeypatch, 4)
     pressed_at(monkeypatch, "lidarslam.run.run.write_results", 3)
@@ -120,7 +119,7 @@ def test_who_insists_abandons_the_results_and_can_resume(
     ],
 )
 def test_resuming_is_promised_where_there_is_a_checkpoint(
-    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, scans: int, options: list[str], told: str
+    run: Run, monkeypatch: pytest.MonkeyPatch, scans: int, options: list[str], told: str
 ) -> None:
     at_scan(monkeypatch, scans)
     result = run(*options)
@@ -129,9 +128,7 @@ def test_resuming_is_promised_where_there_is_a_checkpoint(
     assert ("--resume" in result.output) == bool(options)
 
 
-def test_before_the_first_scan_nothing_is_kept(
-    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_before_the_first_scan_nothing_is_kept(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for place in ("lidarslam.run.run.open_odometry", "lidarslam.run.run.prefetch"):
         with monkeypatch.context() as patch:
             pressed_at(patch, place, 1)
@@ -170,11 +167,11 @@ def test_a_request_in_a_finaliser_is_not_lost(is_weak: bool, is_run: bool) -> No
 
 
 def test_the_handlers_are_as_before() -> None:
-    def handlers() -> Iterator[object]:
-        return (signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
+    def handlers() -> list[object]:
+        return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
-    before = list(handlers())
+    before = handlers()
     with Interruptions():
-        assert list(handlers()) != before
-    assert list(handlers()) == before
+        assert handlers() != before
+    assert handlers() == before
     assert logging.getLogger("lidarslam.run.interruption").level == logging.NOTSET

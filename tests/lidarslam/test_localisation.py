@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -60,15 +61,12 @@ def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> N
     rng = np.random.default_rng(0)
     corner = np.concatenate([np.insert(rng.uniform(1.0, 6.0, (800, 2)), axis, 1.0, axis=1) for axis in range(3)])
     localiser = OdometryAlone(ConsistencyCheck())
-    told = [
-        localiser.localise(
-            ScanOdometry(Scan(corner, 0.1 * number), Motion(np.eye(4), 100, degenerate=names), 0.1), None
-        )
-        for number, names in enumerate([(), (), ("x", "yaw")])
-    ]
-    assert [localised.status for localised in told[1:]] == [Status.OK, Status.DEGRADED]
-    assert (told[1].message, told[2].message) == ("", "degenerate along x, yaw")
-    assert told[2].degenerate == ("x", "yaw")
+    motions = [Motion(np.eye(4), 100, degenerate=names) for names in ((), (), ("x", "yaw"))]
+    scans = [ScanOdometry(Scan(corner, 0.1 * number), motion, 0.1) for number, motion in enumerate(motions)]
+    _, seen, open_ = [localiser.localise(scan, None) for scan in scans]
+    assert (seen.status, seen.message) == (Status.OK, "")
+    assert (open_.status, open_.message) == (Status.DEGRADED, "degenerate along x, yaw")
+    assert open_.degenerate == ("x", "yaw")
 
 
 def test_a_sweep_that_was_compensated_already_is_left_alone() -> None:
@@ -78,7 +76,6 @@ def test_a_sweep_that_was_compensated_already_is_left_alone() -> None:
 
 def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> None:
     scan = sweep(-0.05, 0.05)
-    assert scan.time_offsets is not None
     expected = [
         transform_points(exp(t * (BEFORE if t < 0.0 else AFTER)), p[None])[0]
         for t, p in zip(scan.time_offsets, scan.points, strict=True)
@@ -90,15 +87,20 @@ def localise_all(
     scans: list[Scan], motions: list[Motion], interval_s: float = 0.1, start: dict[float, Prior] | None = None
 ) -> list[ScanEstimate]:
     localiser = ScanToMap(Mapper(MappingConfig()), start=start)
-    measured = [motion.failure is None for motion in motions]
-    estimates = [
-        ScanOdometry(scan, motion, interval_s if k and measured[k] and measured[k - 1] else None)
-        for k, (scan, motion) in enumerate(zip(scans, motions, strict=True))
-    ]
-    return [
-        localiser.localise(estimate, following)
-        for estimate, following in zip(estimates, [*estimates[1:], None], strict=True)
-    ]
+    intervals = [None, *(interval_s if b.failure is a.failure is None else None for a, b in pairwise(motions))]
+    estimates = [ScanOdometry(*given) for given in zip(scans, motions, intervals, strict=True)]
+    return [localiser.localise(one, following) for one, following in pairwise([*estimates, None])]
+
+
+def true_motions(truth: FloatArray, variance: float) -> list[Motion]:
+    """As an odometry without errors tells them, which believes in such ones."""
+    return [Motion(T, 100, covariance=variance * np.eye(6)) for T in (np.eye(4), *(inverse(truth[:-1]) @ truth[1:]))]
+
+
+def errors_of(localised: list[ScanEstimate], truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances in metres and angles in degrees."""
+    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
+    return np.linalg.norm(errors[:, :3, 3], axis=1), np.rad2deg(rotation_angle(errors))
 
 
 def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
@@ -107,11 +109,9 @@ def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
     errors = exp(rng.normal(0.0, [0.01] * 3 + [0.02] * 3, (len(room_scans) - 1, 6)))
     wrong = [np.eye(4), *(room_truth.relative_motions() @ errors)]
     localised = localise_all(room_scans, [Motion(T, 100) for T in wrong])
-    chained = np.eye(4)
-    for T_prev_curr, found in zip(wrong, localised, strict=True):
-        chained = chained @ T_prev_curr
-        np.testing.assert_allclose(found.T_odom_lidar, chained, atol=1e-9)
-    assert np.linalg.norm(chained[:3, 3] - localised[-1].T_world_lidar[:3, 3]) > 0.02, "but not the pose"
+    chained = list(accumulate(wrong, np.matmul))
+    np.testing.assert_allclose([found.T_odom_lidar for found in localised], chained, atol=1e-9)
+    assert np.linalg.norm(chained[-1][:3, 3] - localised[-1].T_world_lidar[:3, 3]) > 0.02, "but not the pose"
 
 
 def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(
@@ -131,20 +131,16 @@ def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any
     def turning(times: FloatArray) -> FloatArray:
         since = times + 0.1
         degrees = 20.0 * since + 400.0 * np.clip(since, 0.0, 0.2) ** 2 + 160.0 * np.maximum(since - 0.2, 0.0)
-        return make_transform(
-            Rotation.from_rotvec(np.deg2rad(degrees)[:, None] * [0.0, 0.0, 1.0]).as_matrix(), np.zeros(3)
-        )
+        return exp(np.multiply.outer(np.deg2rad(degrees), [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
 
     stamps = 0.2 * np.arange(SMOOTHED)
     scans, truth = [room.ring_sweep(turning, stamp) for stamp in stamps], turning(stamps)
     start = smoothed_start(scans, MappingConfig())
     assert list(start) == [0.0]
     assert np.rad2deg(start[0.0].turn_rate) == pytest.approx([0.0, 0.0, 100.0], abs=10.0)
-    motions = [np.eye(4), *(inverse(truth[:-1]) @ truth[1:])]
-    localised = localise_all(scans, [Motion(T, 100, covariance=1e-6 * np.eye(6)) for T in motions], 0.2, start)
-    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
-    assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.02
-    assert np.rad2deg(rotation_angle(errors)).max() < 0.5
+    distances_m, angles_deg = errors_of(localise_all(scans, true_motions(truth, 1e-6), 0.2, start), truth)
+    assert distances_m.max() < 0.02
+    assert angles_deg.max() < 0.5
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.0, 1.0), (0.5e-3, 0.5), (1e-2, 0.0)])
@@ -171,12 +167,10 @@ def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> N
 
     stamps = 0.1 * np.arange(30)
     scans, truth = [room.ring_sweep(swaying, stamp) for stamp in stamps], swaying(stamps)
-    motions = [np.eye(4), *(inverse(truth[:-1]) @ truth[1:])]
-    localised = localise_all(scans, [Motion(T, 100, covariance=1e-5 * np.eye(6)) for T in motions])
-    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
-    errors = errors[5:-1]  # not in a young map, nor at the last scan, whose following motion is unknown
-    assert np.rad2deg(rotation_angle(errors)).max() < 0.08
-    assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.01
+    distances_m, angles_deg = errors_of(localise_all(scans, true_motions(truth, 1e-5)), truth)
+    settled = slice(5, -1)  # not in a young map, nor at the last scan, whose following motion is unknown
+    assert angles_deg[settled].max() < 0.08
+    assert distances_m[settled].max() < 0.01
 
 
 def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanEstimate], Pipeline]:
@@ -185,12 +179,10 @@ def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanEstimate], Pipe
 
 
 def check_poses_and_map(results: list[ScanEstimate], pipeline: Pipeline, room: Any, room_truth: Trajectory) -> None:
-    truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
-    errors = inverse(truth) @ np.array([result.T_world_lidar for result in results])
-    assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.01
-    assert np.rad2deg(rotation_angle(errors)).max() < 0.1
+    distances_m, angles_deg = errors_of(results, room_truth.T_world_lidar)
+    assert distances_m.max() < 0.01
+    assert angles_deg.max() < 0.1
     assert all(result.status is Status.OK for result in results)
-    assert pipeline.map.global_map is not None
     in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 0.005
@@ -199,12 +191,9 @@ def check_poses_and_map(results: list[ScanEstimate], pipeline: Pipeline, room: A
 
 def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
     """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
-    step = exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
-    motions = room_truth.relative_motions() @ step
-    poses = [np.eye(4)]
-    for T_prev_curr in motions:
-        poses.append(poses[-1] @ T_prev_curr)
-    results, pipeline = run(ExternalOdometry(Trajectory(room_truth.stamps, np.array(poses))), room_scans)
+    motions = room_truth.relative_motions() @ exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
+    poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
+    results, pipeline = run(ExternalOdometry(Trajectory(room_truth.stamps, poses)), room_scans)
     check_poses_and_map(results, pipeline, room, room_truth)
 
 
@@ -225,19 +214,23 @@ def test_without_any_odometry_a_sensor_that_begins_at_rest_has_true_poses_and_a_
 def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:
     for method, kind in (("surfels", SurfelMap), ("loam", FeatureMap)):
         mapper = make_localiser(Config(mapping=MappingConfig(method=method))).mapper
-        assert mapper is not None
         mapper.process(mapper.sample(room_scans[0]), Prior())
         assert type(mapper.local_map) is kind
     assert isinstance(make_localiser(Config(mapping=MappingConfig(method="off"))), OdometryAlone)
 
 
+@pytest.fixture
+def estimates(room_scans: list[Scan], room_truth: Trajectory) -> list[ScanOdometry]:
+    """Of eight scans, without errors."""
+    motions = [np.eye(4), *room_truth.relative_motions()]
+    return [ScanOdometry(scan, Motion(T, 100), 0.1) for scan, T in zip(room_scans[:8], motions, strict=False)]
+
+
 @pytest.mark.parametrize("method", ["surfels", "loam"])
 def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
-    room_scans: list[Scan], room_truth: Trajectory, method: MappingName
+    estimates: list[ScanOdometry], method: MappingName
 ) -> None:
     config = Config(mapping=MappingConfig(method=method))
-    motions = [np.eye(4), *room_truth.relative_motions()]
-    estimates = [ScanOdometry(scan, Motion(T, 100), 0.1) for scan, T in zip(room_scans[:8], motions, strict=False)]
     whole, resumed = make_localiser(config), make_localiser(config)
     for estimated in estimates[:5]:
         whole.localise(estimated, None)
@@ -248,14 +241,12 @@ def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
         np.testing.assert_array_equal(first.T_odom_lidar, second.T_odom_lidar)
 
 
-def test_scans_may_be_thinned_ahead_of_their_poses(room_scans: list[Scan], room_truth: Trajectory) -> None:
+def test_scans_may_be_thinned_ahead_of_their_poses(estimates: list[ScanOdometry]) -> None:
     """As many ahead as the pipeline has scans under way."""
-    motions = [np.eye(4), *room_truth.relative_motions()]
-    estimates = [ScanOdometry(scan, Motion(T, 100), 0.1) for scan, T in zip(room_scans[:8], motions, strict=False)]
     in_turn, ahead = make_localiser(Config()), make_localiser(Config())
     sampled = [replace(one, sampled=ahead.sample(one.scan)) for one in estimates]
     for one, other in zip(estimates, sampled, strict=True):
         first, second = in_turn.localise(one, None), ahead.localise(other, None)
         assert second.status is Status.OK
         np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
-    assert make_localiser(Config(mapping=MappingConfig(method="off"))).sample(room_scans[0]) is None
+    assert make_localiser(Config(mapping=MappingConfig(method="off"))).sample(estimates[0].scan) is None

@@ -1,19 +1,18 @@
 """`lidarslam localise`: a recording of a room found in the map of a run, and one of another room refused."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import Result
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.finished_run import load_run
 
-from ..conftest import lidarslam, write_recording
+from ..conftest import succeeds, write_recording
+from .conftest import FAST, refused, summary_of
 
 Drive = Callable[[FloatArray], FloatArray]
 SCANS, FIRST = 34, 8
@@ -24,11 +23,6 @@ def record(folder: Path, room: Any, drive: Drive) -> Path:
     """Scans as .npy files, with times and stamps."""
     scans = (room.sweep(drive, 0.1 * number) for number in range(1, SCANS + 1))
     return write_recording(folder, scans, is_timed=True)
-
-
-def call(*words: str | Path) -> Result:
-    """The command line."""
-    return lidarslam(*words, *WITHOUT_ODOMETRY)
 
 
 @pytest.fixture(scope="module")
@@ -47,17 +41,16 @@ def recording(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive)
 def mapped(tmp_path_factory: pytest.TempPathFactory, recording: Path) -> Path:
     """A run of it."""
     out = tmp_path_factory.mktemp("runs") / "mapped"
-    assert call("run", recording, "-o", out, "--no-report").exit_code == 0
+    succeeds("run", recording, "-o", out, *FAST)
     return out
 
 
 def test_poses_are_in_the_frame_of_the_map(tmp_path: Path, recording: Path, mapped: Path, drive: Drive) -> None:
     before, out = (mapped / "map.ply").read_bytes(), tmp_path / "again"
-    result = call("localise", recording, "--map", mapped, "-o", out, "--start", str(FIRST))
-    assert result.exit_code == 0, result.output
-    assert "found at scan" in result.output
+    said = succeeds("localise", recording, "--map", mapped, "-o", out, "--start", FIRST, *WITHOUT_ODOMETRY)
+    assert "found at scan" in said
     assert (mapped / "map.ply").read_bytes() == before
-    trajectory, summary = read_tum(out / "trajectory.tum"), json.loads((out / "summary.json").read_text())
+    trajectory, summary = read_tum(out / "trajectory.tum"), summary_of(out)
     stamps = 0.1 * np.arange(FIRST + 1, SCANS + 1)
     truth = inverse(drive(np.array([0.1]))[0]) @ drive(stamps)
     assert np.linalg.norm((inverse(truth) @ trajectory.T_world_lidar)[:, :3, 3], axis=1).max() < 0.1
@@ -76,20 +69,15 @@ def test_poses_are_in_the_frame_of_the_map(tmp_path: Path, recording: Path, mapp
 def test_a_recording_of_another_place_is_refused(tmp_path: Path, room: Any, drive: Drive, mapped: Path) -> None:
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     elsewhere, out = record(tmp_path / "elsewhere", other, drive), tmp_path / "out"
-    result = call("localise", elsewhere, "--map", mapped, "-o", out)
-    assert result.exit_code == 1
-    assert "not found in" in result.output
+    assert "not found in" in refused("localise", elsewhere, "--map", mapped, "-o", out, *WITHOUT_ODOMETRY)
     assert not (out / "trajectory.tum").exists()
-    found = json.loads((out / "summary.json").read_text())["localisation"]
+    found = summary_of(out)["localisation"]
     assert not found["found"]
     assert found["searches_refused"]
 
 
 def test_what_is_no_map_is_refused_before_anything_is_written(tmp_path: Path, recording: Path, mapped: Path) -> None:
     out = tmp_path / "out"
-    result = call("localise", recording, "--map", recording, "-o", out)
-    assert result.exit_code == 1
-    result = call("localise", recording, "--map", mapped, "-o", out, "--set", "mapping.method=off")
-    assert result.exit_code == 1
-    assert "surfels" in result.output
+    refused("localise", recording, "--map", recording, "-o", out)
+    assert "surfels" in refused("localise", recording, "--map", mapped, "-o", out, "--set", "mapping.method=off")
     assert not out.exists()

@@ -19,7 +19,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
-from ...conftest import lidarslam
+from ...conftest import succeeds
+from ..conftest import summary_of
 
 SWEEP_S = 0.1
 SLOWEST = pytest.param("ct-icp", marks=pytest.mark.slow)
@@ -128,8 +129,7 @@ def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recordi
     pytest.importorskip("small_gicp", reason="needs the extra peers")
     out = tmp_path / "compared"
     arguments = ["compare", recording, "-o", out, "--methods", "small-gicp,rko-lio"]
-    done = lidarslam(*arguments)
-    assert done.exit_code == 0, done.output
+    succeeds(*arguments)
     methods = json.loads((out / "comparison.json").read_text())["methods"]
     assert methods["small-gicp"]["status"] == "ok"
     assert methods["small-gicp"]["metrics"]["trajectory"]["ate_rmse_m"] < 0.1
@@ -138,10 +138,10 @@ def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recordi
     run = out / "room" / "small-gicp"
     assert (run / "map.ply").is_file()
     assert "peer: small_gicp" in (run / "config.yaml").read_text()
-    assert json.loads((run / "summary.json").read_text())["scans"] == 5
-    again = lidarslam(*arguments, "--reuse")
-    assert "small-gicp: ok" in again.output
-    assert "in an earlier comparison" in again.output
+    assert summary_of(run)["scans"] == 5
+    again = succeeds(*arguments, "--reuse")
+    assert "small-gicp: ok" in again
+    assert "in an earlier comparison" in again
 
 
 class _Ranges:
@@ -171,8 +171,7 @@ def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: 
     out = tmp_path / "compared"
     names = ["small-gicp", "small-gicp@scene", "kiss-icp@scene"]
     arguments = ["compare", recording, "-o", out, "--methods", ",".join(names)]
-    done = lidarslam(*arguments)
-    assert done.exit_code == 0, done.output
+    said = succeeds(*arguments)
     content = json.loads((out / "comparison.json").read_text())
     assert [method["status"] for method in content["methods"].values()] == ["ok"] * 3
     assert all(method["metrics"]["trajectory"]["ate_rmse_m"] < 0.1 for method in content["methods"].values())
@@ -182,9 +181,8 @@ def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: 
     configs = {name: (out / "room" / name / "config.yaml").read_text() for name in names}
     assert "max_range_m: 100.0" in configs["small-gicp"]
     assert [f"max_range_m: {range_m}" in configs[name] for name in names] == [False, True, True]
-    assert "Times of small-gicp, small-gicp@scene: registration alone" in done.output
-    again = lidarslam(*arguments, "--reuse")
-    assert again.output.count("in an earlier comparison") == 3
+    assert "Times of small-gicp, small-gicp@scene: registration alone" in said
+    assert succeeds(*arguments, "--reuse").count("in an earlier comparison") == 3
 
 
 @pytest.mark.parametrize(
