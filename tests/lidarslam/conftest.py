@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import Result
+from hypothesis import HealthCheck, settings
 
 from lidarslam.compare.comparison import Counter, Narrator
 from lidarslam.core.geometry import FloatArray
@@ -31,6 +33,24 @@ def refused(*arguments: object) -> str:
     assert result.stderr.startswith("lidarslam: ")
     assert result.stderr.count("\n") == 1
     return result.stderr
+
+
+def ends_well(*arguments: object) -> Result:
+    """A command that ends with a status, and with one line where that is 1."""
+    result = lidarslam(*arguments)
+    assert result.exit_code in (0, 1, 2, 3)
+    assert "Traceback" not in result.output
+    if result.exit_code == 1:
+        assert result.stderr.startswith("lidarslam: ")
+        assert len(result.stderr.splitlines()) == 1, result.stderr
+        assert len(result.stderr) < 3000
+    return result
+
+
+def fuzzed(examples: int) -> settings:
+    """Examples that follow from the test's name alone, so that a failure is found again."""
+    unimportant = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    return settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=unimportant)
 
 
 def summary_of(run: Path) -> dict[str, Any]:

@@ -27,12 +27,14 @@ from ..conftest import lidarslam, succeeds
 from .conftest import FAST, refused, summary_of
 
 COMMAND = f"'{sys.executable}' -m lidarslam"
-PYTHONPATH = os.pathsep.join(folder for folder in sys.path if Path(folder).is_absolute())
 
 
-def in_shell(script: str, **options: object) -> "subprocess.CompletedProcess[str]":
+def in_shell(script: str, folder: Path, **changed: str | None) -> "subprocess.CompletedProcess[str]":
+    """What it comes to in a folder, with variables of the environment that are changed or absent."""
+    path = os.pathsep.join(place for place in sys.path if Path(place).is_absolute())
+    env = {key: value for key, value in (os.environ | {"PYTHONPATH": path} | changed).items() if value is not None}
     command = ["bash", "-c", script]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, **options)  # type: ignore[call-overload,no-any-return]
+    return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False, timeout=60)
 
 
 def left_in(folder: Path) -> list[str]:
@@ -297,8 +299,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
 def test_standard_streams_that_are_closed_or_full(
     tmp_path: Path, small_recording: Path, redirected: str, status: int
 ) -> None:
-    script = f"{COMMAND} run '{small_recording}' --out run --odometry constant-velocity {redirected}"
-    ended = in_shell(script, cwd=tmp_path, env=os.environ | {"PYTHONPATH": PYTHONPATH})
+    ended = in_shell(f"{COMMAND} run '{small_recording}' --out run --odometry constant-velocity {redirected}", tmp_path)
     assert ended.returncode == status
     assert "Traceback" not in ended.stderr
     assert summary_of(tmp_path / "run")["scans"] == 6
@@ -320,26 +321,22 @@ def test_standard_streams_that_are_closed_or_full(
 )
 def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, str | None]) -> None:
     source = shutil.copytree(small_recording, tmp_path / "Größe")
-    environment = os.environ | {"PYTHONPATH": PYTHONPATH} | changed
-    env = {key: value for key, value in environment.items() if value is not None}
-    options = " ".join([*FAST, "--pose-graph"])
-    ended = in_shell(f"{COMMAND} run '{source}' --out '{tmp_path / 'läuft'}' {options}", env=env)
+    ended = in_shell(f"{COMMAND} run '{source}' --out läuft {' '.join(FAST)} --pose-graph", tmp_path, **changed)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert "written to" in ended.stdout
     assert summary_of(tmp_path / "läuft")["scans"] == 6
 
 
-def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("cd gone && rmdir ../gone", "the current folder was removed"),
+        ("ulimit -v 1000000", "the address space is limited to"),  # OpenBLAS would wait for memory, deaf to SIGTERM
+    ],
+)
+def test_shells_in_which_nothing_can_be_done(tmp_path: Path, script: str, said: str) -> None:
     (tmp_path / "gone").mkdir()
-    script = f"cd gone && rmdir ../gone && {COMMAND} run '{small_recording}' --out '{tmp_path / 'never'}'"
-    ended = in_shell(script, cwd=tmp_path, env=os.environ | {"PYTHONPATH": PYTHONPATH})
+    ended = in_shell(f"{script}; exec {COMMAND} info nothing", tmp_path)
     assert ended.returncode == 1
-    assert ended.stderr == "lidarslam: the current folder was removed; change to another\n"
-
-
-def test_an_address_space_that_libraries_fill_is_refused() -> None:
-    """OpenBLAS would wait for memory without an end, deaf to SIGTERM."""
-    ended = in_shell(f"ulimit -v 1000000; exec {COMMAND} info nothing")
-    assert ended.returncode == 1
-    assert "the address space is limited to" in ended.stderr
+    assert said in ended.stderr
     assert ended.stderr.count("\n") == 1

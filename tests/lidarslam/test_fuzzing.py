@@ -12,11 +12,9 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.trajectory import Trajectory
@@ -26,18 +24,12 @@ from lidarslam.simulation.writers import FORMATS, write_kitti, write_ply_scans
 from lidarslam.storage.finished_run import load_map
 
 from ..conftest import write_recording
-from .conftest import FAST
+from . import conftest
+from .conftest import FAST, ends_well
 
 pytestmark = pytest.mark.slow
 
-EXAMPLES = int(os.environ.get("LIDARSLAM_FUZZ_EXAMPLES", "40"))
-# Examples follow from the test's name alone, so that a failure is found again.
-fuzzed = settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+fuzzed = conftest.fuzzed(int(os.environ.get("LIDARSLAM_FUZZ_EXAMPLES", "40")))
 # More than all commands here take on the undamaged files, beyond what is loaded already.
 MOST_MEMORY_KB = 1 << 20
 NUMBERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**64 - 1)
@@ -177,20 +169,6 @@ def nothing_else_changes(root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
     assert listing(root) == before
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory_kb < MOST_MEMORY_KB
     monkeypatch.undo()
-
-
-def ends_well(*arguments: object) -> int:
-    """The exit status of a command, which ends as promised."""
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
-    assert result.exit_code in (0, 1, 2, 3)
-    said = result.stderr.splitlines()
-    if result.exit_code == 1:
-        assert len(said) == 1, said
-        assert said[0].startswith("lidarslam: ")
-        assert len(said[0]) < 3000
-    assert "Traceback" not in result.output
-    return result.exit_code
 
 
 def damage(folder: Path, patterns: tuple[str, ...], which: float, made: list[Change]) -> None:
