@@ -190,9 +190,11 @@ def decoder() -> CloudDecoder:
     return CloudDecoder(ReaderConfig(), CLOUD, Faults())
 
 
-def test_point_times_and_elevations_are_corrected_as_set(decoder: CloudDecoder) -> None:
+def test_point_times_are_inferred_and_they_and_elevations_corrected_as_set(decoder: CloudDecoder) -> None:
     as_set = CloudDecoder(ReaderConfig(time_scale=-0.5, elevation_correction_deg=0.2), CLOUD, Faults())
-    as_sent, corrected = (each.scan(message_at(1000.5), NOW) for each in (decoder, as_set))
+    as_sent, corrected = (each.scan(message_at(1000.5, "os"), NOW) for each in (decoder, as_set))
+    assert (as_sent.stamp_ns, as_sent.frame_id, as_sent.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
+    np.testing.assert_allclose(as_sent.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
     np.testing.assert_array_equal(corrected.scan.time_offsets, -0.5 * as_sent.scan.time_offsets)
     np.testing.assert_array_equal(corrected.scan.points, correct_elevation(as_sent.scan.points, 0.2))
 
