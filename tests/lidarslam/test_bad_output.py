@@ -277,8 +277,9 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     command = [sys.executable, "-m", "lidarslam", "run", str(source), "--out", str(out), *FAST]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     begun = time.monotonic()
-    while not (out / "unfinished" / "state.npz").exists() and time.monotonic() - begun < 90.0:
+    while not (out / "unfinished" / "run.json").exists() and time.monotonic() - begun < 90.0:
         time.sleep(0.05)
+    time.sleep(1.5)
     process.send_signal(sent)
     _, said = process.communicate(timeout=30)
     assert process.returncode == 1
