@@ -10,7 +10,6 @@ import pytest
 from lidarslam.odometry.network.shipped import default_weights
 
 HIDDEN = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript")
-LIDARSLAM = [sys.executable, "-m", "lidarslam"]
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +20,11 @@ def base_install(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         (hidden / f"{name}.py").write_text(f"raise ModuleNotFoundError('hidden', name={name!r})\n")
     path = os.pathsep.join([str(hidden), *sys.path])
     return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+
+
+def run(arguments: list[str], environment: dict[str, str], folder: Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.long
@@ -44,9 +48,7 @@ def test_every_command_but_training_and_export_does_without(base_install: dict[s
         "import sys\n"
         f"print('imported:', sorted(set({HIDDEN}) & set(sys.modules)))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=base_install, capture_output=True, text=True, check=False
-    )
+    done = run(["-c", code], base_install, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines()[-1] == "imported: []"
     assert all((tmp_path / name).exists() for name in ("run/map.ply", "run.rrd", "map.png", "compared/report.html"))
@@ -69,9 +71,7 @@ def test_what_needs_the_extra_says_so_in_one_line(
     scans.mkdir()
     for number in range(2):
         (scans / f"{number}.bin").write_bytes(b"\x00\x00\x80\x3f" * 4 * 500)
-    done = subprocess.run(
-        [*LIDARSLAM, *arguments], cwd=tmp_path, env=base_install, capture_output=True, text=True, check=False
-    )
+    done = run(["-m", "lidarslam", *arguments], base_install, tmp_path)
     (line,) = done.stderr.splitlines()
     assert f"torch is not installed, which {purpose} needs; pip install 'lidarslam[train]'" in line
     assert "CPU build" in line

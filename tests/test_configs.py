@@ -32,36 +32,16 @@ def test_settings_win_over_the_file(tmp_path: Path) -> None:
     assert config.odometry.kiss_icp.max_range_m == 40.0
 
 
-@pytest.mark.parametrize(
-    ("text", "settings", "method"),
-    [
-        ("", [], "surfels"),
-        ("mapping: {method: loam}", [], "loam"),
-        ("mapping: {method: off}", [], "off"),
-        ("mapping: {method: off}", ["mapping.method=loam"], "loam"),
-    ],
-)
-def test_a_mapping_is_named_and_off_is_a_word(tmp_path: Path, text: str, settings: list[str], method: str) -> None:
-    file = tmp_path / "config.yaml"
-    file.write_text(text)
-    mapping = load_config(file, settings).mapping
-    assert mapping.method == method
-    assert mapping.enabled == (method != "off")
-
-
 @pytest.mark.parametrize("method", get_args(MappingName))
-def test_every_mapping_is_dumped_so_that_it_loads_again(tmp_path: Path, method: MappingName) -> None:
+def test_every_mapping_is_a_word_also_off_and_is_dumped_so_that_it_loads_again(
+    tmp_path: Path, method: MappingName
+) -> None:
     file = tmp_path / "config.yaml"
-    file.write_text(dump_yaml(Config(mapping=MappingConfig(method=method))))
-    assert load_config(file).mapping.method == method
-    assert "enabled" not in Config().model_dump()["mapping"]
-
-
-def test_what_is_dumped_loads_again_with_the_section_on_the_run(tmp_path: Path) -> None:
-    config = load_config(None, ["reader.sequence='04'", "global_map.voxel_size_m=0.3"])
-    file = tmp_path / "config.yaml"
-    file.write_text(dump_yaml(config, {"version": "0.1.0", "source": "somewhere"}))
-    assert load_config(file) == config
+    for text in (f"mapping: {{method: {method}}}", dump_yaml(Config(mapping=MappingConfig(method=method)))):
+        file.write_text(text)
+        mapping = load_config(file).mapping
+        assert mapping.method == method
+        assert mapping.enabled == (method != "off")
 
 
 @pytest.mark.parametrize("text", ["04", "it's", "'", "null", "a: b"])
@@ -75,22 +55,14 @@ def test_the_readers_options_stay_text(text: str) -> None:
     [
         (["odometry.kiss_icp.voxelsize=1"], r"no odometry\.kiss_icp\.voxelsize; did you mean voxel_size_m\?"),
         (["odometry.colour=1"], r"no odometry\.colour; there are: method"),
-        (
-            ["global_map.voxel_size_m=-1"],
-            r"global_map\.voxel_size_m=-1: expected 0\.01 to 10$",
-        ),
         (["odometry.method=loam"], r"odometry\.method: no odometry is called 'loam'; there are: learned, kiss-icp"),
         (["global_map"], r"expected key\.path=value"),
         (["global_map.voxel_size_m=2", "global_map.voxel_size_m.x=1"], "voxel_size_m is a value, not a section"),
         (["odometry=1"], r"^configuration \(--set\): odometry=1: expected a section$"),
-        (
-            ["global_map.min_range_m=80"],
-            r"^configuration \(--set\): global_map: min_range_m=80 must be less than max_range_m=80, or .* left$",
-        ),
+        (["global_map.min_range_m=80"], r"^configuration \(--set\): global_map: min_range_m=80 must be less than "),
         (["mapping.tracking.lost_below=0.8"], r"tracking: lost_below=0\.8 must not exceed degraded_below=0\.6,"),
         (["mapping.method=icp"], r"mapping\.method: no mapping is called 'icp'; there are: surfels, loam, off"),
         (["checkpoints.interval_s=.inf"], "finite number"),
-        (["global_map.voxel_size_m=.nan"], "finite number"),
         (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),
     ],
 )
@@ -119,19 +91,16 @@ def test_broken_files_are_named(tmp_path: Path, text: str | bytes, message: str)
 def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
     file = tmp_path / "wrong.yaml"
     file.write_text("global_map: {voxel_size_m: -1}\n")
-    with pytest.raises(ConfigError) as error:
-        load_config(file)
-    assert str(error.value).startswith(f"configuration ({file}): ")
-    with pytest.raises(ConfigError) as error:
-        load_config(file, ["viewer.map_every=3"])
-    assert str(error.value).startswith(f"configuration ({file} or --set): ")
+    for settings, origin in (([], file), (["viewer.map_every=3"], f"{file} or --set")):
+        with pytest.raises(ConfigError, match=rf"^configuration \({origin}\): .*voxel_size_m=-1"):
+            load_config(file, settings)
 
 
-def test_the_printed_configuration_has_a_comment_for_every_setting_and_loads_again(tmp_path: Path) -> None:
-    file = tmp_path / "config.yaml"
-    file.write_text(dump_yaml(Config()))
-    assert load_config(file) == Config()
-    printed = file.read_text()
+def test_what_is_dumped_has_comments_and_loads_again_with_the_section_on_the_run(tmp_path: Path) -> None:
+    file, printed = tmp_path / "config.yaml", dump_yaml(Config())
+    for config in (Config(), load_config(None, ["reader.sequence='04'", "global_map.voxel_size_m=0.3"])):
+        file.write_text(dump_yaml(config, {"version": "0.1.0", "source": "somewhere"}))
+        assert load_config(file) == config
     assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed
 
 
@@ -140,7 +109,7 @@ def test_plain_values() -> None:
     assert parse_yaml(text) == {"a": {"b": [1, 2.5, None, True]}, "base": {"x": 1}, "c": {"x": 2}}
 
 
-@pytest.mark.parametrize("text", ["010", "04", "0x10", "0o10", "0b11", "1:30", "1:30.5", "1_000", "1.", "7e3", "-0"])
+@pytest.mark.parametrize("text", ["010", "0x10", "0o10", "0b11", "1:30", "1:30.5", "1_000", "1.", "7e3", "-0"])
 def test_a_number_is_decimal_or_a_text(text: str) -> None:
     """In YAML 1.1, 010 is eight and 1:30 ninety."""
     numbers = {"1.": 1.0, "-0": 0}
@@ -151,11 +120,8 @@ def test_a_number_is_decimal_or_a_text(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: [1", "not YAML"),
-        ("a: 1\nb: 2\na: 3\n", "the key 'a' occurs twice"),
         ("a: {b: 1, b: 2}", "the key 'b' occurs twice"),
         ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
-        ("a: !!python/name:os.system", "could not determine a constructor"),
         ("a: 2021-13-45", "looks like a date or a number but is none"),
         ("a: " + "[" * 3_000 + "]" * 3_000, "nested too deeply"),
         ("a: \x00", "not YAML"),

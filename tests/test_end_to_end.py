@@ -12,10 +12,10 @@ import pytest
 
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.geometry import exp, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory, chain, read_kitti_poses, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
@@ -45,6 +45,17 @@ def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) ->
     return write_recording(tmp_path / "room scans", room_scans, room_truth, is_timed=True)
 
 
+def map_errors(out: Path, room: Any, truth: Trajectory) -> FloatArray:
+    """Distances of the points of the map from the surfaces of the room."""
+    points = np.asarray(o3d.io.read_point_cloud(str(out / "map.ply")).points)
+    return np.asarray(room.distance_to_surface(transform_points(truth.T_world_lidar[0], points)))
+
+
+def scan_rows(out: Path) -> list[dict[str, str]]:
+    with (out / "scans.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
 def test_a_run_writes_what_the_contract_names(
     recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
 ) -> None:
@@ -58,19 +69,17 @@ def test_a_run_writes_what_the_contract_names(
     np.testing.assert_allclose(read_kitti_poses(out / "trajectory.kitti"), trajectory.T_world_lidar, atol=1e-6)
     assert (out / "odometry.tum").read_text() == (out / "trajectory.tum").read_text()
 
-    cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
-    in_room = transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points))
-    distance = room.distance_to_surface(in_room)
+    distance = map_errors(out, room, room_truth)
     assert np.median(distance) < 0.02
     assert np.percentile(distance, 99) < 0.08
-    assert len(o3d.io.read_point_cloud(str(out / "map.pcd")).points) == len(cloud.points)
+    assert len(o3d.io.read_point_cloud(str(out / "map.pcd")).points) == len(distance)
 
     summary = json.loads((out / "summary.json").read_text())
     assert summary["scans"] == 20
     assert summary["lost_scans"] == 0
     assert summary["duration_s"] == pytest.approx(1.9)
     assert summary["length_m"] == pytest.approx(room_truth.length_m, rel=0.02)
-    assert summary["map_points"] == len(cloud.points)
+    assert summary["map_points"] == len(distance)
     assert summary["map_voxel_size_m"] == 0.1
     assert set(summary["ms_per_scan"]) == {"total", "read", "odometry", "refine", "check", "deskew", "map"}
     assert summary["ms_per_scan"]["total"]["p95"] >= summary["ms_per_scan"]["total"]["median"] > 0.0
@@ -81,8 +90,7 @@ def test_a_run_writes_what_the_contract_names(
     assert metrics["trajectory"]["ate_rmse_m"] < 0.02
     assert outcome.metrics is not None
 
-    with (out / "scans.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = scan_rows(out)
     assert [float(row["stamp"]) for row in rows] == pytest.approx(room_truth.stamps)
     assert {row["status"] for row in rows} == {"ok"}
     assert not list(out.glob(".partial*"))
@@ -99,25 +107,7 @@ def test_what_config_yaml_says_gives_the_same_run_again(recording: Path, tmp_pat
     np.testing.assert_allclose(first.T_world_lidar, second.T_world_lidar, atol=1e-6)
 
 
-def test_scans_are_laid_on_the_map_by_default(
-    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
-) -> None:
-    out = tmp_path / "run"
-    outcome = execute(RunRequest(recording, out, load_config(None, MAPPING)), quiet)
-    assert outcome.metrics is not None
-    assert outcome.metrics.errors.ate_rmse_m < 0.005
-    assert outcome.summary.lost_scans == 0
-    cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
-    distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))
-    assert np.percentile(distance, 95) < 0.02
-    assert "method: learned" in (out / "config.yaml").read_text()
-    with (out / "scans.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert all(float(row["ms_refine"]) > 0.0 for row in rows)
-    assert all(row["degenerate_directions"] == "" for row in rows)
-
-
-def test_a_pose_graph_is_built_when_it_is_asked_for(
+def test_by_default_scans_are_laid_on_the_map_and_a_pose_graph_is_built_when_it_is_asked_for(
     recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
 ) -> None:
     """The room is too small for a loop: what the map said stays, and the map drawn from submaps is as exact."""
@@ -131,39 +121,13 @@ def test_a_pose_graph_is_built_when_it_is_asked_for(
     assert graph["keyframes"] == sum(line.startswith("VERTEX_SE3:QUAT") for line in lines) >= 3
     assert graph["edges"] == sum(line.startswith("EDGE_SE3:QUAT") for line in lines)
     assert outcome.summary.to_json()["loop_closures"] == 0
-    cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
-    distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))
-    assert np.percentile(distance, 95) < 0.02
+    assert np.percentile(map_errors(out, room, room_truth), 95) < 0.02
     assert sorted(path.name for path in out.iterdir()) == sorted(set(FILES) - set(MAPS.values()))
-    run = load_run(out)
-    assert not len(run.loops)
-
-
-def test_a_wrong_odometry_is_corrected_by_the_map(recording: Path, tmp_path: Path, room_truth: Trajectory) -> None:
-    rng = np.random.default_rng(5)
-    slips = np.concatenate(
-        [np.deg2rad(1.0) * rng.standard_normal((19, 3)), 0.05 * rng.standard_normal((19, 3))], axis=1
-    )
-    wrong = Trajectory(room_truth.stamps, chain(np.eye(4), room_truth.relative_motions() @ exp(slips)))
-    write_tum(tmp_path / "wheels.tum", wrong)
-    config = load_config(None, [*MAPPING, "odometry.method=external"])
-    outcome = execute(RunRequest(recording, tmp_path / "run", config, prior=tmp_path / "wheels.tum"), quiet)
-    assert outcome.metrics is not None
-    assert outcome.metrics.errors.ate_rmse_m < 0.01
-    odometry = read_tum(tmp_path / "run" / "odometry.tum")
-    np.testing.assert_allclose(odometry.relative_motions(), wrong.relative_motions(), atol=1e-6)
-
-
-def test_an_external_trajectory_builds_an_exact_map(
-    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
-) -> None:
-    config = load_config(None, ["odometry.method=external", "mapping.method=off", "global_map.voxel_size_m=0.1"])
-    prior = recording / "ground_truth.tum"
-    execute(RunRequest(recording, tmp_path / "run", config, prior=prior), quiet)
-    cloud = o3d.io.read_point_cloud(str(tmp_path / "run" / "map.ply"))
-    in_room = transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points))
-    assert np.median(room.distance_to_surface(in_room)) < 1e-5
-    assert room.distance_to_surface(in_room).max() < 0.06
+    assert not len(load_run(out).loops)
+    assert "method: learned" in (out / "config.yaml").read_text()
+    assert {row["status"] for row in scan_rows(out)} == {"ok"}
+    assert all(float(row["ms_refine"]) > 0.0 for row in scan_rows(out))
+    assert all(row["degenerate_directions"] == "" for row in scan_rows(out))
 
 
 def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -> None:
@@ -213,14 +177,11 @@ def test_a_damaged_truth_costs_the_metrics_not_the_run(recording: Path, tmp_path
     assert not (tmp_path / "run" / "metrics.json").exists()
 
 
-def test_a_recording_is_not_written_into(recording: Path) -> None:
+def test_a_run_that_cannot_start_leaves_everything_as_it_was(recording: Path, tmp_path: Path) -> None:
     before = sorted(recording.iterdir())
     with pytest.raises(OutputError, match="is the recording itself"):
         execute(RunRequest(recording, recording, load_config(None, KISS_ICP), overwrite=True), quiet)
     assert sorted(recording.iterdir()) == before
-
-
-def test_a_run_that_cannot_start_leaves_nothing_behind(recording: Path, tmp_path: Path) -> None:
     for scan in recording.glob("*.npy"):
         scan.write_bytes(b"not an array")
     with pytest.raises(InputError, match=r"\.npy"):

@@ -2,60 +2,47 @@
 
 import re
 import tomllib
-from collections.abc import Iterator
-from datetime import date
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 REPOSITORY = Path(__file__).parents[1]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-WORKFLOWS = sorted((REPOSITORY / ".github/workflows").glob("*.yml"))
 TARGETS = set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
 
 
-def _steps(workflow: Path) -> Iterator[dict[str, Any]]:
-    for job in yaml.safe_load(workflow.read_text())["jobs"].values():
-        yield from job["steps"]
+WORKFLOWS = [yaml.safe_load(path.read_text()) for path in sorted((REPOSITORY / ".github/workflows").glob("*.yml"))]
+JOBS = [job for workflow in WORKFLOWS for job in workflow["jobs"].values()]
+CITATION = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
 
 
 def test_the_version_is_the_same_everywhere() -> None:
-    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
-    heading = f"## [{PROJECT['version']}] - {citation['date-released']}"
+    heading = f"## [{PROJECT['version']}] - {CITATION['date-released']}"
     lines = (REPOSITORY / "CHANGELOG.md").read_text().splitlines()
-    assert isinstance(citation["date-released"], date)
-    package = (REPOSITORY / "ros2/package.xml").read_text()
-    assert citation["version"] == PROJECT["version"]
-    assert f"<version>{PROJECT['version']}</version>" in package
+    assert CITATION["version"] == PROJECT["version"]
+    assert f"<version>{PROJECT['version']}</version>" in (REPOSITORY / "ros2/package.xml").read_text()
     assert [line for line in lines if line.startswith("## ")][:2] == ["## [Unreleased]", heading]
 
 
 def test_the_citation_describes_the_project() -> None:
-    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
-    assert citation["authors"] == PROJECT["authors"]
-    assert citation["license"] == PROJECT["license"]
-    assert citation["repository-code"] == PROJECT["urls"]["Homepage"]
-    assert [work["title"].split(":")[0] for work in citation["references"][1:]] == ["LOAM", "KISS-ICP"]
+    assert CITATION["authors"] == PROJECT["authors"]
+    assert CITATION["license"] == PROJECT["license"]
+    assert CITATION["repository-code"] == PROJECT["urls"]["Homepage"]
+    assert [work["title"].split(":")[0] for work in CITATION["references"][1:]] == ["LOAM", "KISS-ICP"]
 
 
 def test_workflows_call_the_commands_of_the_makefile() -> None:
-    commands = [step["run"] for workflow in WORKFLOWS for step in _steps(workflow) if "run" in step]
+    steps = [step for job in JOBS for step in job["steps"]]
+    commands = [step["run"] for step in steps if "run" in step]
     assert sorted(commands) == ["make lint", "make lowest", "make release", "make test", "make test-long"]
     assert {command.removeprefix("make ") for command in commands} <= TARGETS
-    actions = [step["uses"] for workflow in WORKFLOWS for step in _steps(workflow) if "uses" in step]
-    assert all(re.fullmatch(r"actions/[a-z-]+@v\d+", action) for action in actions)
+    assert all(re.fullmatch(r"actions/[a-z-]+@v\d+", step["uses"]) for step in steps if "uses" in step)
 
 
 def test_workflows_try_the_python_versions_of_the_classifiers() -> None:
     classified = [name.rpartition(" ")[2] for name in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d+$", name)]
-    matrices = [
-        job["strategy"]["matrix"]["python"]
-        for workflow in WORKFLOWS
-        for job in yaml.safe_load(workflow.read_text())["jobs"].values()
-        if "strategy" in job
-    ]
+    matrices = [job["strategy"]["matrix"]["python"] for job in JOBS if "strategy" in job]
     assert matrices == [classified, classified]
     assert PROJECT["requires-python"] == f">={classified[0]}"
 

@@ -52,16 +52,14 @@ def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path,
     assert "the map contradicts itself between scans 0 and" in slid.output
     assert summary["map_entropy"] > fine["map_entropy"]
     ended = judge(Ending("itself", 3, 1.0, None), tmp_path / "slid", tmp_path / "no.log", Limits())
-    assert ended == (
-        "lost",
-        f"its map contradicts itself between scans 0 and {summary['map_contradictions'][0]['last']}",
-    )
+    last = summary["map_contradictions"][0]["last"]
+    assert ended == ("lost", f"its map contradicts itself between scans 0 and {last}")
     again, _ = run(recording, room_truth, tmp_path / "slid", 0.4, "--resume")
     assert again.exit_code == 3
     assert "is finished already" in again.output
 
 
-def test_a_large_map_is_sampled_by_blocks(rng: np.random.Generator) -> None:
+def test_a_large_map_is_sampled_by_blocks_and_no_map_has_no_entropy(rng: np.random.Generator) -> None:
     ground = rng.uniform(-60.0, 60.0, (400_000, 3)) * [1.0, 1.0, 0.0005]
     part = sampled_map_entropy(ground, 100_000)
     assert part is not None
@@ -70,7 +68,4 @@ def test_a_large_map_is_sampled_by_blocks(rng: np.random.Generator) -> None:
     assert one is not None
     assert one == other
     assert part.mean == pytest.approx(one.mean, abs=0.1)
-
-
-def test_no_map_has_no_entropy() -> None:
     assert sampled_map_entropy(np.empty((0, 3))) is None

@@ -14,18 +14,18 @@ from lidarslam.mapping.global_map.edits import moved
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, succeeds
 
 TILT = exp([np.deg2rad(7.0), 0.0, 0.0, 0.0, 0.0, 0.0])
+POSES = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
 GROUND_M = -1.5
 FLOATERS = 40
 BACKWARDS, OUTSIDE = ("1", "-1", "0", "1", "0", "1"), ("90", "91", "0", "1", "0", "1")
 
 
 def edited(out: Path, *arguments: object) -> tuple[PointCloud, str]:
-    done = lidarslam("map", *arguments, "--out", out, "--overwrite")
-    assert done.exit_code == 0, done.output
-    return load_map(out), done.stdout
+    said = succeeds("map", *arguments, "--out", out, "--overwrite")
+    return load_map(out), said
 
 
 def hall() -> PointCloud:
@@ -45,16 +45,15 @@ def run(tmp_path: Path) -> Path:
     out, source = tmp_path / "run", tmp_path / "room"
     out.mkdir()
     source.mkdir()
-    T = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
     stamps = np.arange(41) / 10.0
-    write_tum(out / "trajectory.tum", Trajectory(stamps, T))
+    write_tum(out / "trajectory.tum", Trajectory(stamps, POSES))
     write_cloud(out / "map.ply", moved(hall(), TILT))
     (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(source)}))
     np.save(source / "000000.npy", np.eye(3))
-    accelerations = np.gradient(np.gradient(T[:, :3, 3], 0.1, axis=0), 0.1, axis=0)
-    force = np.einsum("nji,nj->ni", T[:, :3, :3], accelerations + TILT[:3, :3] @ [0.0, 0.0, 9.81])
-    rows = [",".join(map(str, [stamp, 0, 0, 0, *row])) for stamp, row in zip(stamps, force, strict=True)]
-    (source / "imu.csv").write_text("# T_lidar_imu: 1 0 0 0 0 1 0 0 0 0 1 0\n" + "\n".join(rows) + "\n")
+    accelerations = np.gradient(np.gradient(POSES[:, :3, 3], 0.1, axis=0), 0.1, axis=0)
+    force = np.einsum("nji,nj->ni", POSES[:, :3, :3], accelerations + TILT[:3, :3] @ [0.0, 0.0, 9.81])
+    rows = np.column_stack([stamps, np.zeros((41, 3)), force])
+    np.savetxt(source / "imu.csv", rows, delimiter=",", header="T_lidar_imu: 1 0 0 0 0 1 0 0 0 0 1 0")
     return out
 
 
@@ -75,8 +74,7 @@ def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
     inside = ((whole >= box[:, 0]) & (whole <= box[:, 1])).all(axis=1)
     assert f"cropped: {inside.sum():,} of {len(whole):,} points kept" in said
     np.testing.assert_array_equal(cloud.points, whole[inside])
-    poses = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
-    distance = np.linalg.norm(whole[:, None] - poses[:, :3, 3], axis=2).min(axis=1)
+    distance = np.linalg.norm(whole[:, None] - POSES[:, :3, 3], axis=2).min(axis=1)
     cloud, _ = edited(tmp_path / "near.ply", run, "--within", 3.0)
     np.testing.assert_array_equal(cloud.points, whole[distance < 3.0])
     both, _ = edited(tmp_path / "both.ply", run, "--within", 3.0, "--box", *box.ravel())
@@ -122,9 +120,8 @@ def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
     assert "other.ply: registered, from everywhere; 100 % of it within 0.20 m" in said
     np.testing.assert_allclose(cloud.points, expected, atol=0.03)
     cloud, _ = edited(tmp_path / "plain.ply", *sources)
-    np.testing.assert_allclose(
-        cloud.points[len(room) :], transform_points(inverse(T), expected[len(room) :]), atol=1e-5
-    )
+    apart = transform_points(inverse(T), expected[len(room) :])
+    np.testing.assert_allclose(cloud.points[len(room) :], apart, atol=1e-5)
 
 
 @pytest.mark.parametrize(

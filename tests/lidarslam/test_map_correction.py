@@ -1,7 +1,7 @@
 """A local map drawn anew replaces the running one at a scan that depends on neither threads nor interruptions."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -77,21 +77,27 @@ def pipeline_of(odometry: ExternalOdometry, graph: Any, keeper: Keeper | None = 
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), graph, keeper)
 
 
-def poses(results: list[ScanEstimate]) -> FloatArray:
+def poses(results: Iterable[ScanEstimate]) -> FloatArray:
     return np.array([result.T_world_lidar for result in results])
 
 
 @pytest.fixture(scope="module")
-def corrected(room_scans: list[Scan], room_truth: Trajectory) -> FloatArray:
-    return poses(list(pipeline_of(ExternalOdometry(room_truth), Graph()).run(room_scans)))
+def poses_with(room_scans: list[Scan], room_truth: Trajectory) -> Callable[..., FloatArray]:
+    """The poses of a run with a graph, whose state may be kept."""
+    return lambda graph, *keeper: poses(pipeline_of(ExternalOdometry(room_truth), graph, *keeper).run(room_scans))
+
+
+@pytest.fixture(scope="module")
+def corrected(poses_with: Callable[..., FloatArray]) -> FloatArray:
+    return poses_with(Graph())
 
 
 def test_the_map_is_replaced_so_many_scans_after_the_closure(
-    corrected: FloatArray, room_scans: list[Scan], room_truth: Trajectory
+    corrected: FloatArray, poses_with: Callable[..., FloatArray]
 ) -> None:
-    as_it_was = poses(list(pipeline_of(ExternalOdometry(room_truth), Graph(closes=False)).run(room_scans)))
+    as_it_was = poses_with(Graph(closes=False))
     first = CLOSED_AT + SCANS_LATER
-    assert len(room_scans) > first + 3
+    assert len(corrected) > first + 3
     np.testing.assert_array_equal(corrected[:first], as_it_was[:first])
     shift = corrected[first + 1 :, :3, 3] - as_it_was[first + 1 :, :3, 3]
     # Between the shifted map of three scans and the twelve scans since, which are where they were.
@@ -99,15 +105,15 @@ def test_the_map_is_replaced_so_many_scans_after_the_closure(
 
 
 def test_it_does_not_depend_on_how_fast_the_graph_is(
-    corrected: FloatArray, room_scans: list[Scan], room_truth: Trajectory
+    corrected: FloatArray, poses_with: Callable[..., FloatArray]
 ) -> None:
-    found = poses(list(pipeline_of(ExternalOdometry(room_truth), Graph(delay_s=0.02)).run(room_scans)))
-    np.testing.assert_array_equal(found, corrected)
+    np.testing.assert_array_equal(poses_with(Graph(delay_s=0.02)), corrected)
 
 
 @pytest.mark.parametrize("at", [CLOSED_AT, CLOSED_AT + 4, CLOSED_AT + SCANS_LATER + 2])
 def test_a_map_that_waits_is_in_the_state(
     corrected: FloatArray,
+    poses_with: Callable[..., FloatArray],
     room_scans: list[Scan],
     room_truth: Trajectory,
     through_disk: Callable[[State], Saved],
@@ -115,7 +121,7 @@ def test_a_map_that_waits_is_in_the_state(
 ) -> None:
     graph, rest = Graph(), Graph()
     keeper = Keeper(at, graph, through_disk)
-    list(pipeline_of(ExternalOdometry(room_truth), graph, keeper).run(room_scans))
+    poses_with(graph, keeper)
     assert keeper.saved is not None
     rest.scans = keeper.scans
     odometry = ExternalOdometry(room_truth)
@@ -124,13 +130,12 @@ def test_a_map_that_waits_is_in_the_state(
     assert resumed.held is not None
     odometry.estimate(resumed.held.scan)
     done = len(keeper.scans)
-    found = poses(list(resumed.run(room_scans[done + 1 :])))
-    np.testing.assert_array_equal(found, corrected[done:])
+    np.testing.assert_array_equal(poses(resumed.run(room_scans[done + 1 :])), corrected[done:])
 
 
-def test_an_error_while_drawing_reaches_the_caller(room_scans: list[Scan], room_truth: Trajectory) -> None:
+def test_an_error_while_drawing_reaches_the_caller(poses_with: Callable[..., FloatArray]) -> None:
     with pytest.raises(InputError, match="no room left"):
-        list(pipeline_of(ExternalOdometry(room_truth), Graph(fails=True)).run(room_scans))
+        poses_with(Graph(fails=True))
 
 
 def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from lidarslam import Slam
 from lidarslam.assessment.inputs import truth_of_run
 from lidarslam.config.settings import load_config
-from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.exports.source import read_run_scans
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
@@ -23,7 +23,7 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import succeeds
+from ..conftest import succeeds, write_recording
 
 SCANS = 22  # of which the guess looks at every fourth
 TURNS = {
@@ -49,27 +49,17 @@ def recordings(tmp_path_factory: pytest.TempPathFactory, simulation: Simulation)
     """Two of it, of other noise, with an IMU, as recorded in each of the axes: `upright`, `upright again`, ..."""
     root, paths = tmp_path_factory.mktemp("recordings"), dict[str, Path]()
     for again, seed in (("", 3), (" again", 4)):
-        for name in TURNS:
-            paths[name + again] = root / (name + again).replace(" ", "_")
-            paths[name + again].mkdir()
         made = replace(simulation, seed=seed)
-        stamps = []
-        for number, scan in enumerate(made.scans()):
-            stamps.append(scan.stamp)
-            for name, R in TURNS.items():
-                table = np.empty(len(scan), dtype=[("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
-                table["x"], table["y"], table["z"] = (scan.points @ R.T).T
-                table["time"] = scan.time_offsets
-                np.save(paths[name + again] / f"{number:06d}.npy", table)
-        imu, truth = made.imu, made.ground_truth
+        scans, imu, truth = list(made.scans()), made.imu, made.ground_truth
         rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])
         for name, R in TURNS.items():
-            T_recorded_imu = make_transform(R, np.zeros(3)) @ imu.T_lidar_imu
-            header = "T_lidar_imu: " + " ".join(map(str, T_recorded_imu[:3].ravel()))
-            np.savetxt(paths[name + again] / "imu.csv", rows, delimiter=",", header=header)
-            np.savetxt(paths[name + again] / "timestamps.txt", stamps, fmt="%.9f")
-            T_world_recorded = truth.T_world_lidar @ make_transform(R.T, np.zeros(3))
-            write_tum(paths[name + again] / "ground_truth.tum", Trajectory(truth.stamps, T_world_recorded))
+            T_recorded_lidar = make_transform(R, np.zeros(3))
+            turned = Trajectory(truth.stamps, truth.T_world_lidar @ inverse(T_recorded_lidar))
+            axes = [replace(scan, points=scan.points @ R.T) for scan in scans]
+            paths[name + again] = folder = root / f"{name}{again}".replace(" ", "_")
+            write_recording(folder, axes, turned, is_timed=True)
+            header = "T_lidar_imu: " + " ".join(map(str, (T_recorded_lidar @ imu.T_lidar_imu)[:3].ravel()))
+            np.savetxt(folder / "imu.csv", rows, delimiter=",", header=header)
     return paths
 
 
@@ -80,10 +70,6 @@ def run(source: Path, out: Path, *words: str) -> Path:
 
 def poses(directory: Path) -> FloatArray:
     return read_tum(directory / "trajectory.tum").T_world_lidar
-
-
-def points(directory: Path) -> FloatArray:
-    return load_map(directory).points
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +134,7 @@ def test_with_the_imu(recordings, tmp_path, method, turn):
     expected = run(recordings["upright"], tmp_path / "upright", *odometry)
     turned = run(recordings[turn], tmp_path / "turned", *odometry, *mounting)
     np.testing.assert_allclose(poses(turned), poses(expected), atol=1e-6)
-    np.testing.assert_allclose(points(turned), points(expected), atol=1e-5)
+    np.testing.assert_allclose(load_map(turned).points, load_map(expected).points, atol=1e-5)
 
 
 @pytest.mark.long

@@ -96,11 +96,8 @@ def test_after_a_gap_and_at_an_empty_scan_it_is_asked() -> None:
     assert 30 in asked(steady(), empty=30)
 
 
-def test_at_a_low_rate_it_is_always_asked() -> None:
+def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked() -> None:
     assert asked(steady(), stamps=0.2 * np.arange(40)) == list(range(40))
-
-
-def test_without_a_local_map_of_known_cells_it_is_always_asked() -> None:
     assert asked(steady(), cell_m=None) == list(range(40))
 
 

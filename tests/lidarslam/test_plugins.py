@@ -18,18 +18,16 @@ from lidarslam.compare.methods import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import read_tum, write_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.registry import choose_reader
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, succeeds
 
 GUIDE = Path(__file__).parents[2] / "CONTRIBUTING.md"
 
 
 def _install(folder: Path, package: str, groups: dict[str, dict[str, str]]) -> None:
-    lines = [
-        f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in at.items()) for group, at in groups.items()
-    ]
+    lines = [f"[{group}]\n" + "".join(f"{name} = {at[name]}\n" for name in at) for group, at in groups.items()]
     about = folder / f"{package.replace('-', '_')}-1.0.dist-info"
     about.mkdir(parents=True)
     (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
@@ -40,14 +38,10 @@ def _install(folder: Path, package: str, groups: dict[str, dict[str, str]]) -> N
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The example, installed."""
     folder = tmp_path_factory.mktemp("site")
-    code, table = (
-        re.search(rf"```{kind}\n(.*?)```", GUIDE.read_text().partition("## Plug-ins")[2], re.DOTALL)
-        for kind in ("python", "toml")
-    )
-    assert code is not None
-    assert table is not None
-    (folder / "lidarslam_example.py").write_text(code[1])
-    _install(folder, "lidarslam-example", tomllib.loads(table[1])["project"]["entry-points"])
+    section = GUIDE.read_text().partition("## Plug-ins")[2]
+    (code,), (table,) = (re.findall(rf"```{kind}\n(.*?)```", section, re.DOTALL) for kind in ("python", "toml"))
+    (folder / "lidarslam_example.py").write_text(code)
+    _install(folder, "lidarslam-example", tomllib.loads(table)["project"]["entry-points"])
     return folder
 
 
@@ -96,12 +90,11 @@ def test_a_run_takes_odometry_mapping_and_metric(example: Path, recording: Path,
 
 def test_a_mapping_corrects_an_added_odometry(example: Path, recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    assert lidarslam("run", recording, "--out", out, "--odometry", "still", "--no-report").exit_code == 0
+    succeeds("run", recording, "--out", out, "--odometry", "still", "--no-report")
     truth = read_tum(recording / "ground_truth.tum").positions[:5]
     moved = read_tum(out / "trajectory.tum").positions
-    np.testing.assert_allclose(
-        np.linalg.norm(moved - moved[0], axis=1), np.linalg.norm(truth - truth[0], axis=1), atol=0.02
-    )
+    far, expected = (np.linalg.norm(positions - positions[0], axis=1) for positions in (moved, truth))
+    np.testing.assert_allclose(far, expected, atol=0.02)
 
 
 def test_a_source_is_recognised(example: Path, room_scans: list[Scan], tmp_path: Path) -> None:
@@ -109,13 +102,11 @@ def test_a_source_is_recognised(example: Path, room_scans: list[Scan], tmp_path:
     source.mkdir()
     for index, scan in enumerate(room_scans[:3]):
         scan.points.tofile(source / f"{index}.sweep")
-    described = json.loads(lidarslam("info", source, "--json").output)
+    described = json.loads(succeeds("info", source, "--json"))
     assert (described["reader"], described["scans"]) == ("sweeps", 3)
     assert choose_reader(source, "sweeps") == "sweeps"
-    result = lidarslam(
-        "run", source, "--reader", "sweeps", "--out", tmp_path / "run", "--odometry", "still", "--no-report"
-    )
-    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 3, result.output
+    lidarslam("run", source, "--reader", "sweeps", "--out", tmp_path / "run", "--odometry", "still", "--no-report")
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 3
 
 
 @pytest.mark.long
@@ -129,12 +120,10 @@ def test_a_peer_is_compared(example: Path, recording: Path, tmp_path: Path) -> N
 
 
 def test_evaluate_has_the_metric_and_gates_of_it(example: Path, recording: Path, tmp_path: Path) -> None:
-    truth = read_tum(recording / "ground_truth.tum")
-    write_tum(tmp_path / "mine.tum", truth)
-    files = (tmp_path / "mine.tum", "--reference", recording / "ground_truth.tum", "--out", tmp_path / "metrics.json")
-    result = lidarslam("evaluate", *files, "--max", "plugins.height.mean_m=1e-6")
-    assert result.exit_code == 0, result.output
-    assert re.search(r"^height +mean_m ", result.output, re.MULTILINE)
+    truth = recording / "ground_truth.tum"
+    files = (truth, "--reference", truth, "--out", tmp_path / "metrics.json")
+    said = succeeds("evaluate", *files, "--max", "plugins.height.mean_m=1e-6")
+    assert re.search(r"^height +mean_m ", said, re.MULTILINE)
     assert json.loads((tmp_path / "metrics.json").read_text())["plugins"]["height"]["mean_m"] < 1e-6
     assert lidarslam("evaluate", *files, "--min", "plugins.height.mean_m=1").exit_code == 4
 
@@ -143,30 +132,25 @@ def test_without_the_package_nothing_is_added(recording: Path, tmp_path: Path) -
     assert lidarslam("run", recording, "--odometry", "still").exit_code == 2
     with pytest.raises(ConfigError, match="there are: learned"):
         parse_methods("still")
-    result = lidarslam(
-        "evaluate", recording / "ground_truth.tum", "--reference", recording, "--out", tmp_path / "m.json"
-    )
-    assert result.exit_code == 0
+    succeeds("evaluate", recording / "ground_truth.tum", "--reference", recording, "--out", tmp_path / "m.json")
     assert "plugins" not in json.loads((tmp_path / "m.json").read_text())
 
 
 def test_what_cannot_be_imported_is_one_line_with_the_package(
     broken: Path, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    cannot = "'broken' of the package lidarslam-broken cannot be loaded"
     for option in ("odometry", "mapping", "reader"):
         result = lidarslam("run", recording, "--out", tmp_path / "run", f"--{option}", "broken")
         assert result.exit_code == 1
         assert result.stderr.count("\n") == 1
-        assert (
-            f"the {option} 'broken' of the package lidarslam-broken cannot be loaded (ModuleNotFoundError"
-            in result.stderr
-        )
-    with pytest.raises(ConfigError, match="the peer 'broken' of the package lidarslam-broken cannot be loaded"):
+        assert f"the {option} {cannot} (ModuleNotFoundError" in result.stderr
+    with pytest.raises(ConfigError, match=f"the peer {cannot}"):
         parse_methods("broken")
     files = ("--reference", recording, "--out", tmp_path / "metrics.json")
-    assert lidarslam("evaluate", recording / "ground_truth.tum", *files).exit_code == 0
+    succeeds("evaluate", recording / "ground_truth.tum", *files)
     assert list(json.loads((tmp_path / "metrics.json").read_text())["plugins"]) == ["height"]
-    assert "the metric 'broken' of the package lidarslam-broken cannot be loaded" in caplog.text
+    assert f"the metric {cannot}" in caplog.text
 
 
 def test_names_are_listed_and_a_built_in_one_is_not_taken(

@@ -7,19 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, succeeds
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
 
-def run(source: Path, out: Path, *options: str) -> dict[str, float]:
-    """The errors and the summary of a run that ends with exit status 0."""
-    ended = lidarslam("run", source, "--out", out, *options)
-    assert ended.exit_code == 0, ended.output
-    summary = json.loads((out / "summary.json").read_text())
-    metrics = out / "metrics.json"
-    errors = json.loads(metrics.read_text())["trajectory"] if metrics.exists() else {}
-    return {**summary, **errors}
+def error_m(source: Path, out: Path, *options: str) -> float:
+    """The trajectory error of a run that ends with exit status 0 and loses no scan."""
+    succeeds("run", source, "--out", out, *options)
+    assert json.loads((out / "summary.json").read_text())["lost_scans"] == 0
+    return float(json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"])
 
 
 METHODS = ("learned", "constant-velocity")
@@ -34,9 +31,7 @@ METHODS = ("learned", "constant-velocity")
     ],
 )
 def test_scans_do_not_slide_at_any_rate(real_data: Path, tmp_path: Path, name: str, odometry: str, step: int) -> None:
-    result = run(real_data / name, tmp_path / "run", "--odometry", odometry, "--step", str(step))
-    assert result["ate_rmse_m"] < 0.015
-    assert result["lost_scans"] == 0
+    assert error_m(real_data / name, tmp_path / "run", "--odometry", odometry, "--step", str(step)) < 0.015
 
 
 @pytest.mark.parametrize("odometry", METHODS)
@@ -46,9 +41,7 @@ def test_the_direction_of_the_axes_does_not_matter(
 ) -> None:
     """The same sweeps fall into other cells, as any small change would have it."""
     options = "--odometry", odometry, "--set", f"reader.mounting=[0, 0, {yaw_deg}]"
-    result = run(real_data / "sim_office_spin", tmp_path / "run", *options)
-    assert result["ate_rmse_m"] < 0.015
-    assert result["lost_scans"] == 0
+    assert error_m(real_data / "sim_office_spin", tmp_path / "run", *options) < 0.015
 
 
 @pytest.mark.parametrize("odometry", METHODS)
@@ -56,9 +49,7 @@ def test_the_direction_of_the_axes_does_not_matter(
 def test_a_real_drive_at_speed_from_its_first_scan(real_data: Path, tmp_path: Path, odometry: str, step: int) -> None:
     """Sequence 04 is at 13 m/s when it begins; KISS-ICP is off by 19 m at every fifth scan."""
     source = real_data / "kitti_odometry_04" / "sequences" / "04"
-    result = run(source, tmp_path / "run", "--odometry", odometry, "--step", str(step))
-    assert result["ate_rmse_m"] < 0.05
-    assert result["lost_scans"] == 0
+    assert error_m(source, tmp_path / "run", "--odometry", odometry, "--step", str(step)) < 0.05
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 1e-5])
@@ -71,17 +62,13 @@ def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noi
         for axis in "xyz":
             scan[axis] += rng.normal(0.0, noise_m, len(scan)).astype(scan[axis].dtype)
         np.save(path, scan)
-    result = run(stairs, tmp_path / "run")
-    assert result["ate_rmse_m"] < 0.03
-    assert result["lost_scans"] == 0
+    assert error_m(stairs, tmp_path / "run") < 0.03
 
 
 @pytest.mark.parametrize("step", [3, 4])
 def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: Path, tmp_path: Path, step: int) -> None:
     """The map grows with degraded scans that the odometry confirms, without which the next flight fits none."""
-    result = run(real_data / "sim_stairs", tmp_path / "run", "--step", str(step))
-    assert result["ate_rmse_m"] < 0.3
-    assert result["lost_scans"] == 0
+    assert error_m(real_data / "sim_stairs", tmp_path / "run", "--step", str(step)) < 0.3
 
 
 @pytest.mark.parametrize("start", [0, 20, 40, 80])

@@ -40,12 +40,12 @@ def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier: Path) ->
     assert "version: 1" in (earlier / CONFIG).read_text()
 
 
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path: Path, overwrite: bool) -> None:
+def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path: Path) -> None:
     (tmp_path / MAP_PLY).write_text("somebody's map")
     (tmp_path / CONFIG).write_text("somebody: config\n")
-    with pytest.raises(OutputError, match="not those of a run"), RunDirectory.create(tmp_path, overwrite):
-        pass
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="not those of a run"), RunDirectory.create(tmp_path, overwrite):
+            pass
     assert (tmp_path / MAP_PLY).read_text() == "somebody's map"
 
 

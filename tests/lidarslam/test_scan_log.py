@@ -1,4 +1,4 @@
-"""The log of a run: its table, its trajectories, and its state."""
+"""The log of a run: its table, its trajectories, its state, and its summary."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ import pytest
 from lidarslam.core.geometry import exp
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
-from lidarslam.pipeline.estimates import ScanEstimate
+from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import Milliseconds, WrittenMap, summarise
+from lidarslam.run.summary import Milliseconds, SlowestScan, WrittenMap, summarise
 from lidarslam.run.summary_text import format_times
 
 from .conftest import scan_estimate
@@ -56,6 +56,18 @@ def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps
     json = summary.to_json()
     assert (json["elapsed_ms_per_scan"], json["latency_ms"]["p99"]) == (80.0, 80.0)
     assert json["ms_per_scan"]["total"]["median"] == 0.0
+    assert json["slowest_scan"] == {"scan": 1, "stage": "refine", "ms": 50.0}
+
+
+def test_the_slowest_stage_is_not_that_of_the_first_scan_which_loads_loops() -> None:
+    stage_ms = np.full((4, len(STAGES)), 2.0)
+    stage_ms[0], stage_ms[2, STAGES.index("refine")] = 900.0, 77.0
+    assert SlowestScan.of(stage_ms) == SlowestScan(2, "refine", 77.0)
+    assert SlowestScan.of(stage_ms[:1]) is None
+
+
+def test_percentiles_are_of_all_scans() -> None:
+    assert Milliseconds.of(np.arange(101.0)) == Milliseconds(50.0, 95.0, 99.0)
 
 
 def test_the_numbers_of_all_scans(log: ScanLog) -> None:

@@ -31,7 +31,6 @@ def test_every_file_begins_with_a_line_about_it_and_an_example_by_its_name(path:
 def test_a_configuration_is_found_by_its_name() -> None:
     expected = dump_yaml(load_config(CONFIGS / "indoor.yaml"))
     assert expected != dump_yaml(Config())
-    assert lidarslam("config", "--config", "indoor").stdout == expected
     assert lidarslam("config", "-c", "indoor").stdout == expected
 
 
@@ -47,7 +46,6 @@ def test_a_path_is_a_file_of_the_user(empty_folder: Path) -> None:
     ("arguments", "message"),
     [
         (["config", "-c", "indor"], "'indor' is neither a file nor the name of a configuration; there are: indoor, "),
-        (["config", "-c", "configs/indoor.yaml"], "'configs/indoor.yaml' is neither a file nor"),
         (["config", "-c", ""], "'' is neither a file nor"),
         (["config", "-c", "."], "'.' is neither a file nor"),
         (["compare", "--benchmark", "indoor"], "the name of a benchmark; there are: ablation, anymal, kitti, "),
@@ -70,9 +68,6 @@ def test_config_lists_them_with_what_they_are_and_what_they_need() -> None:
 def test_a_benchmark_without_its_data_says_what_it_needs() -> None:
     refused = lidarslam("compare", "--benchmark", "kitti")
     assert refused.exit_code == 1
-    assert (
-        "KITTI odometry benchmark: none of its recordings is in the current folder;"
-        " --data is the root of the KITTI odometry benchmark, with sequences/NN" in refused.stderr
-    )
+    assert "none of its recordings is in the current folder; --data is the root of the KITTI" in refused.stderr
     elsewhere = lidarslam("compare", "--benchmark", "kitti", "--data", "/nowhere")
     assert "none of its recordings is in /nowhere; --data is the root" in elsewhere.stderr

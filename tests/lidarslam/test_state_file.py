@@ -61,10 +61,11 @@ def test_a_flipped_bit_is_noticed_or_does_not_matter(tmp_path: Path, share: floa
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.999])
 def test_a_file_cut_short_is_damaged(tmp_path: Path, share: float) -> None:
-    write_state(tmp_path / "state.npz", STATE)
-    os.truncate(tmp_path / "state.npz", int(share * (tmp_path / "state.npz").stat().st_size))
+    path = tmp_path / "state.npz"
+    write_state(path, STATE)
+    os.truncate(path, int(share * path.stat().st_size))
     with pytest.raises(InputError, match="is damaged"):
-        read_state(tmp_path / "state.npz")
+        read_state(path)
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])

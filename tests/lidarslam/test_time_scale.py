@@ -13,7 +13,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.run.summary import time_scale, time_scale_warning
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, succeeds
 
 STAMPS = 100.0 + 0.1 * np.arange(60)
 
@@ -53,8 +53,7 @@ def test_few_turns_lost_scans_and_long_intervals_decide_nothing() -> None:
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("time_scale") / "walk"
-    options = ["--scans", "40", "--world", "hall", "--motion", "handheld", "--format", "mcap"]
-    lidarslam("simulate", "-o", out, *options)
+    succeeds("simulate", "-o", out, "--scans", 40, "--world", "hall", "--motion", "handheld", "--format", "mcap")
     return out
 
 
