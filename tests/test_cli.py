@@ -140,13 +140,20 @@ def test_merge_says_who_is_left_out(recording: Path, tmp_path: Path) -> None:
     [(True, 0, (), 0), (True, 2, (), 3), (False, 2, (), 1), (True, 2, ("room: not begun",), 1)],
 )
 def test_merge_exits_as_run_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, joined: bool, lost: int, stopped: tuple[str, ...], status: int
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    joined: bool,
+    lost: int,
+    stopped: tuple[str, ...],
+    status: int,
 ) -> None:
     entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
     summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
     outcome = MergeOutcome(summary, (None, None), stopped)
     monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
-    assert lidarslam("merge", tmp_path, tmp_path.parent, "--out", tmp_path / "out").exit_code == status
+    command = ("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder")
+    assert lidarslam(*command).exit_code == status
 
 
 @pytest.mark.long

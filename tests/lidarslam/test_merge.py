@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,8 @@ from lidarslam.merge.parts import MergeRequest
 from lidarslam.merge.writing import MergeOutcome, format_merge
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.run import Progress
-from lidarslam.simulation.motion import Motion, mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
+from lidarslam.simulation.motion import Motion
+from lidarslam.simulation.record import RecordRequest, make_simulation
 from lidarslam.storage.directory import FILES
 from lidarslam.storage.finished_run import load_map, load_run
 
@@ -58,11 +55,9 @@ class Later(Motion):
 
 def record(folder: Path, office: int, since_s: float, scans: int, noise: int) -> Path:
     """Part of a walk through an office with a VLP-16, as .npy scans with times, stamps and ground truth."""
-    world = build_world("office", office)
-    route = motion_along_route("handheld", world, office)
-    motion = Later(**{f.name: getattr(route, f.name) for f in fields(Motion)}, since_s=since_s)
-    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
-    simulation = Simulation(world, find_sensor("vlp-16"), motion, T_body_lidar, scans, noise)
+    walk = make_simulation(RecordRequest(folder, "office", "vlp-16", "handheld", "upright", scans, office, ""))
+    motion = Later(**{f.name: getattr(walk.motion, f.name) for f in fields(Motion)}, since_s=since_s)
+    simulation = replace(walk, motion=motion, seed=noise)
     return write_recording(folder, simulation.scans(), simulation.ground_truth, is_timed=True)
 
 

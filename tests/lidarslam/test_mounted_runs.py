@@ -16,11 +16,8 @@ from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.exports.source import read_run_scans
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
-from lidarslam.simulation.motion import mount_pose
+from lidarslam.simulation.record import RecordRequest, make_simulation
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
 from lidarslam.storage.finished_run import load_map
 
 from ..conftest import succeeds, write_recording
@@ -38,10 +35,7 @@ CONSTANT = ["--odometry", "constant-velocity"]
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
     """A walk along a street with a VLP-16."""
-    world = build_world("street", 3)
-    motion = motion_along_route("handheld", world, 3)
-    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
-    return Simulation(world, find_sensor("vlp-16"), motion, T_body_lidar, SCANS, 3)
+    return make_simulation(RecordRequest(Path(), "street", "vlp-16", "handheld", "upright", SCANS, 3, ""))
 
 
 @pytest.fixture(scope="module")

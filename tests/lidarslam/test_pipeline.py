@@ -4,6 +4,7 @@ import ctypes
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,7 @@ from lidarslam.pipeline.estimates import STAGES
 from lidarslam.pipeline.localisation import OdometryAlone, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import EVERY_SCANS
-from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
+from lidarslam.simulation.record import RecordRequest, make_simulation
 
 
 def make_pipeline(odometry: Any, follower: Any = None, **config: float) -> Pipeline:
@@ -196,10 +193,7 @@ def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: 
 
 def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows() -> None:
     """A car at speed, without an odometry: nothing is known of the first sweep's motion until the second."""
-    world = build_world("street", 0)
-    motion = motion_along_route("car-fast", world, 0)
-    mount = mount_pose("upright", motion.sensor_height_m)
-    simulation = Simulation(world, find_sensor("vlp-16"), motion, mount, scan_count=2)
+    simulation = make_simulation(RecordRequest(Path(), "street", "vlp-16", "car-fast", "upright", 2, 0, ""))
     first, second = simulation.scans()
     config = Config.model_validate({"odometry": {"method": "constant-velocity"}})
     pipeline = Pipeline(make_odometry(config.odometry), make_localiser(config), GlobalMapConfig(voxel_size_m=0.2))

@@ -46,12 +46,7 @@ def test_time_and_the_memory_of_all_processes_are_measured(run: Run) -> None:
 def test_one_that_hangs_is_ended_with_its_children(
     run: Run, lines: list[str], still_runs: Callable[[int], bool]
 ) -> None:
-    child = "import time; time.sleep(60)"
-    code = f"""
-import subprocess, sys, time
-print(subprocess.Popen([sys.executable, '-c', {child!r}]).pid, flush=True)
-time.sleep(60)
-"""
+    code = "import subprocess, time; print(subprocess.Popen(['sleep', '60']).pid, flush=True); time.sleep(60)"
     ending = run(code, timeout_s=1.0)
     assert (ending.cause, ending.status) == ("time", -signal.SIGKILL)
     assert ending.wall_s < 10.0

@@ -1,5 +1,7 @@
 """What teaches a network, and how often it is drawn."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,11 +11,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.training.preparation import prepare
-from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
+from lidarslam.simulation.record import RecordRequest, make_simulation
 from lidarslam.train.data import MapTeacher, Stretch, draw_weights
 
 SCANS = 14
@@ -22,10 +20,8 @@ SCANS = 14
 @pytest.fixture(scope="module")
 def drive() -> tuple[list[Scan], Trajectory]:
     """A car that is at speed from the first scan on, half a metre from scan to scan."""
-    world = build_world("street", 5)
-    motion = motion_along_route("car-fast", world, 5, speed_mps=6.0)
-    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
-    simulation = Simulation(world, find_sensor("vlp-16"), motion, T_body_lidar, SCANS, 5)
+    request = RecordRequest(Path(), "street", "vlp-16", "car-fast", "upright", SCANS, 5, "", speed_mps=6.0)
+    simulation = make_simulation(request)
     return list(simulation.scans()), simulation.ground_truth
 
 

@@ -51,8 +51,8 @@ def lidarslam(installation: Path, tmp_path: Path) -> Iterator[Command]:
     set_writable(tmp_path / "home", False)
     kept = ("PATH", "LANG", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
     environment = {name: os.environ[name] for name in kept if name in os.environ}
-    environment |= {"PYTHONPATH": str(installation), "HOME": str(tmp_path / "home"), "NUMBA_DEBUG_CACHE": "1"}
-    environment |= {"TMPDIR": str(tmp_path / "temporary")}
+    environment |= {"PYTHONPATH": str(installation), "NUMBA_DEBUG_CACHE": "1"}
+    environment |= {"HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path / "temporary")}
 
     def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
         command = [*WITHOUT_PRIVILEGES, sys.executable, "-m", "lidarslam", *map(str, arguments)]
