@@ -104,24 +104,19 @@ def test_all_that_find_one_another_are_in_the_frame_of_the_first(
 
 
 @pytest.mark.long
-def test_the_common_map_holds_what_is_joined_and_nothing_else(
-    merged: tuple[Path, MergeOutcome], places: dict[str, Path]
-) -> None:
+def test_the_common_map_holds_what_is_joined_and_nothing_else(merged: tuple[Path, MergeOutcome]) -> None:
     out, outcome = merged
     common = load_map(out).points
     assert len(common) == outcome.summary.map.points > 0
     first, foreign, second = (load_map(out / name).points for name in PARTS)
-    ours = cKDTree(np.concatenate([first, second]))
-    distances = ours.query(common)[0]
+    distances = cKDTree(np.concatenate([first, second])).query(common)[0]
     assert np.quantile(distances, 0.999) < 0.1  # a voxel
     assert distances.max() < 0.5  # what moved is left out of each map by its own scans
     tree = cKDTree(common)
     assert np.percentile(tree.query(first)[0], 99.0) < 0.1
     assert np.percentile(tree.query(second)[0], 99.0) < 0.1
     assert np.median(tree.query(foreign)[0]) > 0.1
-    # Walls that both saw are one wall.
-    both = cKDTree(first).query(second)[0]
-    assert np.median(both) < 0.06
+    assert np.median(cKDTree(first).query(second)[0]) < 0.06, "walls that both saw are one wall"
 
 
 @pytest.mark.long
@@ -139,9 +134,8 @@ def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcom
         first = truths[loop["first_recording"] - 1][loop["first_scan"]]
         second = truths[loop["second_recording"] - 1][loop["second_scan"]]
         assert np.linalg.norm((inverse(first) @ second)[:3, 3]) == pytest.approx(loop["distance_m"], abs=0.1)
-    poses, edges = graph_keys(out)
-    assert poses == list(range(summary["pose_graph"]["keyframes"]))
-    assert edges == summary["pose_graph"]["edges"]
+    graph = summary["pose_graph"]
+    assert graph_keys(out) == (list(range(graph["keyframes"])), graph["edges"])
     (apart,) = (warning for warning in summary["warnings"] if "left out of the common map" in warning)
     assert apart.startswith("02_foreign: ")
     assert load_config(out / "config.yaml").pose_graph.enabled
@@ -166,11 +160,11 @@ def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(
     sources = [tmp_path / name for name in ("first", "foreign", "second")]
     outcome = merge(request(tmp_path / "merged", *sources, settings=("reader.mounting=left",)), quiet)
     assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
-    for name in (".", *PARTS):
-        np.testing.assert_allclose(load_map(tmp_path / "merged" / name).points, load_map(merged[0] / name).points)
-        if name != ".":
-            poses, expected = (read_tum(out / name / "trajectory.tum") for out in (tmp_path / "merged", merged[0]))
-            np.testing.assert_allclose(poses.T_world_lidar, expected.T_world_lidar, atol=1e-6)
+    np.testing.assert_allclose(load_map(tmp_path / "merged").points, load_map(merged[0]).points)
+    for name in PARTS:
+        found, expected = (load_run(out / name) for out in (tmp_path / "merged", merged[0]))
+        np.testing.assert_allclose(found.map_points, expected.map_points)
+        np.testing.assert_allclose(found.trajectory.T_world_lidar, expected.trajectory.T_world_lidar, atol=1e-6)
 
 
 def graph_keys(out: Path) -> tuple[list[int], int]:
@@ -182,11 +176,10 @@ def graph_keys(out: Path) -> tuple[list[int], int]:
 @pytest.mark.long
 def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) -> None:
     out, _ = merged
-    runs = [load_run(out / name) for name in PARTS]
-    assert [len(run.trajectory) for run in runs] == [90, 12, 75]
-    assert all(len(run.map_points) for run in runs)
     keyframes = []
-    for name in PARTS:
+    for name, scans in zip(PARTS, (90, 12, 75), strict=True):
+        run = load_run(out / name)
+        assert (len(run.trajectory), len(run.map_points) > 0) == (scans, True)
         summary = json.loads((out / name / "summary.json").read_text())
         assert summary["loop_closures"] == 0  # none leads back within so short a way
         assert summary["map_voxel_size_m"] == 0.1

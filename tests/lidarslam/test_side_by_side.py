@@ -1,5 +1,8 @@
-"""Methods side by side: the folder of a serial comparison but for times, here and on a cluster that loses a node."""
+"""Methods of a comparison and recordings of a merge side by side: the files of a serial one but for times, here and on
+a cluster that loses a node.
+"""
 
+import contextlib
 import json
 import os
 import re
@@ -7,15 +10,26 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lidarslam.compare.comparison import CompareOutcome, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.config.settings import load_config
+from lidarslam.core.errors import OutputError
+from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import SERIAL, Where
+from lidarslam.merge import parts as tracking
+from lidarslam.merge.merge import merge
+from lidarslam.merge.parts import MergeRequest
+from lidarslam.merge.writing import MergeOutcome
+from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam
 from .conftest import Told
@@ -90,6 +104,22 @@ def _wait_for(condition: Any, seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+@contextmanager
+def _two_nodes(doomed: Callable[[list[Any]], Any]) -> Iterator[Where]:
+    """A cluster of two nodes with a CPU each, of which the doomed one is killed as soon as it is known."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+    killer = threading.Thread(target=lambda: cluster.remove_node(doomed(nodes), allow_graceful=False), daemon=True)
+    killer.start()
+    try:
+        yield Where(cluster=cluster.address)
+        killer.join(60.0)
+    finally:
+        cluster.shutdown()
+
+
 @pytest.mark.slow
 def test_side_by_side_is_the_same_as_one_after_another(
     small_recording: Path, tmp_path: Path, serial: dict[str, Any], told: Told
@@ -109,14 +139,10 @@ def test_side_by_side_is_the_same_as_one_after_another(
 def test_a_node_that_dies_costs_only_its_tasks(
     small_recording: Path, tmp_path: Path, serial: dict[str, Any], counted: tuple[str, ...]
 ) -> None:
-    """Two nodes with a CPU each; that with `learned+map` at work is killed."""
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
-    nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+    """That with `learned+map` at work is killed."""
     died: list[int] = []
 
-    def kill() -> None:
+    def doomed(nodes: list[Any]) -> Any:
         """The node whose raylet is the parent of the worker that started the method."""
         import psutil
 
@@ -124,18 +150,11 @@ def test_a_node_that_dies_costs_only_its_tasks(
         _, worker, process = next(start for start in _starts(tmp_path) if start[0] == "learned+map")
         raylet = psutil.Process(int(worker)).ppid()
         _wait_for(lambda: len({name for name, *_ in _starts(tmp_path)}) == 3)
-        doomed = next(n for n in nodes if any(p.process.pid == raylet for p in n.all_processes["raylet"]))
-        cluster.remove_node(doomed, allow_graceful=False)
         died.append(int(process))
+        return next(n for n in nodes if any(p.process.pid == raylet for p in n.all_processes["raylet"]))
 
-    killer = threading.Thread(target=kill, daemon=True)
-    killer.start()
-    try:
-        command = (*counted, "wait")
-        _compare(small_recording, tmp_path / "out", Where(cluster=cluster.address), Told(), *command)
-        killer.join(60.0)
-    finally:
-        cluster.shutdown()
+    with _two_nodes(doomed) as where:
+        _compare(small_recording, tmp_path / "out", where, Told(), *counted, "wait")
     assert died
     assert sorted(name for name, *_ in _starts(tmp_path)) == sorted([*METHODS.split(","), "learned+map"])
     assert _contents(tmp_path / "out") == serial
@@ -174,3 +193,98 @@ def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
     )
     assert len(one) == 26
     assert one == two
+
+
+MERGED = ["global_map.voxel_size_m=0.2", "odometry.method=constant-velocity", "checkpoints.every_scans=1"]
+TIMES = 4  # that the room is crossed, so that a recording takes some seconds
+Files = Callable[[Path], dict[str, Any]]
+
+
+@contextmanager
+def quiet(_name: str) -> Iterator[Progress]:
+    """No progress bar."""
+    yield lambda _number, _total, _result: None
+
+
+def _merge(sources: list[Path], out: Path, where: Where, resume: bool = False) -> MergeOutcome:
+    return merge(MergeRequest(tuple(sources), out, load_config(None, MERGED), resume=resume, where=where), quiet)
+
+
+@pytest.fixture(scope="module")
+def crossings(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) -> list[Path]:
+    """Three recordings of a way to and fro through the room, each with other points."""
+    folders = []
+    for number in range(3):
+        folders.append(tmp_path_factory.mktemp("recordings") / f"crossing {number}")
+        folders[-1].mkdir()
+        scans = [scan for turn in range(TIMES) for scan in room_scans[:: 1 - 2 * (turn % 2)]]
+        for index, scan in enumerate(scans):
+            np.save(folders[-1] / f"{index:06d}.npy", scan.points[number::6])
+        np.savetxt(folders[-1] / "timestamps.txt", 0.1 * np.arange(len(scans)), fmt="%.9f")
+    return folders
+
+
+@pytest.fixture(scope="module")
+def serial_merge(crossings: list[Path], tmp_path_factory: pytest.TempPathFactory, timeless: Files) -> dict[str, Any]:
+    """The files of a serial merge."""
+    out = tmp_path_factory.mktemp("merged") / "serial"
+    _merge(crossings, out, SERIAL)
+    return timeless(out)
+
+
+@pytest.mark.long
+def test_a_node_that_dies_costs_a_merge_only_its_recordings(
+    crossings: list[Path], tmp_path: Path, serial_merge: dict[str, Any], timeless: Files
+) -> None:
+    """One of the nodes is killed in the middle of a recording, after a checkpoint."""
+    out = tmp_path / "out"
+
+    def doomed(nodes: list[Any]) -> Any:
+        _wait_for(lambda: any(map(_has_submaps_open, nodes)), seconds=300.0)
+        return next(filter(_has_submaps_open, nodes))
+
+    with _two_nodes(doomed) as where:
+        outcome = _merge(crossings, out, where)
+    resumed = [warning for warning in outcome.summary.warnings if "the run was resumed once" in warning]
+    assert len(resumed) == 1
+    assert "after 0 scans" not in resumed[0]
+    assert timeless(out) == serial_merge
+
+
+def _has_submaps_open(node: Any) -> bool:
+    """Whether a worker of a node is past the first keyframe of a recording."""
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        workers = psutil.Process(node.all_processes["raylet"][0].process.pid).children(recursive=True)
+        return any(file.path.endswith("submaps.bin") for worker in workers for file in worker.open_files())
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("interruptible")
+def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(
+    crossings: list[Path], tmp_path: Path, serial_merge: dict[str, Any], timeless: Files
+) -> None:
+    out, whole = tmp_path / "out", TIMES * 20
+
+    def interrupt() -> None:
+        _wait_for(lambda: any(out.glob("*/unfinished/state.npz")), seconds=300.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    outcome = _merge(crossings, out, Where(2))
+    scans = [recording.scans for recording in outcome.summary.recordings]
+    assert any(0 < count < whole for count in scans)
+    assert scans[2] == 0
+    assert outcome.stopped[-1].endswith("crossing 2: not begun")
+    assert _merge(crossings, out, Where(2), resume=True).stopped == ()
+    assert timeless(out) == serial_merge
+
+
+def test_a_directory_that_other_machines_do_not_have_is_said(crossings: list[Path], tmp_path: Path) -> None:
+    config = load_config(None, MERGED)
+    request = tracking.RunRequest(crossings[0], tmp_path / "out" / "01_crossing", config)
+    with pytest.raises(OutputError, match="not shared by the nodes"):
+        tracking.track_part(tracking.PartTask(request, "", {}, str(tmp_path), None))
+    assert not (tmp_path / "out").exists()
