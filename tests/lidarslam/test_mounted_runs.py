@@ -75,13 +75,9 @@ def files(directory: Path) -> dict[str, bytes]:
     return {name: (directory / name).read_bytes() for name in ("trajectory.tum", "odometry.tum", "map.ply")}
 
 
-@pytest.fixture(scope="module")
-def rolled(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(recordings["rolled"], tmp_path_factory.mktemp("runs") / "rolled", *CONSTANT)
-
-
 @pytest.mark.long
-def test_results_are_those_of_the_upright_recording(recordings, upright, rolled, tmp_path):
+def test_results_are_those_of_the_upright_recording(recordings, upright, tmp_path):
+    rolled = run(recordings["rolled"], tmp_path / "rolled", *CONSTANT)
     told = run(recordings["rolled"], tmp_path / "told", *CONSTANT, "--set", "reader.mounting=left")
     for directory in (rolled, told):
         assert files(directory) == files(upright)

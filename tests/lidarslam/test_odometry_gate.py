@@ -1,13 +1,13 @@
 """At which scans the odometry is asked, for poses of known motion."""
 
 from collections.abc import Sequence
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.odometry.interface import Motion
 from lidarslam.pipeline.odometry_gate import OdometryGate
@@ -18,28 +18,13 @@ CELL_M = 0.4
 VELOCITY = np.array([0.0, 0.0, 0.2, 5.0, 0.0, 0.0])
 
 
-class Asked:
-    """An odometry that notes the stamps at which it is asked, and those that it skips."""
+def odometry_that_answers() -> Mock:
+    return Mock(**{"estimate.return_value": Motion(np.eye(4), 1), "state.return_value": {}})
 
-    def __init__(self) -> None:
-        self.asked: list[float] = []
-        self.skipped: list[float] = []
 
-    def estimate(self, scan: Scan) -> Motion:
-        self.asked.append(scan.stamp)
-        return Motion(np.eye(4), 1)
-
-    def skip(self, scan: Scan) -> None:
-        self.skipped.append(scan.stamp)
-
-    def state(self) -> State:
-        return {}
-
-    def restore(self, saved: Saved) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
+def stamps_of(method: Mock) -> list[float]:
+    """The stamps of the scans with which a method was called."""
+    return [call.args[0].stamp for call in method.call_args_list]
 
 
 def asked(
@@ -52,18 +37,19 @@ def asked(
 ) -> list[int]:
     """The indices of the scans that are asked for, where each pose comes so many scans late."""
     times = 0.1 * np.arange(len(poses)) if stamps is None else stamps
-    odometry = Asked()
+    odometry = odometry_that_answers()
     gate = OdometryGate(odometry)
     for index, stamp in enumerate(times):
         motion = gate.estimate(Scan(np.ones((0 if index == empty else 5, 3)), float(stamp)))
-        assert motion.is_asked == (float(stamp) in odometry.asked)
+        assert motion.is_asked == (float(stamp) in stamps_of(odometry.estimate))
         done = index - behind + 1
         if done >= 0:
             status = (statuses or {}).get(done, Status.OK)
             result = scan_estimate(float(times[done]), poses[done], status, cell_m=cell_m)
             gate.follow(lambda result=result: result)
-    assert sorted(odometry.asked + odometry.skipped) == times.tolist()
-    return [times.tolist().index(stamp) for stamp in odometry.asked]
+    asked, skipped = stamps_of(odometry.estimate), stamps_of(odometry.skip)
+    assert sorted(asked + skipped) == times.tolist()
+    return [times.tolist().index(stamp) for stamp in asked]
 
 
 def steady(scans: int = 40) -> list[FloatArray]:
@@ -102,7 +88,7 @@ def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked
 
 
 def test_only_results_that_can_matter_are_waited_for() -> None:
-    gate = OdometryGate(Asked())
+    gate = OdometryGate(odometry_that_answers())
     taken = []
     for index, pose in enumerate(steady(12)):
         stamp = 0.1 * index

@@ -85,16 +85,14 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_display")
-def test_no_display_gets_one_line(finished: FinishedRun, tmp_path: Path) -> None:
+def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(
+    finished: FinishedRun, small_recording: Path, tmp_path: Path
+) -> None:
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
         show_in_window(show_runs([finished], None, ViewerConfig()))
     save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
     with pytest.raises(OutputError, match=r"no display .* --web"):
         show_file_in_window(tmp_path / "runs.rrd")
-
-
-@pytest.mark.usefixtures("no_display")
-def test_a_run_with_a_window_and_no_display_ends_before_it_begins(small_recording: Path, tmp_path: Path) -> None:
     request = RunRequest(small_recording, tmp_path / "run", load_config(None), rerun="spawn")
     with pytest.raises(OutputError, match=r"no display .* --rerun web, .* --rerun save"):
         execute(request, lambda *_: None)
