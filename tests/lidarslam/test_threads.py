@@ -1,25 +1,11 @@
-"""Reading ahead, and calls on a thread of their own: in order, bounded, with their errors, no thread left behind."""
+"""Reading ahead, and calls on a thread of their own: in order, bounded, no thread left behind."""
 
 import itertools
 import threading
-from collections.abc import Iterator
 
 import pytest
 
 from lidarslam.pipeline.threads import BackgroundWorker, prefetch
-
-
-def test_an_error_comes_after_the_items_before_it() -> None:
-    def items() -> Iterator[int]:
-        yield 1
-        yield 2
-        raise OSError("disk")
-
-    seen = []
-    with pytest.raises(OSError, match="disk"):
-        for item in prefetch(items()):
-            seen.append(item)
-    assert seen == [1, 2]
 
 
 def test_reads_no_further_ahead_than_it_may_and_leaving_early_ends_the_thread() -> None:
