@@ -7,6 +7,8 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
+ORIGIN = (0.0, 0.0, 0.0)
+
 Box = tuple[Sequence[float], Sequence[float]]  # centre and half size, in metres
 
 
@@ -34,9 +36,23 @@ def on_boxes(boxes: Iterable[Box], area_m2: float, rng: np.random.Generator, noi
     return np.concatenate(parts)
 
 
-def surfel_map_of(points: FloatArray, cell_m: float, sensor: Sequence[float] = (0.0, 0.0, 0.0)) -> SurfelMap:
-    """The map of points (N, 3) seen from one place (3,)."""
-    surfel_map = SurfelMap(cell_m, 100.0)
-    rays = points - np.asarray(sensor)
-    surfel_map.insert(points, np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)), np.asarray(sensor))
+def across_x(rng: np.random.Generator, x: float, half_size: float, count: int) -> FloatArray:
+    """Points (N, 3) on a square piece of a wall across the x axis."""
+    return np.column_stack([np.full(count, x), rng.uniform(-half_size, half_size, (count, 2))])
+
+
+def elevations_of(points: FloatArray) -> FloatArray:
+    """(N,) radians, seen from the origin."""
+    return np.asarray(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
+
+
+def insert(surfel_map: SurfelMap, points: FloatArray, sensor: Sequence[float] = ORIGIN) -> None:
+    """Points (N, 3) seen from one place (3,)."""
+    surfel_map.insert(points, elevations_of(points - np.asarray(sensor)), np.asarray(sensor))
+
+
+def surfel_map_of(points: FloatArray, cell_m: float, radius_m: float = 100.0) -> SurfelMap:
+    """The map of points (N, 3) seen from the origin."""
+    surfel_map = SurfelMap(cell_m, radius_m)
+    insert(surfel_map, points)
     return surfel_map

@@ -1,13 +1,13 @@
-"""Positions of GNSS in the graph, on a drive whose edges drift."""
+"""Trajectories aligned with GNSS tracks, and its positions in the graph of a drive whose edges drift."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.global_map.georeference import GnssTrack, TooFewPositionsError
+from lidarslam.mapping.global_map.georeference import GnssTrack, TooFewPositionsError, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.edges import ProjectedTrack
 from lidarslam.mapping.pose_graph.optimizer import optimise
@@ -61,6 +61,70 @@ def test_positions_take_the_drift_away_and_outliers_are_rejected(track):
 
 def test_positions_outside_of_the_run_are_refused(track):
     later = Trajectory(1000.0 + PERIOD_S * np.arange(SCANS), drive(0.0))
-    with pytest.raises(TooFewPositionsError, match="0 GNSS positions are within the time of the run"):
+    with pytest.raises(TooFewPositionsError, match="0 GNSS positions"):
         track.aligned(later)
     assert track.positions(later, [0]) == []
+
+
+SCALE = 0.9996
+
+
+@pytest.fixture
+def loop() -> Trajectory:
+    """Of 200 m, over a slope."""
+    stamps = 0.1 * np.arange(400)
+    angles = 2.0 * np.pi * stamps / stamps[-1]
+    T = make_transform(
+        exp(np.multiply.outer(angles, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))[:, :3, :3],
+        np.column_stack([32.0 * np.sin(angles), 32.0 * (1.0 - np.cos(angles)), np.sin(angles)]),
+    )
+    return Trajectory(stamps, T)
+
+
+def measured(trajectory: Trajectory, noise_m: float, rng: np.random.Generator) -> tuple[GnssTrack, FloatArray]:
+    """One position in ten scans, between them, and the projected positions."""
+    stamps = trajectory.stamps[:-1:10] + 0.037
+    T = trajectory.at(stamps)
+    antenna = T[:, :3, :3] @ ANTENNA + T[:, :3, 3]
+    projected = SCALE * antenna @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3]
+    projected += rng.normal(0.0, noise_m, projected.shape) if noise_m else 0.0
+    track = GnssTrack(stamps, np.zeros((len(stamps), 3)), np.full(len(stamps), np.nan), ANTENNA)
+    return track, projected
+
+
+def test_the_pose_of_the_world_is_found(loop, rng):
+    track, projected = measured(loop, 0.0, rng)
+    found = align_to_track(loop, track, projected, SCALE)
+    error = inverse(T_MAP_WORLD) @ found.T_map_world
+    assert np.linalg.norm(error[:3, 3]) < 1e-3
+    assert rotation_angle(error) < 1e-4  # the prior of the tilt counts little
+    assert (found.matched, found.rms_m) == (40, pytest.approx(0.0, abs=1e-3))
+    expected = SCALE * loop.positions @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3]
+    np.testing.assert_allclose(found.positions(loop.positions), expected, atol=1e-3)
+
+
+def test_outliers_count_little(loop, rng):
+    """A fifth of the positions are reflections, up to 30 m away to one side."""
+    track, projected = measured(loop, 0.05, rng)
+    projected[::5, 0] += rng.uniform(10.0, 30.0, len(projected[::5]))
+    found = align_to_track(loop, track, projected, SCALE)
+    error = inverse(T_MAP_WORLD) @ found.T_map_world
+    assert np.linalg.norm(error[:3, 3]) < 0.15
+    assert rotation_angle(error) < np.deg2rad(0.3)
+    assert found.median_m < 0.2
+    assert found.rms_m > 5.0
+
+
+def test_a_straight_line_leaves_the_roll_to_the_prior(rng):
+    stamps = 0.1 * np.arange(300)
+    straight = Trajectory(stamps, exp(np.multiply.outer(stamps, [0.0, 0.0, 0.0, 5.0, 0.0, 0.0])))
+    found = align_to_track(straight, *measured(straight, 0.0, rng), SCALE)
+    np.testing.assert_allclose(found.T_map_world[:3, 0], T_MAP_WORLD[:3, 0], atol=1e-3)
+    assert found.T_map_world[2, 2] > 0.998
+
+
+def test_a_short_track_leaves_the_heading_open(loop, rng):
+    track, projected = measured(loop.select(slice(0, 100)), 1.0, rng)
+    assert align_to_track(loop, track, projected, SCALE).heading_sigma_deg > 3.0
+    with pytest.raises(ValueError, match="4 GNSS positions"):
+        align_to_track(loop.select(slice(0, 40)), track, projected, SCALE)

@@ -17,7 +17,7 @@ from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher, measure_fit
 
-from .shapes import surfel_map_of
+from .shapes import elevations_of, on_sides, surfel_map_of
 
 CELL = 0.1
 NOISE_M = 0.008
@@ -28,9 +28,7 @@ T_TRUE = exp([0.0, 0.01, 0.05, 0.3, 0.1, -0.05])
 
 def walls(rng: np.random.Generator, count: int) -> FloatArray:
     """Points on the walls, the floor and the ceiling of 12 m, 2.4 m wide and high."""
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * [6.0, 1.2, 1.2]
-    points[np.arange(count), rng.integers(1, 3, count)] = rng.choice([-1.2, 1.2], count)
-    return points
+    return on_sides(rng, np.array([6.0, 1.2, 1.2]), count, (1, 2))
 
 
 def faces(rng: np.random.Generator, count: int) -> FloatArray:
@@ -47,17 +45,9 @@ def scene(rng: np.random.Generator, on_walls: int, on_each_face: int) -> FloatAr
     return points + rng.normal(scale=NOISE_M, size=points.shape)
 
 
-def elevations(points: FloatArray) -> FloatArray:
-    return np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
-
-
-def map_of(points: FloatArray) -> SurfelMap:
-    return surfel_map_of(points, CELL)
-
-
 @pytest.fixture
 def corridor(rng: np.random.Generator) -> SurfelMap:
-    return map_of(scene(rng, 120_000, 1_000))
+    return surfel_map_of(scene(rng, 120_000, 1_000), CELL)
 
 
 @pytest.fixture
@@ -66,19 +56,25 @@ def keypoints(rng: np.random.Generator) -> FloatArray:
     return transform_points(inverse(T_TRUE), scene(rng, 3_000, 8))
 
 
+@pytest.fixture
+def without_faces(rng: np.random.Generator) -> tuple[SurfelMap, FloatArray]:
+    """A map of walls alone, and keypoints on them."""
+    keypoints = transform_points(inverse(T_TRUE), scene(rng, 3_000, 0))
+    return surfel_map_of(scene(rng, 120_000, 0), CELL), keypoints
+
+
 def test_the_points_on_the_faces_have_the_leverage(rng):
     points = scene(rng, 40_000, 60)
-    chosen = constraining_points(points, elevations(points), 0.5 * CELL, 1_000)
+    chosen = constraining_points(points, elevations_of(points), 0.5 * CELL, 1_000)
     on_face = chosen >= 40_000
     assert on_face.sum() > 0.25 * 60 * len(FACES)
     assert on_face.mean() > 0.6
-    assert len(constraining_points(points, elevations(points), 0.5 * CELL, 50)) == 50
+    assert len(constraining_points(points, elevations_of(points), 0.5 * CELL, 50)) == 50
 
 
 def test_where_everything_constrains_no_point_does_more_than_others(rng):
-    points = rng.uniform(-3.0, 3.0, (40_000, 3))
-    points[np.arange(40_000), rng.integers(0, 3, 40_000)] = rng.choice([-3.0, 3.0], 40_000)
-    assert len(constraining_points(points, elevations(points), 0.5 * CELL, 1_000)) < 40
+    points = on_sides(rng, np.full(3, 3.0), 40_000)
+    assert len(constraining_points(points, elevations_of(points), 0.5 * CELL, 1_000)) < 40
 
 
 @pytest.mark.parametrize("off_m", [-0.2, -0.12, 0.12, 0.2])
@@ -94,27 +90,24 @@ def fit_at(off_m: float, keypoints: FloatArray, surfel_map: SurfelMap) -> Fit:
     return measure_fit(keypoints, T_TRUE @ exp([0.0, 0.0, 0.0, off_m, 0.0, 0.0]), surfel_map)
 
 
-def test_a_scan_that_slid_has_no_evidence_of_the_length(corridor, keypoints):
+def test_a_scan_that_slid_has_no_evidence_of_the_length_nor_has_one_without_faces(corridor, keypoints, without_faces):
     held, slid = (fit_at(off_m, keypoints, corridor) for off_m in (0.0, 0.5))
     assert held.is_constrained
     assert abs(held.weakest[0]) > 0.99
     assert not slid.is_constrained
     assert slid.inlier_ratio == pytest.approx(held.inlier_ratio, abs=0.2)
+    bare_map, bare = without_faces
+    assert not fit_at(0.0, bare, bare_map).is_constrained
 
 
-def test_without_faces_no_pose_has(rng):
-    fit = fit_at(0.0, transform_points(inverse(T_TRUE), scene(rng, 3_000, 0)), map_of(scene(rng, 120_000, 0)))
-    assert not fit.is_constrained
-
-
-def test_what_nothing_constrains_keeps_the_imus_prediction(rng):
+def test_what_nothing_constrains_keeps_the_imus_prediction(without_faces):
     """As uncertain as it was, and it is no measurement."""
-    bare = transform_points(inverse(T_TRUE), scene(rng, 3_000, 0))
-    sampled = SampledScan(0.1, CELL, 3.0, Sweep(bare), elevations(bare), Sweep(bare))
+    bare_map, bare = without_faces
+    sampled = SampledScan(0.1, CELL, 3.0, Sweep(bare), elevations_of(bare), Sweep(bare))
     sigmas = np.array([0.02] * 3 + [0.1, 0.03, 0.03] + [0.1] * 6)
     start = Prediction(0.1, T_TRUE @ exp([0.0, 0.0, 0.01, 0.0, 0.02, 0.0]), np.zeros(6), np.diag(sigmas**2))
     last = MotionState(0.0, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
-    matcher = ScanMatcher(sampled, last, map_of(scene(rng, 120_000, 0)), MappingConfig(), Budget())
+    matcher = ScanMatcher(sampled, last, bare_map, MappingConfig(), Budget())
     found = matcher.register(replace(start, is_inertial=True), coarse_first=False).registration
     error = log(inverse(T_TRUE) @ found.T_world_lidar)
     assert np.linalg.norm(error[3:]) < 0.005

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -11,16 +11,13 @@ from simulated_faults import Faulty, carried_off, covered, index_back
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking import scan_matcher, start_poses
 from lidarslam.mapping.tracking.budget import Budget, Steps
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import Spinning, find_sensor
-from lidarslam.simulation.world import build_world
+
+from .runs import NOTHING, light, simulated
 
 AT, COUNT = 50, 90
 REGISTRATION_MS, SCORE_MS, BUDGET_MS = 20.0, 0.5, 50.0
@@ -46,69 +43,51 @@ class FakeClock:
         return timed
 
 
-def counting(last: int) -> Steps[str]:
-    """A computation of some steps."""
-    for _ in range(last):
+def taking(clock: FakeClock, steps: int, step_ms: float) -> Steps[str]:
+    """A computation whose steps take so long."""
+    for _ in range(steps):
+        clock.s += 1e-3 * step_ms
         yield
     return "done"
 
 
 def test_without_a_budget_no_time_is_ever_spent():
-    clock = FakeClock()
-    budget = Budget(None, clock)
+    budget = Budget(None, clock := FakeClock())
     for _ in range(5):
         budget.begin(0.1)
         clock.s += 1e6
         assert not budget.is_spent
-        assert budget.run(counting(100)) == ("done",)
+        assert budget.run(taking(clock, 100, 1e6)) == ("done",)
 
 
 def test_a_computation_pauses_when_the_time_is_spent_and_goes_on():
-    clock = FakeClock()
-    budget = Budget(10.0, clock)
+    budget = Budget(10.0, clock := FakeClock())
     for _ in range(2):
         budget.begin(0.1)
         clock.s += 1.0
         assert not budget.is_spent  # the first two scans are free
-
-    def slow() -> Steps[int]:
-        for _ in range(25):
-            clock.s += 1e-3
-            yield
-        return 25
-
-    steps, pauses = slow(), 0
-    while True:
+    steps = taking(clock, 25, 1.0)
+    for _ in range(2):
         budget.begin(0.1)
-        done, pauses = budget.run(steps), pauses + 1
-        if done is not None:
-            break
+        assert budget.run(steps) is None
         assert budget.is_spent
-    assert done == (25,)
-    assert pauses == 3
+    budget.begin(0.1)
+    assert budget.run(steps) == ("done",)
 
 
 def test_a_computation_goes_on_even_where_nothing_is_left():
-    clock = FakeClock()
-    budget = Budget(10.0, clock)
+    budget = Budget(10.0, clock := FakeClock())
     for _ in range(3):
         budget.begin(0.1)
     clock.s += 1.0
     assert budget.is_spent
     assert [budget.lets_search_on() for _ in range(4)] == [False, True, False, True]  # at every second scan
-    assert budget.run(taking(clock, 5)) is None
+    assert budget.run(taking(clock, 5, 1.5)) is None
     assert clock.s == pytest.approx(1.003)  # two steps pass a fifth of 10 ms
 
 
-def taking(clock: FakeClock, steps: int) -> Steps[None]:
-    for _ in range(steps):
-        clock.s += 1.5e-3
-        yield
-
-
 def test_auto_is_half_of_the_shorter_of_the_last_two_intervals():
-    clock = FakeClock()
-    budget = Budget("auto", clock)
+    budget = Budget("auto", clock := FakeClock())
     for interval_s, length_s in ((np.inf, np.inf), (0.1, np.inf), (0.1, 0.05), (5.0, 0.05), (0.1, 0.05), (0.2, 0.05)):
         budget.begin(interval_s)
         clock.s += 0.049
@@ -119,12 +98,13 @@ def test_auto_is_half_of_the_shorter_of_the_last_two_intervals():
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    sensor = find_sensor("vlp-16")
-    assert isinstance(sensor.pattern, Spinning)
-    sensor = replace(sensor, pattern=replace(sensor.pattern, columns=sensor.pattern.columns // 4))
-    world = build_world("office", 0)
-    motion = motion_along_route("tracked", world, 0)
-    return Simulation(world, sensor, motion, mount_pose("upright", motion.sensor_height_m), COUNT)
+    return simulated("office", "tracked", light(), COUNT)
+
+
+@pytest.fixture(scope="module")
+def carried(simulation: Simulation) -> Faulty:
+    """Three metres back, and turned."""
+    return carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
 
 
 @pytest.fixture
@@ -133,25 +113,23 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     clock = FakeClock()
     monkeypatch.setattr(scan_matcher, "register", clock.passes(REGISTRATION_MS, scan_matcher.register))
     monkeypatch.setattr(scan_matcher, "with_mean_velocity", lambda registration, *_: registration)
-    for name in ("_distances",):
-        monkeypatch.setattr(start_poses, name, clock.passes(SCORE_MS, getattr(start_poses, name)))
+    monkeypatch.setattr(start_poses, "_distances", clock.passes(SCORE_MS, start_poses._distances))
     return clock
 
 
 def results(mapper: Mapper, faulty: Faulty, clock: FakeClock, first: int = 0) -> Iterator[MappedScan]:
     for scan in faulty.scans[first:]:
         started = clock.s
-        yield mapper.process(mapper.sample(scan), Prior())
+        yield mapper.process(mapper.sample(scan), NOTHING)
         clock.taken_ms.append(1e3 * (clock.s - started))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", ["carried", pytest.param("covered", marks=pytest.mark.slow)])
-def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(simulation, clock, fault):
-    if fault == "carried":
-        faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
-    else:
-        faulty = covered(simulation, AT, AT + 10, "empty")
+def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(
+    simulation, carried, clock, fault
+):
+    faulty = carried if fault == "carried" else covered(simulation, AT, AT + 10, "empty")
     mapper = Mapper(MappingConfig(budget_ms=BUDGET_MS), clock=clock)
     mapped = list(results(mapper, faulty, clock))
     assert max(clock.taken_ms[2:]) <= BUDGET_MS + REGISTRATION_MS + 1e-6
@@ -164,24 +142,21 @@ def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_re
 
 
 @pytest.mark.slow  # follows fifty scans
-def test_without_a_budget_the_same_search_takes_one_scan(simulation, clock):
-    faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
-    mapper = Mapper(MappingConfig(), clock=clock)
-    mapped = list(results(mapper, faulty, clock))
+def test_without_a_budget_the_same_search_takes_one_scan(carried, clock):
+    mapped = list(results(Mapper(MappingConfig(), clock=clock), carried, clock))
     assert max(clock.taken_ms[2:]) > 3 * BUDGET_MS
     assert mapped[AT].message.startswith("relocalised")
 
 
 @pytest.mark.long
-def test_a_search_that_was_under_way_begins_anew_after_a_resumption(simulation, clock):
-    faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
+def test_a_search_that_was_under_way_begins_anew_after_a_resumption(carried, clock):
     config = MappingConfig(budget_ms=BUDGET_MS)
     mapper = Mapper(config, clock=clock)
-    searching = results(mapper, faulty, clock)
+    searching = results(mapper, carried, clock)
     while next(searching).status is not Status.LOST:
         pass
     number = len(clock.taken_ms) + 1
     resumed = Mapper(config, clock=clock)
     resumed.restore(Saved(deepcopy(mapper.state())))
-    mapped = list(results(resumed, faulty, clock, number))
+    mapped = list(results(resumed, carried, clock, number))
     assert [one.status for one in mapped[-5:]] == [Status.OK] * 5

@@ -1,11 +1,13 @@
-"""A trajectory corrected at its keyframes."""
+"""A trajectory corrected at its keyframes, and the graph behind it as g2o text."""
 
+import gtsam
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.trajectory import chain
-from lidarslam.mapping.pose_graph.correction import corrected
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.correction import corrected, format_g2o
 
 FAR = exp([0.2, -0.3, 2.0, 5e5, -3e5, 100.0])
 
@@ -54,19 +56,8 @@ def test_before_the_first_and_after_the_last_the_motion_to_them_is_kept(trajecto
         np.testing.assert_allclose(inverse(poses[key]) @ moved[scans], kept, atol=1e-12)
 
 
-def test_what_is_missing_is_spread_by_the_path():
-    """The second keyframe was 1 m too near; three quarters of the way lie behind the third scan."""
-    moved = corrected(along_x([0.0, 2.0, 6.0, 8.0]), np.array([0, 3]), along_x([0.0, 9.0]))
-    np.testing.assert_allclose(moved, along_x([0.0, 2.25, 6.75, 9.0]), atol=1e-12)
-
-
-def test_standing_still_it_is_spread_by_the_scans():
-    moved = corrected(along_x([3.0] * 5), np.array([0, 4]), along_x([3.0, 4.0]))
-    np.testing.assert_allclose(moved, along_x([3.0, 3.25, 3.5, 3.75, 4.0]), atol=1e-12)
-
-
-def test_stretches_between_keyframes_do_not_mix():
-    """Still in the first, driving in the second."""
+def test_what_is_missing_is_spread_by_the_path_or_standing_still_by_the_scans():
+    """Still before the second keyframe, driving after it; a quarter of that way lies before the fourth scan."""
     moved = corrected(along_x([0.0, 0.0, 0.0, 1.0, 4.0]), np.array([0, 2, 4]), along_x([0.0, 1.0, 7.0]))
     np.testing.assert_allclose(moved, along_x([0.0, 0.5, 1.0, 2.5, 7.0]), atol=1e-12)
 
@@ -81,3 +72,37 @@ def test_a_turn_that_was_missed_is_made_up_for_evenly():
     np.testing.assert_allclose(from_first[2], to_second[2], atol=1e-12)
     np.testing.assert_allclose(from_first[1], to_second[1] / 3.0, atol=1e-12)
     assert np.linalg.norm(from_first[2, :3]) == pytest.approx(0.5 * np.linalg.norm(log(poses[1])[:3]))
+
+
+def random_covariance(rng: np.random.Generator) -> FloatArray:
+    A = rng.normal(size=(6, 6)) * np.array([0.01, 0.02, 0.03, 0.3, 0.2, 0.1])[:, None]
+    return A @ A.T + np.diag([1e-5] * 3 + [1e-3] * 3)
+
+
+def test_gtsam_reads_the_g2o_text_that_is_written(rng, tmp_path):
+    """Poses turned every way, kilometres from the origin, to the last digits."""
+    poses = exp(rng.normal(size=(5, 6)) * [1.0, 1.0, 1.0, 2000.0, 2000.0, 100.0])
+    motions = exp(rng.normal(size=(6, 6)) * [1.0, 1.0, 1.0, 5.0, 5.0, 5.0])
+    ends = [(0, 1), (1, 2), (2, 3), (4, 3), (4, 0), (2, 0)]
+    edges = [RelativePose(*pair, T, random_covariance(rng)) for pair, T in zip(ends, motions, strict=True)]
+    path = tmp_path / "graph.g2o"
+    path.write_text(format_g2o(poses, edges), encoding="utf-8")
+    factors, values = gtsam.readG2o(str(path), True)
+    assert (factors.size(), values.size()) == (6, 5)
+    for key, pose in enumerate(poses):
+        np.testing.assert_allclose(values.atPose3(key).matrix(), pose, atol=1e-9)
+    for row, edge in enumerate(edges):
+        factor = factors.at(row)
+        assert list(factor.keys()) == [edge.first, edge.second]
+        np.testing.assert_allclose(factor.measured().matrix(), edge.T_first_second, atol=1e-9)
+        np.testing.assert_allclose(factor.noiseModel().covariance(), edge.covariance, rtol=1e-7, atol=1e-12)
+
+
+def test_information_is_translation_first_in_g2o_text():
+    covariance = np.diag([1 / 400, 1 / 900, 1 / 1600, 1 / 100, 1 / 25, 1 / 4])
+    _, line = format_g2o(np.eye(4)[None], [RelativePose(0, 1, np.eye(4), covariance)]).splitlines()
+    tag, first, second, *numbers = line.split()
+    assert (tag, first, second) == ("EDGE_SE3:QUAT", "0", "1")
+    assert [float(number) for number in numbers[:7]] == [0, 0, 0, 0, 0, 0, 1]
+    upper = np.array([float(number) for number in numbers[7:]])
+    np.testing.assert_allclose(upper[[0, 6, 11, 15, 18, 20]], [100, 25, 4, 400, 900, 1600])

@@ -26,25 +26,19 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.motion import motion_along, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import Sensor, Spinning, find_sensor
 from lidarslam.simulation.world import World, build_world
+
+from . import runs
+from .runs import light, poses_of, simulated
+from .shapes import on_sides
 
 AT = 70
 COUNT = 100
-NOTHING = Prior()
-
-
-def light(name: str = "vlp-16") -> Sensor:
-    """A sensor with a quarter of its columns, for speed."""
-    sensor = find_sensor(name)
-    assert isinstance(sensor.pattern, Spinning)
-    return replace(sensor, pattern=replace(sensor.pattern, columns=sensor.pattern.columns // 4))
 
 
 @pytest.fixture(autouse=True)
@@ -59,15 +53,13 @@ def office() -> World:
 
 @pytest.fixture(scope="module")
 def drive_by(office: World) -> Simulation:
-    motion = motion_along_route("tracked", office, 0)
-    return Simulation(office, light(), motion, mount_pose("upright", motion.sensor_height_m), COUNT)
+    return simulated(office, "tracked", light(), COUNT)
 
 
 @pytest.fixture(scope="module")
 def _followed(drive_by: Simulation) -> Mapper:
     mapper = Mapper(MappingConfig())
-    for scan in drive_by.scans(0, AT):
-        mapper.process(mapper.sample(scan), NOTHING)
+    runs.process(mapper, list(drive_by.scans(0, AT)))
     return mapper
 
 
@@ -78,16 +70,13 @@ def mapper(_followed: Mapper) -> Mapper:
 
 
 def process(mapper: Mapper, recorded: Faulty, first: int = AT) -> list[MappedScan]:
-    return [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans[first:]]
+    return runs.process(mapper, recorded.scans[first:])
 
 
 def errors(results: list[MappedScan], recorded: Faulty, first: int = AT) -> tuple[FloatArray, FloatArray]:
     """Metres (N,) and degrees (N,) off the truth, whose world is the first scan's frame."""
     truth = recorded.truth.T_world_lidar
-    off = inverse(inverse(truth[0]) @ truth[first : first + len(results)]) @ np.array(
-        [result.state.T_world_lidar for result in results]
-    )
-    return np.linalg.norm(off[:, :3, 3], axis=1), np.rad2deg(rotation_angle(off))
+    return runs.errors(poses_of(results), inverse(truth[0]) @ truth[first : first + len(results)])
 
 
 def assert_nothing_wrong_is_believed(results: list[MappedScan], recorded: Faulty) -> None:
@@ -139,7 +128,7 @@ def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(mapper, drive_by, 
 def test_a_first_scan_of_stray_points_begins_no_map(drive_by):
     recorded = covered(drive_by, 0, 3, "stray")
     mapper = Mapper(MappingConfig())
-    results = [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans[:3]]
+    results = runs.process(mapper, recorded.scans[:3])
     assert [result.status for result in results] == [Status.LOST] * 3
     assert mapper.local_map is None
     assert "only 25 points" in results[0].message
@@ -164,17 +153,13 @@ def test_carried_5_m_back_it_finds_itself_in_its_map(mapper, drive_by, turned_de
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
 def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper, drive_by):
     """In a tunnel it begins a map that is told to be a guess; back in the office, it is in its first map again."""
-    tunnel = build_world("tunnel", 0)
-    motion = motion_along_route("tracked", tunnel, 0)
-    away = Simulation(tunnel, light(), motion, mount_pose("upright", motion.sensor_height_m), 20)
-    there = [replace(scan, stamp=0.1 * (AT + k)) for k, scan in enumerate(away.scans())]
-    results = [mapper.process(mapper.sample(scan), NOTHING) for scan in there]
+    away = simulated("tunnel", "tracked", light(), 20)
+    results = runs.process(mapper, [replace(scan, stamp=0.1 * (AT + k)) for k, scan in enumerate(away.scans())])
     assert Status.OK not in {result.status for result in results}
     assert "a new map begins here" in results[4].message
     assert "in a new map" in results[-1].message
     assert results[-1].added
-    again = [replace(scan, stamp=scan.stamp + 2.0) for scan in drive_by.scans(AT, COUNT)]
-    back = [mapper.process(mapper.sample(scan), NOTHING) for scan in again]
+    back = runs.process(mapper, [replace(scan, stamp=scan.stamp + 2.0) for scan in drive_by.scans(AT, COUNT)])
     recorded = Faulty((), drive_by.ground_truth, np.zeros(COUNT, dtype=np.bool_), AT)
     assert Status.OK in {result.status for result in back}
     assert_nothing_wrong_is_believed([r if r.status is Status.OK else replace(r, added=False) for r in back], recorded)
@@ -240,10 +225,9 @@ def test_nothing_drifts_while_the_sensor_stands_still(name):
     turned_deg = []
     for seed in range(3):
         recorded = stand(build_world(name, seed), 50)
-        mapper = Mapper(MappingConfig())
-        results = [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans]
+        results = process(Mapper(MappingConfig()), recorded, 0)
         assert {result.status for result in results} == {Status.OK}
-        poses = np.array([result.state.T_world_lidar for result in results])
+        poses = poses_of(results)
         drift = inverse(poses[10]) @ poses[40:]
         assert np.linalg.norm(drift[:, :3, 3].mean(axis=0)) < 0.01
         turned_deg.append(np.rad2deg(rotation_angle(drift)).mean())
@@ -253,8 +237,7 @@ def test_nothing_drifts_while_the_sensor_stands_still(name):
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
 def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office):
     recorded = stand(office, 80, np.array([0.8, -0.8, 0.9, -0.9, 1.0, -1.1, 1.2]))
-    mapper = Mapper(MappingConfig())
-    results = [mapper.process(mapper.sample(scan), NOTHING) for scan in recorded.scans]
+    results = process(Mapper(MappingConfig()), recorded, 0)
     metres, degrees = errors(results, recorded, 0)
     assert {result.status for result in results} == {Status.OK}
     assert metres.max() < 0.03
@@ -271,11 +254,8 @@ def test_an_even_tunnel_is_told_to_say_nothing_along_it():
     x = simulation.ground_truth.positions[:, 0]
     nothing = (x > 33.0) & (x < 39.0)
     assert nothing.sum() > 10
-    mapper = Mapper(MappingConfig())
-    results = [
-        mapper.process(mapper.sample(scan), NOTHING)
-        for scan in simulation.scans(0, int(np.flatnonzero(nothing)[-1]) + 1)
-    ]
+    scans = list(simulation.scans(0, int(np.flatnonzero(nothing)[-1]) + 1))
+    results = runs.process(Mapper(MappingConfig()), scans)
     concerned = [result for result, here in zip(results, nothing[: len(results)], strict=True) if here]
     assert {result.status for result in concerned} == {Status.DEGRADED}
     assert all("x" in result.degenerate for result in concerned)
@@ -284,16 +264,7 @@ def test_an_even_tunnel_is_told_to_say_nothing_along_it():
 
 def test_a_scan_that_fits_two_places_alike_is_at_neither(rng):
     """A plain room looks the same after half a turn."""
-    half = np.array([5.0, 3.0, 1.5])
-
-    def walls(count: int) -> FloatArray:
-        points = rng.uniform(-1.0, 1.0, (count, 3)) * half
-        axis = rng.integers(0, 3, count)
-        points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * half[axis]
-        return points
-
-    mapper = Mapper(MappingConfig())
-    for k in range(10):
-        mapper.process(mapper.sample(Scan(walls(8_000), 0.1 * k)), NOTHING)
-    carried = Scan(walls(8_000) - np.array([2.5, 1.0, 0.0]), 1.0)
-    assert mapper.process(mapper.sample(carried), NOTHING).status is Status.LOST
+    walls = [on_sides(rng, np.array([5.0, 3.0, 1.5]), 8_000) for _ in range(11)]
+    walls[-1] -= np.array([2.5, 1.0, 0.0])
+    results = runs.process(Mapper(MappingConfig()), [Scan(points, 0.1 * k) for k, points in enumerate(walls)])
+    assert results[-1].status is Status.LOST

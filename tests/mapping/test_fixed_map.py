@@ -1,20 +1,21 @@
 """Localisation in a finished map: a box-shaped room with pillars, mapped from its true surfaces."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
+from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
 from lidarslam.mapping.localization.place_search import FixedMap
-from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+
+from . import runs
+from .runs import poses_of, process
 
 # The map's frame is neither that of the room nor that of a recording.
 T_MAP_ROOM = exp([0.01, -0.02, 2.0, 20.0, -7.0, 1.5])
@@ -44,16 +45,9 @@ def draw_map(room: Any) -> FixedMap:
     return FixedMap(cloud.points, cloud.normals)
 
 
-def localise(localiser: MapLocaliser, scans: Sequence[Scan]) -> list[MappedScan]:
-    """Without an odometry."""
-    return [localiser.process(localiser.sample(scan), Prior()) for scan in scans]
-
-
 def errors(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Metres and degrees (N,) off the truth of the first N scans of `scan_along`."""
-    truth = T_MAP_ROOM @ T_room_lidar_at(0.1 * np.arange(len(poses)))
-    off = inverse(truth) @ poses
-    return np.linalg.norm(off[:, :3, 3], axis=1), np.rad2deg(rotation_angle(off))
+    return runs.errors(poses, T_MAP_ROOM @ T_room_lidar_at(0.1 * np.arange(len(poses))))
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +58,19 @@ def room(room: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def room_map(room: Any) -> FixedMap:
-    """The map of the room."""
     return draw_map(room)
+
+
+@pytest.fixture(scope="module")
+def other_room(room: Any) -> Any:
+    return type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
 
 
 @pytest.fixture(scope="module")
 def localised(room: Any, room_map: FixedMap) -> tuple[MapLocaliser, list[MappedScan]]:
     """A recording of the room."""
     localiser = MapLocaliser(MappingConfig(), room_map)
-    return localiser, localise(localiser, scan_along(room))
+    return localiser, process(localiser, scan_along(room))
 
 
 def test_is_found_without_a_guess_and_tracked(localised):
@@ -80,8 +78,7 @@ def test_is_found_without_a_guess_and_tracked(localised):
     (found,) = localiser.found
     assert found.scan < 15
     assert found.confirmed - found.scan >= 10
-    poses = np.array([one.state.T_world_lidar for one in mapped])
-    off_m, off_deg = errors(poses)
+    off_m, off_deg = errors(poses_of(mapped))
     assert off_m[found.scan :].max() < 0.03
     assert off_deg[found.scan :].max() < 0.5
     assert [one.status for one in mapped[found.confirmed :]] == [Status.OK] * (SCANS - found.confirmed)
@@ -98,10 +95,9 @@ def test_scans_before_the_place_are_placed_by_the_recordings_own_map(localised):
 
 
 @pytest.mark.long
-def test_another_room_is_refused_with_a_reason(room, room_map):
-    other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
+def test_another_room_is_refused_with_a_reason(other_room, room_map):
     localiser = MapLocaliser(MappingConfig(), room_map)
-    mapped = localise(localiser, scan_along(other))
+    mapped = process(localiser, scan_along(other_room))
     assert not localiser.found
     assert {one.status for one in mapped} == {Status.LOST}
     assert localiser.refusals
@@ -114,22 +110,21 @@ def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room):
     empty_map = draw_map(empty)
     localiser = MapLocaliser(MappingConfig(), empty_map)
     scans = scan_along(empty)
-    localise(localiser, scans)
+    process(localiser, scans)
     assert not localiser.found
     assert any("fit alike" in reason for _, reason in localiser.refusals)
     x, y = (T_MAP_ROOM @ T_room_lidar_at(np.zeros(1))[0])[:2, 3] + [0.4, -0.3]
     guided = MapLocaliser(MappingConfig(), empty_map, guess=(x, y, 2.0 + 2.4 + np.deg2rad(10.0)))
-    mapped = localise(guided, scans)
+    mapped = process(guided, scans)
     assert len(guided.found) == 1
-    off_m, _ = errors(np.array([one.state.T_world_lidar for one in mapped]))
+    off_m, _ = errors(poses_of(mapped))
     assert off_m[guided.found[0].scan :].max() < 0.05
 
 
 @pytest.mark.long
-def test_a_place_that_later_scans_contradict_is_given_up(room, room_map):
-    other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
+def test_a_place_that_later_scans_contradict_is_given_up(room, other_room, room_map):
     localiser = MapLocaliser(MappingConfig(), room_map)
-    mapped = localise(localiser, [*scan_along(room, 8), *scan_along(other, 20)[8:]])
+    mapped = process(localiser, [*scan_along(room, 8), *scan_along(other_room, 20)[8:]])
     first = next(number for number, one in enumerate(mapped) if one.status is not Status.LOST)
     assert not localiser.found
     assert first in localiser.unconfirmed()
@@ -140,8 +135,8 @@ def test_a_covered_sensor_is_lost_and_tracked_again(room, room_map):
     scans = scan_along(room, 40)
     nothing = [Scan(np.empty((0, 3)), scan.stamp, np.empty(0)) for scan in scans[28:33]]
     localiser = MapLocaliser(MappingConfig(), room_map)
-    mapped = localise(localiser, [*scans[:28], *nothing, *scans[33:]])
+    mapped = process(localiser, [*scans[:28], *nothing, *scans[33:]])
     assert [one.status for one in mapped[28:33]] == [Status.LOST] * 5
     assert mapped[-1].status is Status.OK
-    off_m, _ = errors(np.array([one.state.T_world_lidar for one in mapped]))
+    off_m, _ = errors(poses_of(mapped))
     assert off_m[-3:].max() < 0.03

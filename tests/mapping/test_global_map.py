@@ -1,9 +1,112 @@
-"""The merged map: averages, normals, and memory that follows the area."""
+"""The merged map: means and normals, and what its voxels say of intensity, colour, ring and time."""
 
 import numpy as np
 import pytest
 
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import PointAttributes
+from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.global_map.voxels import COUNT
+
+from .shapes import across_x
+
+VOXEL_M = 0.5
+EPOCH = 1_700_000_000.0
+
+
+def some(rng: np.random.Generator, count: int, number: int, names: str = "intensity rgb ring time") -> PointAttributes:
+    """Attributes of a scan's points; every fifth has no intensity."""
+    intensity = rng.uniform(0.0, 65535.0, count).astype(np.float32)
+    intensity[::5] = np.nan
+    known = PointAttributes(
+        intensity=intensity,
+        rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        ring=rng.integers(0, 128, count).astype(np.int32),
+        time=EPOCH + 0.1 * number + rng.permutation(count) * 1e-4,
+    )
+    return known.only(names.split())
+
+
+def cells(points: FloatArray) -> list[tuple[int, ...]]:
+    return [tuple(cell) for cell in np.floor(points / VOXEL_M).astype(int).tolist()]
+
+
+def test_equals_a_dictionary_of_voxels(rng, monkeypatch):
+    """Scans with all, some and none of the attributes, merged many times; later ones bring new attributes."""
+    monkeypatch.setattr(module, "_MIN_PENDING", 500)
+    grid, plain = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
+    intensities: dict[tuple[int, ...], list[float]] = {}
+    colours: dict[tuple[int, ...], list[FloatArray]] = {}
+    firsts: dict[tuple[int, ...], tuple[float, int]] = {}
+    for number in rng.permutation(30):  # so that the earliest point may come last
+        points, T = rng.normal(0.0, 1.5, (200, 3)), exp(rng.normal(0.0, 0.3, 6))
+        wanted = "" if number < 5 else "intensity" if number < 10 else "intensity rgb ring time"
+        known = some(rng, len(points), int(number), wanted)
+        grid.add(points, T, known)
+        plain.add(points, T)
+        for n, cell in enumerate(cells(points @ T[:3, :3].T + T[:3, 3])):
+            if known.intensity is not None and np.isfinite(known.intensity[n]):
+                intensities.setdefault(cell, []).append(float(known.intensity[n]))
+            if known.rgb is not None:
+                colours.setdefault(cell, []).append(known.rgb[n].astype(float))
+            if known.time is not None and known.ring is not None:
+                first = float(known.time[n]), int(known.ring[n])
+                firsts[cell] = min(firsts.get(cell, (np.inf, -1)), first)
+    cloud = grid.cloud()
+    np.testing.assert_array_equal(cloud.points, plain.cloud().points)
+    np.testing.assert_array_equal(cloud.normals, plain.cloud().normals)
+    found = cloud.attributes
+    kinds = set()
+    for n, cell in enumerate(cells(cloud.points)):
+        kinds.add((cell in intensities, cell in colours))
+        np.testing.assert_allclose(found.intensity[n], np.mean(intensities.get(cell, [np.nan])), rtol=1e-5)
+        np.testing.assert_allclose(found.rgb[n], np.mean(colours.get(cell, [np.zeros(3)]), axis=0), atol=0.501)
+        time, ring = firsts.get(cell, (np.inf, -1))
+        assert found.ring[n] == ring
+        assert found.time[n] == time or abs(found.time[n] - time) < 1e-5
+    assert kinds >= {(True, True), (True, False), (False, False)}
+
+
+def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng):
+    poses = [exp([0.0, 0.0, 0.0, x, 0.0, 0.0]) for x in (0.0, 2.0, 4.0)]  # whole voxels, so that they are cut alike
+    direct, drawn = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
+    for number, (pose, names) in enumerate(zip(poses, ("", "intensity", "intensity rgb ring time"), strict=True)):
+        submap = GlobalMap(VOXEL_M)
+        for half in range(2):
+            points = rng.uniform(-3.0, 3.0, (1000, 3))
+            known = some(rng, len(points), 2 * number + half, names)
+            submap.add(points, np.eye(4), known)
+            direct.add(points, pose, known)
+        drawn.add_means(submap.means(), pose)
+    np.testing.assert_allclose(drawn.points(), direct.points(), atol=1e-5)
+    np.testing.assert_array_equal(drawn.means().rows[:, COUNT], direct.means().rows[:, COUNT])
+    np.testing.assert_allclose(drawn.cloud().normals, direct.cloud().normals, atol=1e-3)
+    expected = dict(direct.cloud().attributes.present())
+    assert len(expected) == 4
+    for name, values in drawn.cloud().attributes.present():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-5, atol=1.0 if name == "rgb" else 1e-5)
+
+
+def test_attributes_go_on(rng, through_disk, monkeypatch):
+    """A map that is saved and restored in between is the whole one, to the last bit."""
+    monkeypatch.setattr(module, "_MIN_PENDING", 1500)
+    scans = [
+        (rng.uniform(-3.0, 3.0, (1000, 3)), some(rng, 1000, number, names))
+        for number, names in enumerate(("", "intensity", "intensity", "intensity rgb ring time", "rgb"))
+    ]
+    whole = GlobalMap(VOXEL_M)
+    for points, known in scans:
+        whole.add(points, np.eye(4), known)
+    for after in range(len(scans)):
+        part, restored = GlobalMap(VOXEL_M), GlobalMap(1.0)
+        for points, known in scans[:after]:
+            part.add(points, np.eye(4), known)
+        restored.restore(through_disk(part.state()))
+        for points, known in scans[after:]:
+            restored.add(points, np.eye(4), known)
+        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
+        assert restored.means().layout == whole.means().layout
 
 
 def test_precision_does_not_suffer_far_from_the_origin():
@@ -15,8 +118,7 @@ def test_precision_does_not_suffer_far_from_the_origin():
 
 def test_normals_face_the_sensor(rng):
     grid = GlobalMap(0.2)
-    wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-2.0, 2.0, (4_000, 2))])
-    floor = np.column_stack([rng.uniform(-2.0, 2.0, (4_000, 2)), np.full(4_000, -1.0)])
+    wall, floor = across_x(rng, 3.0, 2.0, 4_000), across_x(rng, -1.0, 2.0, 4_000)[:, [1, 2, 0]]
     grid.add(np.concatenate([wall, floor]), np.eye(4))
     cloud = grid.cloud()
     on_wall = cloud.points[:, 0] > 2.9
@@ -30,3 +132,14 @@ def test_the_voxel_size_follows_the_scene(rng, half_size, voxel):
     directions = rng.normal(size=(2_000, 3))
     sphere = 1.2 * half_size * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     assert voxel_size_for(sphere) == pytest.approx(voxel)
+
+
+def test_views_turn_with_the_submap():
+    """A floor seen from above is seen from the side once the submap is tipped over."""
+    grid = np.stack(np.meshgrid(np.arange(0.05, 3.0, 0.1), np.arange(0.05, 3.0, 0.1), [-1.0]), axis=-1).reshape(-1, 3)
+    submap = GlobalMap(0.1)
+    submap.add(grid, np.eye(4))
+    for tip, expected in ((0.0, [0.0, 0.0, 1.0]), (0.5 * np.pi, [0.0, -1.0, 0.0])):
+        drawn = GlobalMap(0.1)
+        drawn.add_means(submap.means(), exp([tip, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        np.testing.assert_allclose(drawn.cloud().normals.mean(axis=0), expected, atol=1e-6)

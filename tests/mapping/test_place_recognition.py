@@ -1,13 +1,16 @@
-"""Bird's-eye views of places: turned, moved and tilted, they are recognised; others are not."""
+"""Sparse submaps and their bird's-eye views: turned, moved and tilted, places are recognised; others are not."""
+
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
-from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, _level_rotation
+from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, SubmapFile, _level_rotation
 
-from .shapes import on_boxes
+from .runs import assert_near
+from .shapes import on_boxes, on_sides
 
 RADIUS_M = 16.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])
@@ -67,19 +70,14 @@ def test_laid_over_one_another(hall, T_target_source):
     target, source = submap(hall, HOME), submap(hall, HOME @ true)
     _, turn = similarity(target, source)
     T, score = align(BirdEyeView.of(target), BirdEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
-    error = inverse(true) @ T
-    assert np.linalg.norm(error[:3, 3]) < 0.6
-    assert np.rad2deg(rotation_angle(error)) < 4.0
+    assert_near(T, true, 0.6, 4.0)
     assert 0.5 < score <= 1.0
 
 
 def test_of_repeated_places_the_expected_one_counts():
     pillars = np.concatenate([[[4.0 * i, s * 3.0, 0.0]] for i in range(-6, 7) for s in (-1, 1)])
-    points = pillars.repeat(80, axis=0) + np.random.default_rng(0).uniform(-0.2, 0.2, (80 * len(pillars), 3)) * [
-        1,
-        1,
-        8,
-    ]
+    points = pillars.repeat(80, axis=0)
+    points += np.random.default_rng(0).uniform(-0.2, 0.2, points.shape) * [1, 1, 8]
     target = source = BirdEyeView(points[:, :2], points[:, 2], np.eye(3))
     for x in (-4.0, 0.0, 4.0):
         T, _ = align(target, source, np.zeros(1), RADIUS_M, np.array([x + 0.5, 0.0]), 3.0)
@@ -89,11 +87,8 @@ def test_of_repeated_places_the_expected_one_counts():
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_the_sensor_is_stood_upright(hall, tilt_deg, upside_down):
-    T = (
-        HOME
-        @ (UPSIDE_DOWN if upside_down else np.eye(4))
-        @ exp([0.3 * np.deg2rad(tilt_deg), np.deg2rad(tilt_deg), 0, 0, 0, 0])
-    )
+    mounted = HOME @ UPSIDE_DOWN if upside_down else HOME
+    T = mounted @ exp([0.3 * np.deg2rad(tilt_deg), np.deg2rad(tilt_deg), 0, 0, 0, 0])
     level = submap(hall, T).R_level_lidar
     up = level @ T[:3, :3].T @ [0.0, 0.0, 1.0]
     assert up == pytest.approx([0.0, 0.0, -1.0 if upside_down else 1.0], abs=0.03)
@@ -146,3 +141,20 @@ def test_memory_of_a_submap_is_bounded():
     found = SparseSubmap.of(points, 60.0)
     assert len(found) == 2500
     assert sum(array.nbytes for array in vars(found).values() if isinstance(array, np.ndarray)) < 70_000
+
+
+def test_submaps_come_back_from_their_file_to_the_last_bit(rng, tmp_path):
+    kept = SubmapFile(tmp_path)
+    given = [SparseSubmap.of(on_sides(rng, np.full(3, 6.0), points), 100.0) for points in (2001, 0, 7, 900)]
+    for one in given:
+        kept.append(one)
+        assert len(kept[-1]) == len(one)
+    assert len(kept) == len(given)
+    assert not list(tmp_path.iterdir())
+    for one, other in zip(kept, given, strict=True):
+        for field in fields(SparseSubmap):
+            a, b = np.asarray(getattr(one, field.name)), np.asarray(getattr(other, field.name))
+            assert a.dtype == b.dtype, field.name
+            assert np.array_equal(a, b), field.name
+    with pytest.raises(IndexError):
+        kept[len(given)]

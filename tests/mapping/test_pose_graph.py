@@ -8,9 +8,9 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import chain
-from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.edges import Attitude, first_connected
-from lidarslam.mapping.pose_graph.optimizer import _LEAST, bounded, optimise, relax
+from lidarslam.mapping.pose_graph.optimizer import _LEAST, RelaxSchedule, bounded, optimise, relax
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2
 TIGHT = np.diag([0.002, 0.001, 0.003, 0.03, 0.02, 0.01]) ** 2
@@ -204,8 +204,8 @@ def test_a_chain_that_is_loose_in_some_directions_can_be_solved(variances):
     assert_near(optimise(truth, edges, loops).poses, truth, 1e-6)
 
 
-def test_a_good_covariance_is_kept():
-    A = np.random.default_rng(3).normal(size=(6, 6)) * 0.1
+def test_a_good_covariance_is_kept(rng):
+    A = rng.normal(size=(6, 6)) * 0.1
     np.testing.assert_allclose(bounded(A @ A.T), A @ A.T, rtol=1e-12)
     np.testing.assert_allclose(bounded(np.zeros((6, 6))), np.diag(_LEAST**2), rtol=1e-12)
 
@@ -261,3 +261,34 @@ def test_an_attitude_leaves_the_heading_alone():
     truth = np.stack([np.eye(4), exp([0.0, 0.0, 2.0, 1.0, 0.0, 0.0])])
     edges, up = chained(truth), np.array([0.0, 0.0, 1.0])
     assert_near(optimise(truth, edges, [], [Attitude(1, up, up, 1e-3)]).poses, truth, 1e-6)
+
+
+def closure(second: int, off_m: float = 1.0, reason: str = "") -> LoopClosure:
+    T = exp([0.0, 0.0, 0.0, off_m, 0.0, 0.0])
+    return LoopClosure(0, second, T, 1e-4 * np.eye(6), 0.9, 0.01, 0.9, False, 2, reason)
+
+
+def dues(keyframes: range, off_m: float = 1.0, reason: str = "") -> list[int]:
+    """The numbers of keyframes at which it is due, with a closure at each."""
+    schedule = RelaxSchedule()
+    return [n for n in keyframes if schedule.is_due([closure(n - 1, off_m, reason)], [np.eye(4)] * n)]
+
+
+def test_a_small_graph_is_optimised_at_every_closure_that_contradicts_it():
+    assert dues(range(50, 100)) == list(range(50, 100))
+    assert dues(range(50, 100), off_m=0.005) == []
+    assert dues(range(50, 100), reason="overlap") == []
+
+
+def test_the_wait_grows_with_the_graph():
+    found = dues(range(4000, 4200))
+    assert found[0] == 4000
+    assert set(np.diff(found).tolist()) <= {41, 42}
+
+
+def test_a_closure_that_had_to_wait_is_not_forgotten():
+    schedule, poses = RelaxSchedule(), [np.eye(4)] * 4100
+    assert schedule.is_due([closure(3999)], poses[:4000])
+    assert not schedule.is_due([closure(4000)], poses[:4001])
+    due = [n for n in range(4002, 4100) if schedule.is_due([], poses[:n])]
+    assert due == [4041]

@@ -1,27 +1,32 @@
-"""The motions of the first scans, of simulated sensors whose motion is known."""
+"""The motions of the first scans of simulated sensors, a single sweep of which may make no map."""
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
-from lidarslam.simulation.motion import mount_pose
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
+
+from .runs import NOTHING, poses_of, process, simulated
+
+
+def true_poses(simulation: Simulation, scans: list[Scan]) -> FloatArray:
+    """(N, 4, 4) at the stamps of scans."""
+    return np.asarray(simulation.ground_truth.at(np.array([scan.stamp for scan in scans]), 0.2), dtype=np.float64)
 
 
 def walk(sensor: str, start: int, count: int = 25, name: str = "office") -> tuple[list[Scan], FloatArray]:
     """Scans of a legged robot, and the motions (N, 4, 4) between them."""
-    world = build_world(name, 1)
-    motion = motion_along_route("legged", world, 1)
-    simulation = Simulation(world, find_sensor(sensor), motion, mount_pose("upright", motion.sensor_height_m), 200)
+    simulation = simulated(name, "legged", find_sensor(sensor), 200, seed=1)
     scans = list(simulation.scans(start, start + count))
-    T_map_lidar = simulation.ground_truth.at(np.array([scan.stamp for scan in scans]), 0.2)
-    return scans, np.asarray(inverse(T_map_lidar[:-1]) @ T_map_lidar[1:], dtype=np.float64)
+    T_map_lidar = true_poses(simulation, scans)
+    return scans, inverse(T_map_lidar[:-1]) @ T_map_lidar[1:]
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +63,19 @@ def test_too_few_scans_are_left_as_they_are(strokes):
     scans, _ = strokes
     assert smoothed_start(scans[:5], MappingConfig()) == {}
     assert smoothed_start([], MappingConfig()) == {}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_drone_takes_off(seed):
+    simulation = simulated("street", "drone-agile", find_sensor("mid-360"), 30, seed)
+    scans = list(simulation.scans())
+    smoothed = smoothed_start(scans, MappingConfig())
+    motions = [smoothed.get(scan.stamp) for scan in scans]
+    priors = [NOTHING if one is None else Prior(one.T_prev_curr, one.velocity, one.covariance) for one in motions]
+    results = process(Mapper(MappingConfig()), scans, priors)
+    truth, estimated = true_poses(simulation, scans), poses_of(results)
+    steps = inverse(inverse(truth[:-1]) @ truth[1:]) @ inverse(estimated[:-1]) @ estimated[1:]
+    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.1
+    assert np.linalg.norm((inverse(truth[0]) @ truth[-1] - estimated[-1])[:3, 3]) < 0.5
+    assert Status.LOST not in {result.status for result in results}

@@ -11,11 +11,11 @@ from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
+
+from .runs import errors, poses_of, simulated
+from .runs import process as mapped
 
 COUNT = 12
 # What an odometry states of itself: a tenth of a degree and a centimetre.
@@ -24,9 +24,7 @@ STATED = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3) ** 2)
 
 @pytest.fixture(scope="module")
 def at_speed() -> Simulation:
-    world = build_world("street", 0)
-    motion = motion_along_route("car-fast", world, 0)
-    return Simulation(world, find_sensor("vlp-16"), motion, mount_pose("upright", motion.sensor_height_m), COUNT)
+    return simulated("street", "car-fast", find_sensor("vlp-16"), COUNT)
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +39,12 @@ def truth(at_speed: Simulation, scans: list[Scan]) -> FloatArray:
 
 
 def process(scans: list[Scan], motions: list[FloatArray | None]) -> list[MappedScan]:
-    mapper = Mapper(MappingConfig())
     priors = [Prior() if motion is None else Prior(motion, covariance=STATED) for motion in motions]
-    return [mapper.process(mapper.sample(scan), prior) for scan, prior in zip(scans, priors, strict=True)]
+    return mapped(Mapper(MappingConfig()), scans, priors)
 
 
 def worst_m(results: list[MappedScan], truth: FloatArray) -> float:
-    estimated = np.array([result.state.T_world_lidar for result in results])
-    return float(np.linalg.norm((inverse(truth) @ estimated)[:, :3, 3], axis=1).max())
+    return float(errors(poses_of(results), truth)[0].max())
 
 
 @pytest.mark.long

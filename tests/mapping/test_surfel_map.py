@@ -8,24 +8,19 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
-from .shapes import on_sides, surfel_map_of
+from .shapes import across_x, insert, on_sides, surfel_map_of
 
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
-ORIGIN = np.zeros(3)
 HERE = np.eye(4)
 
 
-def elevations_of(points: FloatArray) -> FloatArray:
-    return np.asarray(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
-
-
-def map_of(points: FloatArray, cell_m: float = CELL) -> SurfelMap:
-    return surfel_map_of(points, cell_m)
+def map_of(points: FloatArray) -> SurfelMap:
+    return surfel_map_of(points, CELL)
 
 
 def floor_points(rng: np.random.Generator, count: int, half_size: float = 4.0, z: float = -1.0) -> FloatArray:
-    return np.column_stack([rng.uniform(-half_size, half_size, (count, 2)), np.full(count, z)])
+    return across_x(rng, z, half_size, count)[:, [1, 2, 0]]
 
 
 def ring(elevation_deg: float, walls: tuple[float, float] | None = None, z: float | None = None) -> FloatArray:
@@ -56,10 +51,8 @@ def test_points_on_walls_meet_the_walls(rng):
 
 
 def test_where_fine_cells_show_nothing_coarse_ones_do(rng):
-    sparse = floor_points(rng, 150)
     asked = floor_points(rng, 300, half_size=3.0)
-    local_map = map_of(sparse)
-    matches = local_map.match(asked, HERE)
+    matches = map_of(floor_points(rng, 150)).match(asked, HERE)
     np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
     assert distances(asked, matches).max() < 1e-5
 
@@ -99,13 +92,11 @@ def test_two_rings_on_walls_show_them():
 
 
 def test_the_map_stays_around_the_sensor(rng):
-    local_map = SurfelMap(CELL, 20.0)
-    floor = floor_points(rng, 20_000, half_size=3.0)
-    local_map.insert(floor, elevations_of(floor), ORIGIN)
-    away = floor + np.array([30.0, 0.0, 0.0])
-    local_map.insert(away, elevations_of(floor), np.array([30.0, 0.0, 0.0]))
+    floor, far = floor_points(rng, 20_000, half_size=3.0), np.array([30.0, 0.0, 0.0])
+    local_map, away = surfel_map_of(floor, CELL, radius_m=20.0), floor + far
+    insert(local_map, away, far)
     assert len(local_map.match(floor[:200], HERE)) == 0
-    assert len(local_map.match(away[:200], make_transform(np.eye(3), [30.0, 0.0, 0.0]))) == 200
+    assert len(local_map.match(away[:200], make_transform(np.eye(3), far))) == 200
 
 
 @pytest.mark.parametrize("factor", [0.45, 0.8, 2.0])
@@ -137,25 +128,23 @@ def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_
     tilt_deg = np.hypot(roll_deg, pitch_deg)  # the corners of a room as small as this pull at it
     assert np.rad2deg(np.arccos(vertical @ R[:, 2])) < 1.0 + 0.16 * tilt_deg
     assert np.linalg.norm(vertical) == pytest.approx(1.0)
-    wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
+    wall = across_x(rng, 3.0, 3.0, 4_000)
     np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])  # without a floor the world's
 
 
-def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):
-    """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off."""
+def test_in_grass_a_wider_plane_is_taken_and_with_an_imu_the_finest_of_a_young_map(rng, grass_on_a_slope):
+    """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off.
+
+    Few sweeps of a sensor without rings are a few strokes, of which coarse cells make planes of any direction.
+    """
     points, normal = grass_on_a_slope(rng, 0.2)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
-    matches = map_of(points).match(asked, HERE)
+    grass_map = map_of(points)
+    matches = grass_map.match(asked, HERE)
     errors_deg = np.degrees(np.arccos(np.abs(matches.normals @ normal)))
     assert len(matches) == len(asked)
     assert np.median(errors_deg) < 0.6
     assert np.median(matches.tilt) < 0.01
-
-
-def test_with_an_imu_the_finest_plane_of_a_young_map_is_taken(rng, grass_on_a_slope):
-    """Few sweeps of a sensor without rings are a few strokes, of which coarse cells make planes of any direction."""
-    points, _ = grass_on_a_slope(rng, 0.2)
-    asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
-    matcher = map_of(points).matcher(Sweep(asked), is_inertial=True)
+    matcher = grass_map.matcher(Sweep(asked), is_inertial=True)
     matcher.match(asked, HERE)
     assert np.median(matcher.correspondences().tilt) > 0.02
