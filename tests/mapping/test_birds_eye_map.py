@@ -10,6 +10,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
 
+from .runs import assert_near
+
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -39,8 +41,7 @@ def test_in_a_tilted_world_the_lean_is_kept(rng, l_shaped_room, points):
     scan = transform_points(inverse(true), transform_points(tilt, l_shaped_room(rng, 4_000)))
     plan = BirdsEyeMap.of(transform_points(tilt, points), tilt[:3, 2], 0.4)
     best = complete(plan.find(scan, tilt @ exp([0.0, 0.0, -2.0, 0.0, 0.0, 0.0]), 12.0, 5))[0]
-    assert np.linalg.norm(best[:3, 3] - true[:3, 3]) < 0.7
-    assert np.rad2deg(rotation_angle(inverse(true) @ best)) < 6.0
+    assert_near(best, true, 0.7, 6.0)
 
 
 def test_what_shows_nothing_upright_lies_nowhere(points):

@@ -17,6 +17,8 @@ from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 
+from .shapes import across_x, on_sides
+
 ORIGIN = np.zeros(3)
 CELL_M = 0.2
 
@@ -82,12 +84,12 @@ def test_a_local_map_is_restored_as_what_it_is(rng, through_disk):
 
 def on_plane(rng: np.random.Generator, count: int, noise_m: float = 0.0) -> FloatArray:
     """Points of the plane z = 1."""
-    return np.column_stack([rng.uniform(-3.0, 3.0, (count, 2)), 1.0 + noise_m * rng.standard_normal(count)])
+    return across_x(rng, 1.0, 3.0, count)[:, [1, 2, 0]] + noise_m * rng.standard_normal((count, 1)) * [0.0, 0.0, 1.0]
 
 
 def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng):
     points = on_plane(rng, 20_000, 0.01)
-    feature_map, asked = map_of(NONE, points), on_plane(rng, 200)[:, :]
+    feature_map, asked = map_of(NONE, points), on_plane(rng, 200)
     found = feature_map.match(asked, np.eye(4))
     np.testing.assert_array_equal(found.index, np.arange(200))
     grid = feature_map._planes[0]
@@ -168,10 +170,7 @@ BORDER_M = 0.7
 
 
 def on_faces(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2)) -> FloatArray:
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - BORDER_M)
-    axis = np.array(axes)[np.arange(count) % len(axes)]
-    points[np.arange(count), axis] = HALF[axis] * rng.choice([-1.0, 1.0], count)
-    return points
+    return on_sides(rng, HALF, count, axes, BORDER_M)
 
 
 def on_lines(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2)) -> FloatArray:

@@ -27,20 +27,15 @@ def moved(x: float = 0.0, turn_deg: float = 0.0) -> FloatArray:
     return exp([0.0, 0.0, np.deg2rad(turn_deg), x, 0.0, 0.0])
 
 
-def test_the_way_to_the_next_follows_the_scene(hall, monkeypatch):
+@pytest.mark.parametrize(("scale", "given_m", "distance_m"), [
+    (1.0, None, 2.05), (4.0, None, 4.0), (0.1, None, 0.5), (1.0, 3.0, 3.0),
+])  # fmt: skip
+def test_the_way_to_the_next_follows_the_scene_or_is_the_given_one(hall, monkeypatch, scale, given_m, distance_m):
     """A quarter of 8 m; in a hall four times as large it would be 4 m at most, in a shaft 0.5 m at least."""
     monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.0)
-    for scale, distance_m in ((1.0, 2.05), (4.0, 4.0), (0.1, 0.5)):
-        chosen = selector(scale * hall)
-        assert not chosen.is_due(moved(0.97 * distance_m), scale * hall)
-        assert chosen.is_due(moved(1.03 * distance_m), scale * hall)
-
-
-def test_the_way_can_be_set(hall, monkeypatch):
-    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.0)
-    chosen = selector(hall, distance_m=3.0)
-    assert not chosen.is_due(moved(2.9), hall)
-    assert chosen.is_due(moved(3.0), hall)
+    chosen = selector(scale * hall, distance_m=given_m)
+    assert not chosen.is_due(moved(0.97 * distance_m), scale * hall)
+    assert chosen.is_due(moved(1.03 * distance_m), scale * hall)
 
 
 def test_a_turn_on_the_spot_makes_a_keyframe(hall):
@@ -49,15 +44,13 @@ def test_a_turn_on_the_spot_makes_a_keyframe(hall):
     assert chosen.is_due(moved(turn_deg=-31.0), hall)
 
 
-def test_a_scan_that_sees_other_things_is_due(hall, monkeypatch):
+@pytest.mark.parametrize(("least_overlap", "is_due"), [(0.6, True), (0.4, False)])
+def test_a_scan_that_sees_other_things_is_due(hall, monkeypatch, least_overlap, is_due):
     """Half of it elsewhere: through a door, say."""
-    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.6)
-    chosen = selector(hall)
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", least_overlap)
     beyond = hall + np.where(hall[:, :1] > 0.0, [[10.0, 0.0, 0.0]], 0.0)
-    assert not chosen.is_due(moved(0.1), hall)
-    assert chosen.is_due(moved(0.1), beyond)
-    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.4)
-    assert not selector(hall).is_due(moved(0.1), beyond)
+    assert not selector(hall).is_due(moved(0.1), hall)
+    assert selector(hall).is_due(moved(0.1), beyond) == is_due
 
 
 def test_noise_is_no_new_sight(hall, rng, monkeypatch):

@@ -1,6 +1,6 @@
 """Registrations of known truth: noise-free where poses are asked for, noisy where the covariance is."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.registration import register as register_sweep
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
-from .shapes import on_sides, surfel_map_of
+from .runs import assert_near
+from .shapes import elevations_of, on_sides, surfel_map_of
 
 CELL = 0.2
 HALF = np.array([4.0, 3.0, 1.5])
@@ -53,16 +54,10 @@ def predicted(
     return Prediction(0.0, T_world_lidar, motion, np.diag(np.concatenate([variances, 100.0 * variances])))
 
 
-def register(sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap, coarse_first: bool = True) -> Registration:
-    registration = register_sweep(sweep, prediction, surfel_map, with_velocity=True, coarse_first=coarse_first)
+def register(sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap) -> Registration:
+    registration = register_sweep(sweep, prediction, surfel_map, with_velocity=True)
     assert registration is not None
     return registration
-
-
-def assert_at(T_found: FloatArray, T_true: FloatArray, metres: float, degrees: float) -> None:
-    error = inverse(T_true) @ T_found
-    assert np.linalg.norm(error[:3, 3]) < metres
-    assert np.rad2deg(rotation_angle(error)) < degrees
 
 
 @pytest.fixture(scope="module")
@@ -78,21 +73,15 @@ def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map, s
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     off = exp(np.concatenate([np.deg2rad(10.0) * axes[0], 0.3 * axes[1]]))
     refined = register(snapshot(rng), predicted(T_TRUE @ off), box_map)
-    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    assert_near(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
     assert len(refined.degeneracy) == 0
-
-
-def test_the_true_pose_stays(box_map, rng):
-    refined = register(snapshot(rng), predicted(T_TRUE), box_map, coarse_first=False)
-    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
-    assert refined.iterations <= 2
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(box_map, rng, stamp_at):
     """At 120 deg/s and 1.5 m/s the sweep is bent by 12 degrees and 15 cm."""
     refined = register(sweep_of(rng, TURNING, stamp_at=stamp_at), predicted(T_TRUE), box_map)
-    assert_at(refined.T_world_lidar, T_TRUE, 2e-4, 0.005)
+    assert_near(refined.T_world_lidar, T_TRUE, 2e-4, 0.005)
     np.testing.assert_allclose(refined.velocity[:3], TURNING[:3], atol=np.deg2rad(0.1))
     np.testing.assert_allclose(refined.velocity[3:], TURNING[3:], atol=0.005)
 
@@ -101,7 +90,7 @@ def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(box_ma
     off = exp([0.0, 0.0, 0.05, 0.1, 0.0, 0.0])
     prediction = predicted(T_TRUE @ off, TURNING)
     refined = register_sweep(sweep_of(rng, TURNING), prediction, box_map, with_velocity=False)
-    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    assert_near(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
     np.testing.assert_array_equal(refined.velocity, TURNING)
 
 
@@ -148,22 +137,6 @@ def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(corrido
     np.testing.assert_allclose(refined.velocity[4:], truth[4:], atol=0.02)
 
 
-@pytest.mark.parametrize("off_m", [0.05, 0.1])
-def test_a_few_points_on_its_end_hold_a_corridor(off_m):
-    """All others fit perfectly wherever along it the sensor is, and must not make outliers of them."""
-    rng = np.random.default_rng(1)
-    local_map = map_of(
-        np.concatenate([on_sides(rng, HALF, 60_000, axes=(1, 2)), on_sides(rng, HALF, 3_000, axes=(0,))])
-    )
-    world = np.concatenate([on_sides(rng, HALF, 2_000, (1, 2), 2.1 * CELL), on_sides(rng, HALF, 150, (0,), 2.1 * CELL)])
-    T_predicted = T_TRUE.copy()
-    T_predicted[0, 3] += off_m
-    prediction = predicted(T_predicted, rotation_deg=5.0, metres=0.3)
-    refined = register(Sweep(transform_points(inverse(T_TRUE), world)), prediction, local_map, True)
-    assert len(refined.degeneracy) == 0
-    assert_at(refined.T_world_lidar, T_TRUE, 2e-3, 0.02)
-
-
 @pytest.mark.parametrize(("count", "suffices"), [(0, False), (59, False), (100, True)])
 def test_too_few_points_make_no_pose(box_map, rng, count, suffices):
     few = snapshot(rng, count=count)
@@ -177,7 +150,7 @@ def test_outliers_do_not_move_the_pose(box_map, rng):
     world[::3] *= rng.uniform(0.8, 0.98, (1_000, 1))
     sweep = Sweep(transform_points(inverse(T_TRUE), world))
     off = exp([0.0, 0.01, 0.02, 0.05, -0.05, 0.0])
-    assert_at(register(sweep, predicted(T_TRUE @ off), box_map).T_world_lidar, T_TRUE, 0.01, 0.1)
+    assert_near(register(sweep, predicted(T_TRUE @ off), box_map).T_world_lidar, T_TRUE, 0.01, 0.1)
 
 
 def test_the_covariance_has_its_order_and_its_frame(corridor_map, rng):
@@ -190,14 +163,6 @@ def test_the_covariance_has_its_order_and_its_frame(corridor_map, rng):
     assert sigmas[4] == pytest.approx(0.5, rel=0.5), "the prediction's where nothing is seen"
     assert max(sigmas[3], sigmas[5]) < 0.02
     assert sigmas[:3].max() < np.deg2rad(1.0)
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """Squared errors of N registrations, normalised by their covariance: pose, and velocity."""
-
-    pose: FloatArray
-    velocity: FloatArray
 
 
 def noisy_scan(
@@ -213,8 +178,11 @@ def noisy_scan(
     return directions * (ranges + rng.normal(0.0, sigma_m, count))[:, None], times
 
 
-def registrations(room: Any, sigma_m: float, count: int = 10) -> Consistency:
-    """Of a noisy sweep with a map of three noisy sweeps from known poses along a way, all anew each time."""
+def squared_errors(room: Any, sigma_m: float, count: int = 10) -> FloatArray:
+    """Of poses and velocities (2, N), normalised by their covariance.
+
+    Of a noisy sweep with a map of three noisy sweeps from known poses along a way, all anew each time.
+    """
     velocity = np.array([0.0, 0.0, 0.3, 0.8, 0.05, 0.0])
     start = exp([0.0, 0.0, 0.3, -4.0, 0.0, -0.4])
     found = []
@@ -225,8 +193,7 @@ def registrations(room: Any, sigma_m: float, count: int = 10) -> Consistency:
             points, times = noisy_scan(room, 100 * seed + k, T, velocity, sigma_m, 6_000)
             moved = exp(times[:, None] * velocity)
             straight = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
-            elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
-            local_map.insert(transform_points(T, straight), elevations, T[:3, 3])
+            local_map.insert(transform_points(T, straight), elevations_of(points), T[:3, 3])
         T_true = start @ exp(0.3 * velocity)
         points, times = noisy_scan(room, 100 * seed + 3, T_true, velocity, sigma_m, 2_500)
         rng = np.random.default_rng(seed)
@@ -236,8 +203,7 @@ def registrations(room: Any, sigma_m: float, count: int = 10) -> Consistency:
         dv = velocity - refined.velocity
         P = refined.covariance
         found.append([xi @ np.linalg.solve(P[:6, :6], xi), dv @ np.linalg.solve(P[6:, 6:], dv)])
-    pose, motion = np.array(found).T
-    return Consistency(pose, motion)
+    return np.array(found).T
 
 
 def test_errors_are_as_large_as_the_covariance_says(room):
@@ -245,6 +211,6 @@ def test_errors_are_as_large_as_the_covariance_says(room):
 
     Here all errors are independent and the covariance is cautious; on rough ground they are not, and it is about right.
     """
-    found = registrations(room, sigma_m=0.02)
-    assert 6.0 / 10.0**2 < found.pose.mean() < 6.0
-    assert 6.0 / 10.0**2 < found.velocity.mean() < 6.0
+    means = squared_errors(room, sigma_m=0.02).mean(axis=1)
+    assert (means > 6.0 / 10.0**2).all()
+    assert (means < 6.0).all()

@@ -1,5 +1,6 @@
 """Walls thinner than a cell: each side is matched by those who see it, wherever the cells' borders are."""
 
+from collections.abc import Sequence
 from copy import deepcopy
 
 import numpy as np
@@ -13,22 +14,26 @@ from lidarslam.mapping.surfels.grid import MEAN, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import OTHER_SIDE, VoxelHash, key_cells, point_keys
 
+from .shapes import across_x
+
 CELL = 0.5
 NOISE_M = 0.005
 SENSORS = (np.array([0.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]))
 OFFSETS = np.arange(4) / 4.0
+NEAR_SIDE, FAR_SIDE = (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)  # whence one sees them
 ONE_AFTER_THE_OTHER, IN_TURNS = [0] * 20 + [1] * 20, [0, 1] * 20
 
 
-def face(rng: np.random.Generator, x: float, half_size: float, count: int) -> FloatArray:
-    return np.column_stack([np.full(count, x), rng.uniform(-half_size, half_size, (count, 2))])
+def show(grid: SurfelGrid, points: FloatArray, view: Sequence[float]) -> None:
+    """Points (N, 3), seen along one direction, by lasers at the height of the sensor."""
+    grid.insert(points, np.zeros(len(points)), np.tile(view, (len(points), 1)))
 
 
 def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float], sides: list[int]) -> SurfelMap:
     """A map of a wall with faces at these x, of which scan after scan saw one side."""
     local_map, half_size = SurfelMap(cell_m, 100.0), 6.0 * cell_m
     for side in sides:
-        points = face(rng, faces[side], half_size, 1_000)
+        points = across_x(rng, faces[side], half_size, 1_000)
         local_map.match(points, make_transform(np.eye(3), SENSORS[side]))  # as a scan is before it is added
         points[:, 0] += rng.normal(0.0, NOISE_M, len(points))
         local_map.insert(points, rng.uniform(-0.3, 0.3, len(points)), SENSORS[side])
@@ -43,7 +48,7 @@ def first_matches(local_map: SurfelMap, points: FloatArray, side: int) -> Corres
 
 def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int) -> tuple[float, FloatArray]:
     """The share of points on a face that are matched from one side, and how far these are off."""
-    asked = face(rng, x, 4.0 * local_map.cell_m, 500)
+    asked = across_x(rng, x, 4.0 * local_map.cell_m, 500)
     matches = first_matches(local_map, asked, side)
     return len(matches) / len(asked), np.abs(matches.residuals(asked[matches.index]))
 
@@ -69,7 +74,7 @@ def test_both_sides_stay_when_cells_change_their_size(rng, factor):
     cell_m, faces = 0.25, (2.03, 2.13)
     resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(cell_m * factor)
     for side in (0, 1):
-        asked = face(rng, faces[side], 2.0 * cell_m, 500)
+        asked = across_x(rng, faces[side], 2.0 * cell_m, 500)
         matches = first_matches(resized, asked, side)
         assert len(matches) > 0.95 * len(asked)
         assert np.abs(matches.residuals(asked[matches.index])).mean() < 0.005
@@ -77,9 +82,9 @@ def test_both_sides_stay_when_cells_change_their_size(rng, factor):
 
 def grid_of_both_sides(rng: np.random.Generator, count: int = 4_000) -> tuple[SurfelGrid, FloatArray, FloatArray]:
     """A wall within cells, and points of both its faces."""
-    grid, faces = SurfelGrid(CELL), [face(rng, x, 1.4, count) for x in (2.1, 2.2)]
-    for points, view in zip(faces, (-1.0, 1.0), strict=True):
-        grid.insert(points, np.zeros(count), np.tile([view, 0.0, 0.0], (count, 1)))
+    grid, faces = SurfelGrid(CELL), [across_x(rng, x, 1.4, count) for x in (2.1, 2.2)]
+    for points, view in zip(faces, (NEAR_SIDE, FAR_SIDE), strict=True):
+        show(grid, points, view)
     return grid, *faces
 
 
@@ -88,24 +93,24 @@ def test_another_side_takes_cells_only_where_it_was_seen(rng):
     one = SurfelGrid(CELL)
     for seed in range(5):
         noisy = near + np.random.default_rng(seed).normal(0.0, 0.02, near.shape) * [1.0, 0.0, 0.0]
-        one.insert(noisy, np.zeros(len(near)), np.tile([-1.0, 0.0, 0.0], (len(near), 1)))
+        show(one, noisy, NEAR_SIDE)
     cells = len(np.unique(np.floor(near / CELL), axis=0))
     assert len(one) == cells
     half = far[far[:, 1] > 0.0]
-    one.insert(half, np.zeros(len(half)), np.tile([1.0, 0.0, 0.0], (len(half), 1)))
+    show(one, half, FAR_SIDE)
     assert len(one) == cells + len(np.unique(np.floor(half / CELL), axis=0))
     assert len(both) == 2 * cells
 
 
 def test_a_floor_passed_at_a_flat_angle_has_one_side_and_from_below_another(rng):
     """Seen from ahead and from behind the views are opposed, and yet it is the same surface."""
-    grid, count = SurfelGrid(CELL), 4_000
+    grid = SurfelGrid(CELL)
     for view in ([0.98, 0.0, 0.2], [-0.98, 0.0, 0.2], [0.0, -0.98, 0.2]):
-        floor = face(rng, 0.2, 1.4, count)[:, [1, 2, 0]]
-        grid.insert(floor, np.zeros(count), np.tile(view, (count, 1)))
+        floor = across_x(rng, 0.2, 1.4, 4_000)[:, [1, 2, 0]]
+        show(grid, floor, view)
     cells = len(np.unique(np.floor(floor / CELL), axis=0))
     assert len(grid) == cells
-    grid.insert(floor - [0.0, 0.0, 0.1], np.zeros(count), np.tile([0.8, 0.0, -0.6], (count, 1)))
+    show(grid, floor - [0.0, 0.0, 0.1], [0.8, 0.0, -0.6])
     assert len(grid) == 2 * cells
     for sensor, z in ((np.array([0.0, 0.0, 5.0]), 0.2), (np.array([0.0, 0.0, -5.0]), 0.1)):
         heights = grid.surfels(grid.find(floor, sensor))[:, MEAN][:, 2]
@@ -114,10 +119,9 @@ def test_a_floor_passed_at_a_flat_angle_has_one_side_and_from_below_another(rng)
 
 def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng):
     """Views of both sides, and of neighbours, differ by less than a right angle."""
-    grid, count = SurfelGrid(CELL), 4_000
-    faces = [face(rng, x, 1.4, count) for x in (2.1, 2.2)]
+    grid, faces = SurfelGrid(CELL), [across_x(rng, x, 1.4, 4_000) for x in (2.1, 2.2)]
     for points, view in zip(faces, ([-0.4, 0.9, 0.0], [0.4, 0.9, 0.0]), strict=True):
-        grid.insert(points, np.zeros(count), np.tile(view, (count, 1)))
+        show(grid, points, view)
     for points, sensor, x in ((faces[0], [-1.0, 7.0, 0.0], 2.1), (faces[1], [5.0, 7.0, 0.0], 2.2)):
         surfels = grid.surfels(grid.find(points, np.array(sensor)))
         np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
@@ -128,8 +132,8 @@ def test_restored_it_goes_on_alike_to_the_last_bit(rng):
     restored = SurfelGrid(CELL)
     restored.restore(Saved(deepcopy(grid.state())))
     for other in (grid, restored):
-        for points, view in ((near, -1.0), (far, 1.0)):
-            other.insert(points + np.array([0.0, 0.4, 0.0]), np.zeros(300), np.tile([view, 0.0, 0.0], (300, 1)))
+        for points, view in ((near, NEAR_SIDE), (far, FAR_SIDE)):
+            show(other, points + np.array([0.0, 0.4, 0.0]), view)
     one, other_state = grid.state(), restored.state()
     for name, value in one.items():
         np.testing.assert_array_equal(value, other_state[name])
@@ -151,16 +155,16 @@ def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng):
 def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng):
     """Seen from there again it grows, and no third one begins."""
     grid, count = SurfelGrid(CELL), 60_000
-    for x, points, view in ((2.1, 300, -1.0), (2.2, count, 1.0)):
-        grid.insert(face(rng, x, 2.9, points), np.zeros(points), np.tile([view, 0.0, 0.0], (points, 1)))
+    for x, points, view in ((2.1, 300, NEAR_SIDE), (2.2, count, FAR_SIDE)):
+        show(grid, across_x(rng, x, 2.9, points), view)
     assert len(grid) > len(np.unique(key_cells(grid.state()["_keys"]), axis=0))
     grid.tidy()
     cells = key_cells(grid.state()["_keys"])
     assert len(grid) == len(np.unique(cells, axis=0))
-    far = face(rng, 2.2, 2.4, count)
+    far = across_x(rng, 2.2, 2.4, count)
     surfels = grid.surfels(grid.find(far))
     np.testing.assert_allclose(surfels[:, NORMAL][:, 0], 1.0, atol=1e-3)
-    grid.insert(far, np.zeros(count), np.tile([1.0, 0.0, 0.0], (count, 1)))
+    show(grid, far, FAR_SIDE)
     assert len(grid) == len(cells)
 
 
