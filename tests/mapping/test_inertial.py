@@ -28,6 +28,8 @@ from lidarslam.mapping.motion.prediction import (
 )
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
+Path = Callable[[FloatArray], FloatArray]
+
 RATE_HZ, PERIOD_S = 200.0, 0.1
 T_LIDAR_IMU = exp([0.4, -0.3, 2.8, 0.05, -0.1, 0.08])
 REGISTRATION = np.diag([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2
@@ -65,11 +67,7 @@ def yaw_only(times: FloatArray) -> FloatArray:
 
 
 def samples(
-    motion: Callable[[FloatArray], FloatArray],
-    last_s: float,
-    bias: FloatArray = BIAS,
-    force_bias: FloatArray = FORCE_BIAS,
-    scale: float = 1.0,
+    motion: Path, last_s: float, bias: FloatArray = BIAS, force_bias: FloatArray = FORCE_BIAS, scale: float = 1.0
 ) -> ImuSamples:
     """Noiseless samples of a motion, by central differences; its accelerations scaled."""
     stamps, h = np.arange(0.0, last_s, 1.0 / RATE_HZ), 1e-4
@@ -80,14 +78,19 @@ def samples(
     return ImuSamples(stamps, rates + bias, forces + force_bias, T_LIDAR_IMU)
 
 
-def registered(state: MotionState | None, stamp: float, T_world_lidar: FloatArray, **flags: bool) -> MappedScan:
+def registered(
+    state: MotionState | None,
+    stamp: float,
+    T_world_lidar: FloatArray,
+    is_registered: bool = True,
+    is_connected: bool = True,
+) -> MappedScan:
     """A scan that was registered to half a centimetre and a tenth of a degree, beside what was predicted of it."""
     covariance = UNKNOWN_VELOCITY.copy()
     covariance[:6, :6] = REGISTRATION
     measured = MotionState(stamp, T_world_lidar, np.zeros(6), covariance)
     if state is None:
-        return MappedScan(measured, T_world_lidar, flags.get("is_registered", True), Status.OK, is_connected=False)
-    is_registered, is_connected = flags.get("is_registered", True), flags.get("is_connected", True)
+        return MappedScan(measured, T_world_lidar, is_registered, Status.OK, is_connected=False)
     return MappedScan(
         state.fused(measured), state.T_world_lidar, is_registered, Status.OK,
         is_connected=is_connected, measured=MeasuredPose(T_world_lidar, np.linalg.inv(REGISTRATION)),
@@ -106,7 +109,7 @@ def take(inertial: Inertial, stamp: float, T_world_lidar: FloatArray, **flags: b
 
 
 def followed(
-    inertial: Inertial, last_s: float, rng: np.random.Generator, motion: Callable[[FloatArray], FloatArray] = walk
+    inertial: Inertial, last_s: float, rng: np.random.Generator, motion: Path = walk
 ) -> list[tuple[float, GravityDirection]]:
     """Give it the scans of a motion, with errors, in a world that the first one makes; what it measures of gravity."""
     directions = []
@@ -164,9 +167,8 @@ def test_clocks_that_count_from_1970_lose_no_digits():
 def test_a_gap_between_samples_is_not_covered():
     imu = samples(walk, 4.0)
     kept = (imu.stamps < 2.0) | (imu.stamps > 2.2)
-    gyroscope = Preintegration(
-        ImuSamples(imu.stamps[kept], imu.angular_velocities[kept], imu.accelerations[kept]), np.eye(3)
-    )
+    parts = imu.stamps[kept], imu.angular_velocities[kept], imu.accelerations[kept]
+    gyroscope = Preintegration(ImuSamples(*parts), np.eye(3))
     assert gyroscope.covers(1.0, 1.9)
     assert gyroscope.covers(2.3, 3.99)
     for first_s, last_s in ((1.95, 2.05), (2.05, 2.15), (1.0, 3.0), (-0.5, 0.5), (3.5, 4.5)):
@@ -182,7 +184,6 @@ def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at, rng):
     sweep = Scan(np.einsum("nji,nj->ni", R, points), stamp, offsets)
     gyroscope = Preintegration(samples(jerky, 2.0), T_LIDAR_IMU[:3, :3])
     rate = gyroscope.mean_rate(sweep)
-    assert rate is not None
     velocity = np.concatenate([rate - T_LIDAR_IMU[:3, :3] @ BIAS, np.zeros(3)])
     raw, evened = (
         np.linalg.norm(move(scan.points, offsets, velocity) - points, axis=1).max()
@@ -248,13 +249,9 @@ def test_a_direction_without_structure_is_held_by_the_imu(walked):
         information[3:, 3:] = across / REGISTRATION[5, 5]
         covariance = state.covariance.copy()
         covariance[:6, :6] = np.linalg.inv(np.linalg.inv(state.covariance[:6, :6]) + information)
-        walked.update(
-            empty(stamp),
-            MappedScan(
-                MotionState(stamp, T_world_lidar, state.velocity, covariance), state.T_world_lidar, True, Status.OK,
-                measured=MeasuredPose(T_world_lidar, information),
-            ),
-        )  # fmt: skip
+        found = MotionState(stamp, T_world_lidar, state.velocity, covariance)
+        measured = MeasuredPose(T_world_lidar, information)
+        walked.update(empty(stamp), MappedScan(found, state.T_world_lidar, True, Status.OK, measured=measured))
     state = walked.prior(empty(stamps[-1] + 1e-4), Prior()).inertial
     error = (state.T_world_lidar - inverse(walk(0.5)) @ walk(stamps[-1] + 1e-4))[0, 3]
     moved = np.linalg.norm(walk(stamps[-1])[:3, 3] - walk(stamps[0])[:3, 3])
@@ -363,11 +360,9 @@ def test_states_are_fused_by_their_information(rng):
 
 
 def test_a_prediction_follows_the_imu_where_the_motion_is_uncertain():
-    covariance = UNKNOWN_VELOCITY.copy()
-    last = MotionState(0.0, np.eye(4), np.zeros(6), covariance)
-    moved = MotionState(
-        0.1, exp([0.0, 0.0, 0.2, 0.3, 0.1, 0.0]), np.array([0.0, 0.0, 2.0, 3.0, 1.0, 0.0]), 1e-6 * np.eye(12)
-    )
+    last = MotionState(0.0, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
+    velocity = np.array([0.0, 0.0, 2.0, 3.0, 1.0, 0.0])
+    moved = MotionState(0.1, exp(0.1 * velocity), velocity, 1e-6 * np.eye(12))
     prediction = predict(last, 0.1, Prior(inertial=moved), ProcessNoise(), MappingConfig())
     np.testing.assert_allclose(prediction.T_world_lidar, moved.T_world_lidar, atol=1e-3)
     np.testing.assert_allclose(prediction.velocity, moved.velocity, atol=1e-2)
@@ -388,10 +383,7 @@ def test_large_biases_are_reported(rng):
 
 
 def compared(
-    motion: Callable[[FloatArray], FloatArray],
-    rng: np.random.Generator,
-    imu: ImuSamples,
-    T_lidar_imu: FloatArray = T_LIDAR_IMU,
+    motion: Path, rng: np.random.Generator, imu: ImuSamples, T_lidar_imu: FloatArray = T_LIDAR_IMU
 ) -> Comparison:
     comparison = Comparison(imu, T_lidar_imu)
     for stamp in np.arange(0.5, imu.stamps[-1] - 0.1, PERIOD_S):
@@ -468,6 +460,5 @@ def test_restored_it_goes_on_alike(walked, through_disk):
         one, other = take(begun, stamp, pose), take(resumed, stamp, pose)
         np.testing.assert_array_equal(one.T_world_lidar, other.T_world_lidar)
         np.testing.assert_array_equal(one.covariance, other.covariance)
-        assert (begun.direction is None) == (resumed.direction is None)
-        if begun.direction is not None and resumed.direction is not None:
-            np.testing.assert_array_equal(begun.direction.lidar, resumed.direction.lidar)
+        directions = [None if each.direction is None else each.direction.lidar for each in (begun, resumed)]
+        np.testing.assert_array_equal(*directions)

@@ -21,7 +21,6 @@ def extract_features(scan: Scan, min_range_m: float, max_range_m: float, cell_m:
     """Edges and planar points for a map with such cells."""
     config = MappingConfig(method="loam", cell_m=cell_m, min_range_m=min_range_m, max_range_m=max_range_m)
     sweep = FeatureSampler(config).sample(scan).sweep
-    assert sweep.kinds is not None
     return sweep.take(np.flatnonzero(sweep.kinds == EDGE)), sweep.take(np.flatnonzero(sweep.kinds == PLANE))
 
 
@@ -152,20 +151,6 @@ def kinds_of(points: FloatArray, rings: NDArray[np.intp] | None = None) -> NDArr
     return kinds
 
 
-def wall_at(x: FloatArray | float, azimuth_deg: FloatArray) -> FloatArray:
-    """One ring's points (N, 3) on walls across the x axis at these distances."""
-    azimuth = np.deg2rad(azimuth_deg)
-    return np.column_stack([x * np.ones(len(azimuth)), x * np.tan(azimuth), np.zeros(len(azimuth))])
-
-
-AZIMUTH_DEG = np.arange(-30.0, 30.0, 0.2) + 0.1  # 300 of them
-
-
-def test_a_flat_wall_is_planar():
-    expected = np.where((np.arange(300) < 5) | (np.arange(300) >= 295), 0, PLANE)
-    np.testing.assert_array_equal(kinds_of(wall_at(5.0, AZIMUTH_DEG)), expected)
-
-
 def test_the_corner_of_two_walls_is_one_edge():
     """Walls along the diagonals meet straight ahead at a right angle."""
     azimuth = np.deg2rad(np.arange(-20.0, 26.2, 0.4))
@@ -178,8 +163,9 @@ def test_the_corner_of_two_walls_is_one_edge():
 
 def test_the_edge_of_a_near_surface_is_an_edge_and_that_of_what_it_hides_is_none():
     """A board at 5 m before a wall at 10 m, in the middle 50 points of a ring."""
-    is_near = np.abs(np.arange(300) - 149.5) < 25.0
-    kinds = kinds_of(wall_at(np.where(is_near, 5.0, 10.0), AZIMUTH_DEG))
+    is_near, azimuth = np.abs(np.arange(300) - 149.5) < 25.0, np.deg2rad(np.arange(-30.0, 30.0, 0.2) + 0.1)
+    x_m = np.where(is_near, 5.0, 10.0)
+    kinds = kinds_of(np.column_stack([x_m, x_m * np.tan(azimuth), np.zeros(300)]))
     near, far = np.flatnonzero(is_near), np.flatnonzero(~is_near)
     assert set(np.flatnonzero(kinds == EDGE)) == {near[0], near[-1]}
     assert (kinds[far[5:-5]] == PLANE).all()
@@ -266,7 +252,6 @@ def test_features_are_points_as_measured_with_their_times(ring_scans):
     scan = ring_scans[0]
     features = extract_features(scan, 0.5, 100.0, 0.1)
     for sweep in features:
-        assert sweep.times is not None
         np.testing.assert_array_equal(sweep.times, scan.time_offsets[rows_of(sweep.points, scan)])
     edges, planes = extract_features(replace(scan, time_offsets=None), 0.5, 100.0, 0.1)
     assert edges.times is None

@@ -57,7 +57,6 @@ def test_laspy_reads_laz(tmp_path, cloud):
     np.testing.assert_allclose(read.intensity, np.nan_to_num(known.intensity), atol=0.5)
     np.testing.assert_array_equal(read.ring, known.ring)
     np.testing.assert_array_equal(read.gps_time, known.time)
-    assert known.rgb is not None
     np.testing.assert_array_equal(np.column_stack([read.red, read.green, read.blue]) // 257, known.rgb)
     assert set(read.return_number) == set(read.number_of_returns) == {1}
 

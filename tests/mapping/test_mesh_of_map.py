@@ -9,7 +9,7 @@ from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.mapping.global_map.edits import reconstruct
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, succeeds
 
 RADIUS_M = 3.0
 
@@ -52,8 +52,7 @@ def test_the_files_are_read_by_others(bowl, tmp_path, suffix):
     write_tum(run / "trajectory.tum", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     write_cloud(run / "map.ply", bowl)
     command = ["export-mesh", str(run), "--out", str(out), "--cell", "0.3"]
-    done = lidarslam(*command)
-    assert done.exit_code == 0, done.output
+    succeeds(*command)
     mesh = o3d.io.read_triangle_mesh(str(out))
     assert len(mesh.triangles) > 500
     assert distances(np.asarray(mesh.vertices)).max() < 0.3

@@ -13,13 +13,12 @@ from lidarslam.mapping.global_map.occupancy_grid import (
     UNKNOWN,
     GridOptions,
     OccupancyGrid,
-    find_ground,
     occupancy_grid,
 )
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, succeeds
 
 SLOPE = np.tan(np.deg2rad(10.0))
 SENSOR_M = 1.0
@@ -65,9 +64,7 @@ def room() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @pytest.fixture(scope="module")
 def grid(room: tuple[FloatArray, FloatArray, FloatArray]) -> OccupancyGrid:
-    found = occupancy_grid(*room, GridOptions(resolution_m=STEP))
-    assert found is not None
-    return found
+    return occupancy_grid(*room, GridOptions(resolution_m=STEP))
 
 
 def value(grid: OccupancyGrid, x: float, y: float) -> int:
@@ -109,12 +106,9 @@ def test_what_the_robot_drove_through_is_free(room):
     points, normals, path = room
     person = patch(at(1.0, -0.1), np.array([0.0, 0.2, 0.0]), np.array([0.0, 0.0, 1.7]))
     more = np.concatenate([points, person]), np.concatenate([normals, np.tile([1.0, 0.0, 0.0], (len(person), 1))])
-    grid = occupancy_grid(*more, path, GridOptions(resolution_m=STEP))
-    assert grid is not None
-    assert value(grid, 1.0, 0.0) == FREE
-    aside = occupancy_grid(*more, path + np.array([0.0, 1.0, 0.0]), GridOptions(resolution_m=STEP))
-    assert aside is not None
-    assert value(aside, 1.0, 0.0) == OCCUPIED
+    for aside_m, expected in ((0.0, FREE), (1.0, OCCUPIED)):
+        grid = occupancy_grid(*more, path + np.array([0.0, aside_m, 0.0]), GridOptions(resolution_m=STEP))
+        assert value(grid, 1.0, 0.0) == expected
 
 
 def test_without_ground_there_is_no_grid(room):
@@ -144,8 +138,7 @@ def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
     write_tum(run / "trajectory.tum", Trajectory(0.1 * np.arange(len(path)), T))
     write_cloud(run / "map.ply", PointCloud(points, normals))
     command = ["export-grid", str(run), "--out", str(out)]
-    done = lidarslam(*command)
-    assert done.exit_code == 0, done.output
+    succeeds(*command)
     cloud = load_map(run)  # in single precision
     grid = occupancy_grid(cloud.points, cloud.normals, path, GridOptions(resolution_m=STEP))
     about, occupancy = _read(out)
@@ -157,5 +150,5 @@ def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
     np.testing.assert_allclose([x, y, yaw], [*grid.origin, 0.0], atol=1e-6)
     np.testing.assert_array_equal(meaning, grid.cells)
     assert lidarslam(*command).exit_code == 1
-    assert lidarslam(*command, "--overwrite").exit_code == 0
+    succeeds(*command, "--overwrite")
     assert lidarslam("export-grid", run, "--out", tmp_path / "map.png").exit_code == 1

@@ -60,7 +60,6 @@ def laid(
         laid.follow(pose)
     members = np.ones(len(targets), dtype=np.bool_)
     drawn = laid.redrawn(targets, members, CELL_M, lambda key: VoxelMeans(submaps[key], Layout()), scan=40)
-    assert drawn is not None
     return laid, drawn
 
 

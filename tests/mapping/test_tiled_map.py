@@ -126,7 +126,6 @@ def test_tiles_together_are_the_map_in_one_piece(views):
 def test_the_overview_has_no_more_points_than_it_may(views):
     built = walked(GlobalMap(VOXEL_M, MOST))
     drawn = drawn_map(built, views, CONFIG)
-    assert drawn.voxel_size_m is not None
     assert drawn.tiled.total > MOST
     assert 0.6 * MOST < len(drawn.cloud) <= MOST
     assert len(np.unique(point_keys(drawn.cloud.points, drawn.voxel_size_m))) > 0.99 * len(drawn.cloud)

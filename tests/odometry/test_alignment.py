@@ -252,7 +252,6 @@ def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m,
 def test_the_best_of_many_guesses_is_found_roughly(street):
     guesses = [ahead(0.1 * x) for x in (-20, -10, 0, 13, 25)]
     found = try_instead(one_on_the_other(street, REST), guesses, second_on_first(street), FINE)
-    assert found is not None
     assert wrong_by_m(found) < 0.02
 
 

@@ -114,7 +114,6 @@ def test_scans_outside_the_external_trajectory_are_said_to_be_uncovered():
     odometry = external(last=1.0)
     odometry.estimate(scan_at(0.9))
     failed = odometry.estimate(scan_at(1.2))
-    assert failed.failure is not None
     assert "does not cover" in failed.failure
 
 
@@ -125,7 +124,6 @@ def test_a_scan_in_a_hole_of_the_external_trajectory_is_not_covered(stamp):
     odometry.estimate(scan_at(-0.1))
     failed = odometry.estimate(scan_at(stamp))
     assert failed.points_used == 0
-    assert failed.failure is not None
     assert "does not cover this scan: it has no pose from 0.000000 to 1.400000" in failed.failure
     caught_up = odometry.estimate(scan_at(1.45))
     assert caught_up.failure is None

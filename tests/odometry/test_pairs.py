@@ -44,7 +44,6 @@ def fit(batch: PairBatch, item: int) -> tuple[Tensor, Tensor]:
 
     Distances are in units of the previous scan's greatest range, which no augmentation changes but scaling.
     """
-    assert batch.surfaces is not None
     previous, current = batch.surfaces[item].flatten(2).double().mT
     T = batch.T_prev_curr[item].double()
     distance, nearest = torch.cdist(transform_points(T, current[:, :3]), previous[:, :3]).min(dim=1)
@@ -64,7 +63,6 @@ def test_a_pair_as_it_is(recording):
 def test_surfaces_are_those_seen_from_the_middle_of_the_sweep(recording, previous, current):
     """Laid on one another by the motion, walls are on walls."""
     pair = pair_of(recording, previous, current)
-    assert pair.surfaces is not None
     torch.testing.assert_close(pair.T_prev_curr[0], motion(current - previous), rtol=0, atol=1e-6)
     poses = torch.stack([motion(previous), motion(current)])
     assert wall_distance(poses, pair.surfaces[0]) < 0.002
@@ -188,5 +186,4 @@ def test_scenes_are_enlarged_if_the_translation_stays_within_the_grid(small_room
     T[:, 0, 3] = along_m
     pairs = Pairs([replace(recording, T_prev_curr=T)], seed=1, surfaces=False, augmentation=only(fine=1.0, heading=0.0))
     batch = pairs.batch(0, 4)
-    assert batch.scale is not None
     assert batch.scale.tolist() == [scale] * 4

@@ -31,7 +31,6 @@ def test_pixels_are_the_points_with_their_times(box_room):
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_offsets_are_from_the_middle_of_the_sweep_wherever_the_stamp_is(box_room, stamp_at):
     scan = box_room.scans(1, TWIST)[0]
-    assert scan.time_offsets is not None
     stamped = Scan(scan.points, scan.stamp, scan.time_offsets - stamp_at * 0.1)
     assert stamped.middle_offset_s == pytest.approx(0.05 - stamp_at * 0.1, abs=1e-8)
     np.testing.assert_allclose(images_of(stamped).offsets, box_room.sweeps(1, TWIST)[0].offsets, atol=1e-7)
