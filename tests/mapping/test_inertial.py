@@ -79,21 +79,17 @@ def samples(
 
 
 def registered(
-    state: MotionState | None,
-    stamp: float,
-    T_world_lidar: FloatArray,
-    is_registered: bool = True,
-    is_connected: bool = True,
+    state: MotionState | None, stamp: float, T: FloatArray, is_registered: bool = True, is_connected: bool = True
 ) -> MappedScan:
     """A scan that was registered to half a centimetre and a tenth of a degree, beside what was predicted of it."""
     covariance = UNKNOWN_VELOCITY.copy()
     covariance[:6, :6] = REGISTRATION
-    measured = MotionState(stamp, T_world_lidar, np.zeros(6), covariance)
+    measured = MotionState(stamp, T, np.zeros(6), covariance)
     if state is None:
-        return MappedScan(measured, T_world_lidar, is_registered, Status.OK, is_connected=False)
+        return MappedScan(measured, T, is_registered, Status.OK, is_connected=False)
     return MappedScan(
         state.fused(measured), state.T_world_lidar, is_registered, Status.OK,
-        is_connected=is_connected, measured=MeasuredPose(T_world_lidar, np.linalg.inv(REGISTRATION)),
+        is_connected=is_connected, measured=MeasuredPose(T, np.linalg.inv(REGISTRATION)),
     )  # fmt: skip
 
 

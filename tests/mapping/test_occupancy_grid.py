@@ -13,6 +13,7 @@ from lidarslam.mapping.global_map.occupancy_grid import (
     UNKNOWN,
     GridOptions,
     OccupancyGrid,
+    find_ground,
     occupancy_grid,
 )
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud

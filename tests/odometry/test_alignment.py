@@ -1,7 +1,9 @@
-"""Motions between sweeps that are exact, and what is said and searched where they cannot be found."""
+"""Motions between sweeps that are exact, and what is said and searched where they cannot be found, or not in part."""
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,34 +17,20 @@ from lidarslam.odometry.alignment.alignment import (
     InitialEstimate,
     align,
     align_best,
+    find_degeneracy,
+    joined_information,
+    replaced_along,
     try_instead,
 )
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
 
+from .motions import WRONG, assert_close, errors, moved
+
 FINE, NO_STEP = Effort(column_step=2), Effort(iterations=0, column_step=2)
 INTERVAL_S = 0.1
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)  # rad/s, m/s
 TURNING = (0.1, 0.1, math.radians(80.0), 1.0, 0.3, 0.1)
-# Wrong by 2 degrees about an axis of no particular direction, and by 10 cm.
-WRONG = (0.012, -0.012, 0.030, 0.06, -0.06, 0.05)
-
-
-def moved(twist: tuple[float, ...], wrong: tuple[float, ...] = (0.0,) * 6) -> FloatArray:
-    """The true motion (4, 4) from one sweep to the next, or a guess off by so much."""
-    return exp(wrong) @ exp(0.1 * np.array(twist))
-
-
-def errors(T: FloatArray, truth: FloatArray) -> tuple[float, float]:
-    """Degrees and metres."""
-    error = log(T @ inverse(truth))
-    return float(np.rad2deg(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
-
-
-def assert_close(T: FloatArray, truth: FloatArray, rotation_deg: float, translation_m: float) -> None:
-    found_deg, found_m = errors(T, truth)
-    assert found_deg < rotation_deg
-    assert found_m < translation_m
 
 
 def second_on_first(sweeps: list[SweepImages], last: SweepMotion | None = None) -> SweepPair:
@@ -216,7 +204,7 @@ def ahead(along_m: float) -> FloatArray:
 
 
 def wrong_by_m(aligned: Alignment) -> float:
-    return errors(aligned.T_prev_curr, ahead(1.4))[1]
+    return float(errors(aligned.T_prev_curr, ahead(1.4))[1])
 
 
 def test_alignment_from_rest_stays_there_and_knows_it(street):
@@ -262,3 +250,69 @@ def test_the_less_likely_a_guess_the_more_it_must_explain(street, monkeypatch):
         starts = [InitialEstimate(REST), InitialEstimate(ahead(1.3), sigmas=odds)]
         found = align_best(starts, second_on_first(street), FINE)
         assert (wrong_by_m(found) > 0.5) == wrong
+
+
+def information(normals: FloatArray, points: FloatArray) -> FloatArray:
+    """(6, 6) of points on planes."""
+    J = np.concatenate([np.cross(points, normals), normals], axis=1)
+    return J.T @ J
+
+
+def images(range_m: float = 4.0) -> Any:
+    """All points have a normal, this far away; their median range is 4 m."""
+    return SimpleNamespace(
+        share_with_normal=lambda: 1.0, median_range_m=lambda: 4.0, mean_inverse_square_range=lambda: range_m**-2.0
+    )
+
+
+@pytest.fixture(scope="module")
+def corridor_walls() -> FloatArray:
+    """Information of points on walls, floor and ceiling along x."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1.0, 1.0, (4000, 3)) * [8.0, 2.0, 1.5]
+    axis, side = rng.integers(1, 3, 4000), rng.choice([-1.0, 1.0], 4000)
+    points[np.arange(4000), axis] = side * np.array([0.0, 2.0, 1.5])[axis]
+    return information(np.eye(3)[axis], points)
+
+
+def test_a_corridor_is_open_along_it(corridor_walls):
+    found = find_degeneracy(corridor_walls, 4000, images())
+    assert found.names == ("x",)
+    np.testing.assert_allclose(np.abs(found.directions), [[0, 0, 0, 1, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("share", "range_m", "count"), [(0.0005, 4.0, 1), (0.002, 4.0, 0), (0.004, 1.0, 1), (0.004, 5.0, 0)]
+)
+def test_a_wall_at_the_end_closes_it_when_enough_points_lie_on_it(corridor_walls, share, range_m, count):
+    """More than the noise of near normals feigns."""
+    end = share * 4000 * information(np.array([[1.0, 0.0, 0.0]]), np.array([[8.0, 0.0, 0.0]]))
+    assert len(find_degeneracy(corridor_walls + end, 4000, images(range_m))) == count
+
+
+@pytest.mark.parametrize(("bare_share", "count"), [(1.0, 1), (0.75, 1), (0.65, 0), (0.0, 0)])
+def test_where_much_has_no_normal_nothing_is_left_open_for_all_one_knows(corridor_walls, box_room, bare_share, count):
+    sweep = box_room.sweeps(1, [0.0] * 6)[0]
+    sweep.normals[..., round(bare_share * sweep.normals.shape[-1]) :] = 0.0
+    assert len(find_degeneracy(corridor_walls, 4000, sweep)) == count
+
+
+def test_a_motion_goes_on_along_open_directions_and_only_there(corridor_walls):
+    degeneracy = find_degeneracy(corridor_walls, 4000, images())
+    aligned, expected = exp([0.01, 0.0, 0.2, 0.02, -0.1, 0.05]), exp([0.0, 0.1, 0.19, 0.4, 0.3, 0.0])
+    motion = replaced_along(aligned, expected, degeneracy)
+    change = log(motion @ inverse(aligned))
+    np.testing.assert_allclose(change[[0, 1, 2, 4, 5]], 0.0, atol=1e-9)
+    assert log(expected @ inverse(motion))[3] == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_covariance_is_the_expected_one_along_and_the_seen_one_across(corridor_walls):
+    expected = np.diag([0.02, 0.02, 0.02, 0.3, 0.3, 0.3]) ** 2
+    joined = np.linalg.inv(
+        joined_information(corridor_walls, expected, find_degeneracy(corridor_walls, 4000, images()))
+    )
+    assert np.sqrt(joined[3, 3]) == pytest.approx(0.3)
+    free = [0, 1, 2, 4, 5]
+    np.testing.assert_allclose(
+        joined[np.ix_(free, free)], np.linalg.inv(corridor_walls[np.ix_(free, free)]), rtol=1e-3, atol=1e-9
+    )

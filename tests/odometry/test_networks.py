@@ -11,7 +11,7 @@ from torch import Tensor
 from lidarslam.odometry.config import NetworkConfig
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
-from lidarslam.odometry.network.networks import CorrelationNetwork, DeloraNetwork, PairImages, column_channels
+from lidarslam.odometry.network.networks import CorrelationNetwork, DeloraNetwork, PairImages
 from lidarslam.odometry.network.networks import make_network as network_named
 from lidarslam.odometry.network.torch_geometry import inverse
 from lidarslam.odometry.training.config import TrainingConfig
@@ -57,12 +57,6 @@ def pairs(previous: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor], turn:
 @pytest.mark.parametrize(("name", "count"), [("correlation", 62_005), ("delora", 11_876_019)])
 def test_the_size_is_the_documented_one_and_the_papers(name, count):
     assert sum(p.numel() for p in make(name).parameters()) == count
-
-
-@pytest.mark.parametrize("columns", [1, 7, -3])
-def test_input_channels_know_no_azimuth(scans, columns):
-    shifted = column_channels(*turned(scans, columns))
-    torch.testing.assert_close(shifted, column_channels(*scans).roll(columns, -1), rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

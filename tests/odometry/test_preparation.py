@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.config import ImageConfig
-from lidarslam.odometry.network.torch_geometry import inverse, log
-from lidarslam.odometry.training.preparation import prepare
+from lidarslam.odometry.training.preparation import PreparedRecording, prepare
+
+from .motions import assert_close, moved
 
 CONFIG = ImageConfig(rows=16, columns=360)
 SLOW = (0.05, -0.05, 0.1, 1.0, 0.3, 0.1)
 TURNING = (0.0, 0.0, math.radians(120.0), 1.0, 0.3, 0.0)
 
 
-def errors(recording, twist):
-    """Of each motion, degrees and metres."""
-    truth = torch.from_numpy(exp(0.1 * np.array(twist)))
-    error = log(recording.T_prev_curr.double() @ inverse(truth))
-    return error[:, :3].norm(dim=1).rad2deg(), error[:, 3:].norm(dim=1)
+def assert_true(recording: PreparedRecording, twist: tuple[float, ...], translation_m: float = 0.006) -> None:
+    """Of all valid motions; the rest is that of normals near edges."""
+    assert_close(recording.T_prev_curr[recording.valid].double().numpy(), moved(twist), 0.15, translation_m)
 
 
 @pytest.mark.parametrize("twist", [SLOW, TURNING])
@@ -29,11 +27,8 @@ def test_motions_are_found_from_scratch(box_room, twist):
     recording = prepare(box_room.scans(10, twist), CONFIG)  # more than are made into images at a time
     assert len(recording) == 10
     assert recording.points.shape == (10, 3, 16, 360)
-    rotation_deg, translation_m = errors(recording, twist)
-    # The rest is that of normals near edges.
-    assert rotation_deg.max() < 0.15
-    assert translation_m.max() < 0.006
     assert recording.valid.all()
+    assert_true(recording, twist)
     torch.testing.assert_close(recording.interval_s, torch.full((9,), 0.1), rtol=0, atol=1e-6)
 
 
@@ -43,8 +38,7 @@ def test_sudden_turns_are_found_from_rest(box_room):
     clouds = [sweep.points.reshape(3, -1).T.astype(np.float64) for sweep in box_room.sweeps(2, fast, rolling=False)]
     recording = prepare([Scan(cloud, 0.1 * i) for i, cloud in enumerate(clouds)], CONFIG)
     assert recording.valid.all()
-    assert errors(recording, fast)[0].max() < 0.15
-    assert errors(recording, fast)[1].max() < 0.003
+    assert_true(recording, fast, 0.003)
 
 
 def test_scans_of_different_places_are_not_valid(box_room, corridor):
@@ -59,9 +53,7 @@ def test_one_bad_scan_does_not_lose_those_after_it(box_room, kind):
     scans[2] = Scan.from_raw(3.0 * points, scans[2].stamp + 0.05)
     recording = prepare(scans, CONFIG)
     assert recording.valid.tolist() == [True, False, False, True, True]
-    rotation_deg, translation_m = (error[recording.valid] for error in errors(recording, TURNING))
-    assert rotation_deg.max() < 0.15
-    assert translation_m.max() < 0.006
+    assert_true(recording, TURNING)
 
 
 def test_scans_at_one_time_do_not_move_infinitely_fast(box_room):
