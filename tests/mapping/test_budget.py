@@ -141,13 +141,6 @@ def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_re
             assert np.linalg.norm(one.state.T_world_lidar[:3, 3] - T[:3, 3]) < 0.1
 
 
-@pytest.mark.slow  # follows fifty scans
-def test_without_a_budget_the_same_search_takes_one_scan(carried, clock):
-    mapped = list(results(Mapper(MappingConfig(), clock=clock), carried, clock))
-    assert max(clock.taken_ms[2:]) > 3 * BUDGET_MS
-    assert mapped[AT].message.startswith("relocalised")
-
-
 @pytest.mark.long
 def test_a_search_that_was_under_way_begins_anew_after_a_resumption(carried, clock):
     config = MappingConfig(budget_ms=BUDGET_MS)

@@ -6,13 +6,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
-from lidarslam.core.state import decode
 from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
 from lidarslam.mapping.loam.features import EDGE, PLANE
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.large_surfaces import are_large
-from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
@@ -74,12 +72,6 @@ def test_a_map_of_other_cells_has_the_same_points(rng):
     for found, expected in zip(resized.grids, coarse.grids, strict=True):
         assert found._sums[:, 0].sum() == expected._sums[:, 0].sum()
         assert len(found) == pytest.approx(len(expected), rel=0.2)
-
-
-def test_a_local_map_is_restored_as_what_it_is(rng, through_disk):
-    whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
-    saved = through_disk({"map": whole.state()})
-    assert isinstance(decode(LocalMap | None, saved.value("map"), saved), FeatureMap)
 
 
 def on_plane(rng: np.random.Generator, count: int, noise_m: float = 0.0) -> FloatArray:

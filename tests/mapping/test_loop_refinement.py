@@ -9,12 +9,14 @@ from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.loops.refinement import DenseSubmap
 
 from .runs import assert_near
+from .shapes import on_boxes
 
 T_TARGET_SOURCE = exp([0.01, -0.02, 0.6, 3.0, -1.5, 0.1])
 OFF = exp([0.004, -0.003, 0.006, 0.05, -0.04, 0.03])
 PRIOR = np.diag(np.array([np.deg2rad(0.5)] * 3 + [0.05] * 3) ** 2)
 DRIFT = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
 CELL_M = 0.2
+PILLARS = ((-6.0, 2.0), (-1.0, -3.0), (5.0, 1.0))
 NOISE_M = 0.01
 
 
@@ -26,16 +28,11 @@ def refine(
 
 
 def planes(rng: np.random.Generator, ends: bool) -> FloatArray:
-    """Points on floor and walls of a hall of 20 x 8 m, and on its ends and some pillars."""
-    faces = [((-10, -4, 0), (20, 8, 0)), ((-10, -4, 0), (20, 0, 3)), ((-10, 4, 0), (20, 0, 3))]
-    if ends:
-        faces += [((-10, -4, 0), (0, 8, 3)), ((10, -4, 0), (0, 8, 3))]
-        faces += [((x, y, 0), size) for x, y in ((-6, 2), (-1, -3), (5, 1)) for size in ((0.8, 0, 3), (0, 0.8, 3))]
-    clouds = []
-    for corner, extent in faces:
-        area = float(np.prod([length for length in extent if length]))
-        clouds.append(np.array(corner) + rng.uniform(size=(int(60 * area), 3)) * extent)
-    cloud = np.concatenate(clouds)
+    """Points on floor, ceiling and walls of a hall of 20 x 8 x 3 m, and on its ends and some pillars."""
+    hall, pillars = ((0.0, 0.0, 1.5), (10.0, 4.0, 1.5)), [((x, y, 1.5), (0.4, 0.4, 1.5)) for x, y in PILLARS]
+    cloud = on_boxes([hall, *pillars] if ends else [hall], 1.0 / 60.0, rng)
+    if not ends:
+        cloud = cloud[np.abs(cloud[:, 0]) < 10.0]
     return np.asarray(cloud + rng.normal(scale=NOISE_M, size=cloud.shape))
 
 

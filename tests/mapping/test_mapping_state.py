@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.config import KeyframeConfig, MappingConfig
-from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
+
+from .runs import process
 
 
 @pytest.fixture(autouse=True)
@@ -43,24 +43,20 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
 )
 def test_a_mapper_goes_on(through_disk, request, method, recording, resumed_after):
     config, scans = MappingConfig(keypoints=600, method=method), request.getfixturevalue(recording)[:12]
-    whole = Mapper(config)
-    expected = [whole.process(whole.sample(scan), Prior()) for scan in scans]
+    expected = process(Mapper(config), scans)
     assert Status.OK in {mapped.status for mapped in expected}
     assert any("a new map" in mapped.message for mapped in expected) == (method == "surfels")
     for after in resumed_after:
         first, second = Mapper(config), Mapper(config)
-        for scan in scans[:after]:
-            first.process(first.sample(scan), Prior())
+        process(first, scans[:after])
         second.restore(through_disk(first.state()))
-        for scan, mapped in zip(scans[after:], expected[after:], strict=True):
-            assert_same(second.process(second.sample(scan), Prior()), mapped)
+        for found, mapped in zip(process(second, scans[after:]), expected[after:], strict=True):
+            assert_same(found, mapped)
 
 
 @pytest.mark.parametrize("tidied_after", [1_000, 3])
 def test_a_map_that_has_forgotten_goes_on(rng, through_disk, monkeypatch, tidied_after):
     """Rows of cells are in the order in which they came, also after some were dropped."""
-    from lidarslam.mapping.surfels.surfel_map import SurfelMap
-
     monkeypatch.setattr("lidarslam.mapping.surfels.surfel_map._TIDIED_AFTER", tidied_after)
 
     def add(local_map: SurfelMap, step: int, seed: int) -> None:
@@ -80,15 +76,3 @@ def test_a_map_that_has_forgotten_goes_on(rng, through_disk, monkeypatch, tidied
         found = restored.match(queries, np.eye(4))
         for name, value in vars(whole.match(queries, np.eye(4))).items():
             np.testing.assert_array_equal(getattr(found, name), value)
-
-
-def test_keyframes_are_chosen_as_before(rng, through_disk):
-    points = rng.uniform(-5.0, 5.0, (2000, 3))
-    selector, restored = KeyframeSelector(KeyframeConfig()), KeyframeSelector(KeyframeConfig())
-    selector.take(np.eye(4), points)
-    restored.restore(through_disk(selector.state()))
-    poses = [exp([0.0, 0.0, turn, way, 0.0, 0.0]) for turn in (0.0, 0.3, 1.0) for way in (0.0, 0.5, 0.9, 2.0)]
-    answers = [selector.is_due(pose, points) for pose in poses]
-    assert set(answers) == {True, False}
-    assert [restored.is_due(pose, points) for pose in poses] == answers
-    assert restored.is_due(np.eye(4), points + 3.0) == selector.is_due(np.eye(4), points + 3.0)

@@ -25,7 +25,6 @@ COLONNADE = tuple((x, side * 5.0, 0.8) for x in range(-45, 46, 5) for side in (-
 
 @pytest.fixture(scope="module")
 def street(room):
-    """The street."""
     return replace(room, half_size=(60.0, 9.0, 2.0), pillars=BESIDE)
 
 
@@ -51,7 +50,6 @@ def record(place: object, ahead: float | None = None) -> list[FloatArray]:
 
 @pytest.fixture(scope="module")
 def scans(street: object) -> list[FloatArray]:
-    """Of the street."""
     return record(street)
 
 

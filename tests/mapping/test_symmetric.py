@@ -44,15 +44,7 @@ def test_values_of_random_matrices_of_any_size(rng, scale):
 
 @pytest.mark.parametrize(
     "spectrum",
-    [
-        [0.0, 0.0, 0.0],
-        [1.0, 1.0, 1.0],
-        [0.0, 1.0, 1.0],
-        [0.0, 0.0, 1.0],
-        [1.0, 1.0, 3.0],
-        [-2.0, -2.0, 5.0],
-        [0.0, 1e-9, 1.0],
-    ],
+    [[0, 0, 0], [1, 1, 1], [0, 1, 1], [0, 0, 1], [1, 1, 3], [-2, -2, 5], [0, 1e-9, 1]],
     ids=["zero", "ball", "disc", "needle", "long", "indefinite", "noisy needle"],
 )
 def test_values_of_special_spectra(rng, spectrum):

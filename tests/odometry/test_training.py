@@ -13,7 +13,7 @@ from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.losses import objective
 from lidarslam.odometry.training.pairs import birds, pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.training import learning_rate, make_optimizer, summarise, validate
+from lidarslam.odometry.training.training import learning_rate, make_optimizer, validate
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 
@@ -108,10 +108,3 @@ def test_without_a_valid_pair_there_is_no_number(small_room):
         assert found.pairs == 0
         assert math.isnan(found.rotation_rms_deg)
         assert all(math.isnan(share) for share in found.covered_percent)
-
-
-def test_coverage_of_a_normal_distribution():
-    g = torch.Generator().manual_seed(0)
-    sigmas = torch.rand(20_000, 6, generator=g) + 0.1
-    found = summarise(torch.randn(20_000, 6, generator=g) * sigmas, sigmas)
-    assert found.covered_percent == pytest.approx((68.27, 95.45, 99.73), abs=0.3)
