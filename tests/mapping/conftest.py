@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,6 @@ EXACT = RangeModel(0.05, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 STAND = (0.7, -0.4, 1.3)
 
 Scanner = Callable[..., Scan]
-RoomPoints = Callable[[np.random.Generator, int], FloatArray]
-Grass = Callable[[np.random.Generator, float], tuple[FloatArray, FloatArray]]
 
 
 def _room() -> World:
@@ -47,37 +44,6 @@ def scan_room() -> Scanner:
         return Simulation(world, model, still, mount_pose(mount, 0.0), 5).scan(1).scan
 
     return scan
-
-
-@pytest.fixture(scope="session")
-def l_shaped_room() -> RoomPoints:
-    """Makes so many points, and a few more, of the room below."""
-    return _l_shaped_room
-
-
-def _l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points (N, 3) on the walls, floor and ceiling of a room that looks the same from no two places."""
-    corners = np.array([[-4, -3], [6, -3], [6, 1], [1, 1], [1, 5], [-4, 5], [-4, -3]], dtype=float)
-    parts = []
-    for a, b in pairwise(corners):
-        along = rng.uniform(0.0, 1.0, (round(count * np.linalg.norm(b - a) / 36.0), 1))
-        parts.append(np.column_stack([a + along * (b - a), rng.uniform(-1.5, 1.5, len(along))]))
-    flat = rng.uniform([-4, -3], [6, 5], (count, 2))
-    flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
-    parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
-    return np.concatenate(parts)
-
-
-@pytest.fixture(scope="session")
-def grass_on_a_slope() -> Grass:
-    """Points of blades up to a height, and the unit normal of the slope below, which is the same everywhere."""
-
-    def points(rng: np.random.Generator, blade_m: float) -> tuple[FloatArray, FloatArray]:
-        plane, normal = rng.uniform(-6.0, 6.0, (6000, 2)), np.array([-0.1, 0.05, 1.0])
-        heights = -2.0 - plane @ normal[:2] + rng.uniform(0.0, blade_m, len(plane))
-        return np.column_stack([plane, heights]), normal / np.linalg.norm(normal)
-
-    return points
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
-"""Points on boxes, and the map of surfels that they give."""
+"""Points on known surfaces, and the map of surfels that they give."""
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -56,3 +57,23 @@ def surfel_map_of(points: FloatArray, cell_m: float, radius_m: float = 100.0) ->
     surfel_map = SurfelMap(cell_m, radius_m)
     insert(surfel_map, points)
     return surfel_map
+
+
+def l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
+    """So many points (N, 3), and a few more, on the walls, floor and ceiling of a room that looks alike nowhere."""
+    corners = np.array([[-4, -3], [6, -3], [6, 1], [1, 1], [1, 5], [-4, 5], [-4, -3]], dtype=float)
+    parts = []
+    for a, b in pairwise(corners):
+        along = rng.uniform(0.0, 1.0, (round(count * np.linalg.norm(b - a) / 36.0), 1))
+        parts.append(np.column_stack([a + along * (b - a), rng.uniform(-1.5, 1.5, len(along))]))
+    flat = rng.uniform([-4, -3], [6, 5], (count, 2))
+    flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
+    parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
+    return np.concatenate(parts)
+
+
+def grass_on_a_slope(rng: np.random.Generator, blade_m: float) -> tuple[FloatArray, FloatArray]:
+    """Points (N, 3) of blades up to a height, and the unit normal (3,) of the slope below, the same everywhere."""
+    plane, normal = rng.uniform(-6.0, 6.0, (6000, 2)), np.array([-0.1, 0.05, 1.0])
+    heights = -2.0 - plane @ normal[:2] + rng.uniform(0.0, blade_m, len(plane))
+    return np.column_stack([plane, heights]), normal / np.linalg.norm(normal)

@@ -15,7 +15,7 @@ from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 
-from .shapes import across_x, on_sides
+from .shapes import across_x, grass_on_a_slope, on_sides
 
 ORIGIN = np.zeros(3)
 CELL_M = 0.2
@@ -226,7 +226,7 @@ def test_large_surfaces_go_on(rng):
     assert not are_large(feature_map, board, np.array([[0.0, 1.0, 0.0]]), ORIGIN).any()
 
 
-def test_in_grass_a_wider_plane_is_taken(rng, grass_on_a_slope):
+def test_in_grass_a_wider_plane_is_taken(rng):
     """Through the finest voxels, planes are 2.1 degrees off."""
     points, normal = grass_on_a_slope(rng, 0.16)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]

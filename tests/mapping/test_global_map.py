@@ -100,11 +100,10 @@ def test_attributes_go_on(rng, through_disk, monkeypatch):
         whole.add(points, np.eye(4), known)
     for after in range(len(scans)):
         part, restored = GlobalMap(VOXEL_M), GlobalMap(1.0)
-        for points, known in scans[:after]:
-            part.add(points, np.eye(4), known)
-        restored.restore(through_disk(part.state()))
-        for points, known in scans[after:]:
-            restored.add(points, np.eye(4), known)
+        for number, (points, known) in enumerate(scans):
+            if number == after:
+                restored.restore(through_disk(part.state()))
+            (part if number < after else restored).add(points, np.eye(4), known)
         np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
         assert restored.means().layout == whole.means().layout
 

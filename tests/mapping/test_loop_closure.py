@@ -50,8 +50,7 @@ def round_trip(laps: float, step_m: float = 2.0) -> FloatArray:
     angles = np.arange(0.0, laps * 2.0 * np.pi, step_m / 8.5)
     xy = np.stack([10.0 * np.cos(angles), 7.0 * np.sin(angles)], axis=1)
     yaw = np.arctan2(7.0 * np.cos(angles), -10.0 * np.sin(angles))
-    zeros = np.zeros(len(angles))
-    R = exp(np.stack([zeros, zeros, yaw, zeros, zeros, zeros], axis=1))[:, :3, :3]
+    R = exp(np.multiply.outer(yaw, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))[:, :3, :3]
     return make_transform(R, np.column_stack([xy, np.full(len(xy), 1.5)]))
 
 
@@ -79,10 +78,9 @@ def add(detector: LoopDetector, submap: Submap, estimates: FloatArray) -> list[L
     return detector.add(submap.points, submap.way_m, submap.segment, estimates[: submap.index + 1])
 
 
-def detect(submaps, estimates, config: LoopConfig = CONFIG) -> tuple[list[LoopClosure], LoopDetector]:
+def detect(submaps: list[Submap], estimates: FloatArray, config: LoopConfig = CONFIG) -> list[LoopClosure]:
     detector = LoopDetector(config)
-    closures = [c for s in submaps for c in add(detector, s, estimates)]
-    return closures + detector.finish(), detector
+    return [c for s in submaps for c in add(detector, s, estimates)] + detector.finish()
 
 
 def accepted(closures: list[LoopClosure]) -> list[LoopClosure]:
@@ -103,7 +101,7 @@ def twice(hall) -> tuple[list[Submap], FloatArray]:
 
 def test_a_lap_is_closed_in_spite_of_drift(twice):
     submaps, truth = twice
-    found = accepted(detect(submaps, drifted(truth))[0])
+    found = accepted(detect(submaps, drifted(truth)))
     assert len(found) >= 5
     assert_right(found, truth)
     assert all(c.first < c.second and c.reason == "" for c in found)
@@ -115,7 +113,7 @@ def test_a_lap_is_closed_in_spite_of_drift(twice):
 def test_a_lap_is_closed_by_appearance_alone(twice, monkeypatch):
     submaps, truth = twice
     monkeypatch.setattr(KeyframeDatabase, "_nearby", lambda *_: iter(()))
-    found = accepted(detect(submaps, drifted(truth))[0])
+    found = accepted(detect(submaps, drifted(truth)))
     assert len(found) >= detection._CONSISTENT + 1
     assert_right(found, truth)
     assert all(c.by_appearance and c.consistent >= detection._CONSISTENT for c in found)
@@ -124,7 +122,7 @@ def test_a_lap_is_closed_by_appearance_alone(twice, monkeypatch):
 def test_closures_keep_their_distance(twice, monkeypatch):
     submaps, truth = twice
     monkeypatch.setattr(detection, "_SPACING_M", 7.0)
-    found = accepted(detect(submaps, drifted(truth))[0])
+    found = accepted(detect(submaps, drifted(truth)))
     ways = np.array([submaps[c.second].way_m for c in found])
     assert len(ways) >= 2
     assert (np.diff(ways) >= 7.0).all()
@@ -132,8 +130,7 @@ def test_closures_keep_their_distance(twice, monkeypatch):
 
 def test_nothing_is_closed_on_a_way_without_return(hall):
     truth = round_trip(0.45)
-    closures, _ = detect(submaps_of(hall, truth), truth)
-    assert accepted(closures) == []
+    assert accepted(detect(submaps_of(hall, truth), truth)) == []
 
 
 @pytest.mark.long
@@ -141,8 +138,7 @@ def test_segments_are_joined_whatever_their_worlds_and_mounts(hall):
     first, second = round_trip(0.6), round_trip(0.9)[9:] @ exp([0, 0, 0.2, 0.3, -0.2, 0.0]) @ UPSIDE_DOWN
     submaps = submaps_of(hall, first, 0) + submaps_of(hall, second, 1, len(first))
     unrelated = exp([0.1, 0.2, 2.0, 300.0, 5.0, -9.0])
-    closures, _ = detect(submaps, np.concatenate([first, unrelated @ second]))
-    found = accepted(closures)
+    found = accepted(detect(submaps, np.concatenate([first, unrelated @ second])))
     assert len(found) >= detection._CONSISTENT + 1
     assert_right(found, np.concatenate([first, second]))
     assert all(c.first < len(first) <= c.second for c in found)
@@ -166,8 +162,8 @@ def test_rooms_that_are_all_the_same_are_not_taken_for_one(min_way_m, min_simila
             submaps.append(Submap(len(submaps), 0, 12.0 * number + 2.0 * s, seen))
             T[0, 3] += 12.0 * number
             truth.append(T)
-    closures, _ = detect(submaps, np.stack(truth), LoopConfig(min_way_m=min_way_m))
-    assert all(c.first // 3 == c.second // 3 for c in accepted(closures))
+    found = accepted(detect(submaps, np.stack(truth), LoopConfig(min_way_m=min_way_m)))
+    assert all(c.first // 3 == c.second // 3 for c in found)
 
 
 def test_a_planted_falsehood_is_refused(twice, monkeypatch):
@@ -182,7 +178,7 @@ def test_a_planted_falsehood_is_refused(twice, monkeypatch):
         return replace(found, T_target_source=found.T_target_source @ exp([0, 0, 0, 1.2, 0.0, 0.0]))
 
     monkeypatch.setattr(detection, "verify", lying)
-    closures, _ = detect(submaps, drifted(truth))
+    closures = detect(submaps, drifted(truth))
     assert len(calls) > 7
     assert len(accepted(closures)) >= 4
     assert_right(accepted(closures), truth)
@@ -193,9 +189,7 @@ def test_a_planted_falsehood_is_refused(twice, monkeypatch):
 def test_what_drift_cannot_explain_is_refused(twice):
     submaps, truth = twice
     config = LoopConfig(min_way_m=10.0, drift_percent=0.01)
-    estimates = drifted(drifted(truth))
-    closures, _ = detect(submaps, estimates, config)
-    assert accepted(closures) == []
+    assert accepted(detect(submaps, drifted(drifted(truth)), config)) == []
 
 
 @pytest.mark.parametrize("count", [0, 1, 50])
@@ -212,9 +206,8 @@ def test_closures_wait_for_others_to_agree_until_the_segment_ends(twice, monkeyp
     monkeypatch.setattr(detection, "_ALONE_RANGES", 0.0)
     monkeypatch.setattr(detection, "_CONSISTENT", 99)
     monkeypatch.setattr(KeyframeDatabase, "_alike", lambda *_: [])
-    _, detector = detect(submaps[:0], truth)
+    detector, estimates = LoopDetector(CONFIG), drifted(truth)
     last = next(i for i, s in enumerate(submaps) if s.way_m > 60.0)
-    estimates = drifted(truth)
     waiting = [c for s in submaps[:last] for c in add(detector, s, estimates)]
     assert accepted(waiting) == []
     decided = add(detector, Submap(last, 1, 0.0, np.zeros((0, 3))), estimates)

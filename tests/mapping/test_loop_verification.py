@@ -16,12 +16,12 @@ from .shapes import on_boxes
 MIN_OVERLAP = LoopConfig().min_overlap
 # Centre and half sizes; the sensor stands inside.
 ROOM = [((0, 0, 1.5), (5, 4, 1.5)), ((3.2, 2.1, 0.6), (0.5, 1.1, 0.6)), ((-4.4, -1.5, 0.9), (0.6, 0.4, 0.9))]
-OTHER_FURNITURE = [
+OTHER_ROOM = [
+    ROOM[0],
     ((-1.2, 2.4, 0.9), (0.8, 0.5, 0.9)),
     ((2.6, -1.5, 1.4), (0.6, 2.4, 1.4)),
     ((-3.6, 0, 1), (0.9, 2, 1)),
 ]
-OTHER_ROOM = [ROOM[0], *OTHER_FURNITURE]
 CORRIDOR = [((0, 0, 1.3), (60, 1.2, 1.3))]
 
 

@@ -40,6 +40,10 @@ def grid_of(points: FloatArray, elevations: FloatArray | None = None) -> SurfelG
     return grid
 
 
+def surfels_at(grid: SurfelGrid, points: FloatArray) -> FloatArray:
+    return grid.surfels(grid.find(points))
+
+
 def from_above(count: int) -> FloatArray:
     """Seen from high above (N, 3)."""
     return np.tile([0.0, 0.0, 1.0], (count, 1))
@@ -55,8 +59,7 @@ def test_surfels_of_a_plane_lie_on_it_wherever_it_is(seed, away_m):
     rng = np.random.default_rng(seed)
     normal, through = unit(rng.normal(size=3)), away_m * unit(rng.normal(size=3))
     points = on_plane(rng, normal, through)
-    grid = grid_of(points)
-    surfels = grid.surfels(grid.find(points))
+    surfels = surfels_at(grid_of(points), points)
     assert surfels[:, IS_PLANE].all()
     np.testing.assert_allclose(np.abs(surfels[:, NORMAL] @ normal), 1.0, rtol=0.0, atol=1e-10)
     np.testing.assert_allclose(np.cross(surfels[:, NORMAL], normal), 0.0, atol=2e-5)
@@ -69,7 +72,7 @@ def test_a_surfel_is_as_thick_as_the_noise(rng):
     points = on_plane(rng, normal, np.zeros(3), count=20_000)
     grid = grid_of(points + rng.normal(0.0, 0.02, (len(points), 1)) * normal)
     inner = np.abs(points).max(axis=1) < 0.5
-    thickness = grid.surfels(grid.find(points[inner]))[:, SPREADS][:, 0]
+    thickness = surfels_at(grid, points[inner])[:, SPREADS][:, 0]
     np.testing.assert_allclose(thickness, 0.02, rtol=0.1)
 
 
@@ -79,8 +82,7 @@ def test_several_batches_make_what_one_makes(rng):
     for part in np.array_split(np.arange(len(points)), 7):
         in_parts.insert(points[part], elevations[part], from_above(len(part)))
     assert len(at_once) == len(in_parts)
-    one = at_once.surfels(at_once.find(points))
-    other = in_parts.surfels(in_parts.find(points))
+    one, other = surfels_at(at_once, points), surfels_at(in_parts, points)
     np.testing.assert_allclose(other[:, MEAN], one[:, MEAN], atol=1e-5)
     np.testing.assert_allclose(other[:, SPREADS], one[:, SPREADS], atol=1e-4)
     np.testing.assert_allclose(other[:, ELEVATION_SPREAD], one[:, ELEVATION_SPREAD], atol=1e-4)
@@ -92,7 +94,7 @@ def test_a_point_counts_as_many_as_it_weighs(rng):
     weighed, repeated = SurfelGrid(CELL), SurfelGrid(CELL)
     weighed.insert(points, elevations, from_above(3_000), weight=3.0)
     repeated.insert(np.repeat(points, 3, axis=0), np.repeat(elevations, 3), from_above(9_000))
-    one, other = weighed.surfels(weighed.find(points)), repeated.surfels(repeated.find(points))
+    one, other = surfels_at(weighed, points), surfels_at(repeated, points)
     for columns in (MEAN, SPREADS, ELEVATION_SPREAD):
         np.testing.assert_allclose(one[:, columns], other[:, columns], atol=1e-4)
     np.testing.assert_allclose(one[:, COUNT], other[:, COUNT], rtol=1e-5)
@@ -102,9 +104,8 @@ def test_a_point_counts_as_many_as_it_weighs(rng):
 def test_a_wall_along_the_border_of_cells_is_one_plane(rng, offset):
     """Noise throws half of its points into the cells on either side."""
     points = np.column_stack([rng.normal(offset, 0.005, 6_000), rng.uniform(-2, 2, (6_000, 2))])
-    grid = grid_of(points)
     inner = np.abs(points[:, 1:]).max(axis=1) < 1.0
-    surfels = grid.surfels(grid.find(points[inner]))
+    surfels = surfels_at(grid_of(points), points[inner])
     assert surfels[:, IS_PLANE].all()
     np.testing.assert_allclose(surfels[:, MEAN][:, 0], offset, atol=0.002)
     assert np.rad2deg(np.arccos(np.abs(surfels[:, NORMAL][:, 0]).min())) < 0.5
@@ -117,13 +118,13 @@ def test_samples_of_cells_are_seen_from_where_their_points_were(rng):
     samples, elevations, views = grid.samples()
     np.testing.assert_allclose(views, np.tile([-0.6, 0.8, 0.0], (len(samples), 1)), atol=1e-5)
     other.insert(samples, elevations, views)
-    assert other.surfels(other.find(samples))[:, NORMAL][:, 0].max() < -0.99
+    assert surfels_at(other, samples)[:, NORMAL][:, 0].max() < -0.99
 
 
 def test_neighbours_count_less_than_the_cell_itself():
     """Two points beside one another in neighbouring cells: the surfel lies nearer to the cell's own."""
-    grid = grid_of(np.array([[0.25, 0.25, 0.25], [0.75, 0.25, 0.25]]))
-    surfel = grid.surfels(grid.find(np.array([[0.25, 0.25, 0.25]])))
+    points = np.array([[0.25, 0.25, 0.25], [0.75, 0.25, 0.25]])
+    surfel = surfels_at(grid_of(points), points[:1])
     np.testing.assert_allclose(surfel[:, MEAN], [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
     np.testing.assert_allclose(surfel[:, COUNT], 1.8, rtol=1e-6)
 
@@ -133,8 +134,7 @@ def test_a_line_has_its_direction(seed):
     rng = np.random.default_rng(seed)
     direction, through = unit(rng.normal(size=3)), 100.0 * rng.normal(size=3)
     points = through + rng.uniform(-3.0, 3.0, (600, 1)) * direction
-    grid = grid_of(points)
-    surfels = grid.surfels(grid.find(points))
+    surfels = surfels_at(grid_of(points), points)
     assert not surfels[:, IS_PLANE].any()
     np.testing.assert_allclose(np.cross(surfels[:, DIRECTION], direction), 0.0, atol=2e-5)
     np.testing.assert_allclose(np.cross(surfels[:, MEAN] - through, direction), 0.0, atol=1e-5)
@@ -143,8 +143,7 @@ def test_a_line_has_its_direction(seed):
 def test_a_ball_of_points_is_no_plane_nor_are_five_points(rng):
     few = np.array([[0.1, 0.1, 0.1], [0.4, 0.1, 0.1], [0.1, 0.4, 0.1], [0.4, 0.4, 0.1], [0.2, 0.3, 0.1]])
     for points, asked in ((cloud(rng, 20_000, half_size=1.5), [0.1, 0.2, 0.3]), (few, [0.2, 0.2, 0.1])):
-        grid = grid_of(points)
-        assert not grid.surfels(grid.find(np.array([asked])))[:, IS_PLANE].any()
+        assert not surfels_at(grid_of(points), np.array([asked]))[:, IS_PLANE].any()
 
 
 def test_an_empty_cell_shows_the_nearest_around_it():
@@ -176,12 +175,12 @@ def test_what_is_near_stays_with_its_surfels_when_the_rest_is_forgotten(rng):
     middles = (np.floor(points / CELL) + 0.5) * CELL
     distance = np.linalg.norm(middles - centre, axis=1)
     # Patches are worked out before: what is kept must not be worked out from what is gone.
-    before = grid.surfels(grid.find(points))
+    before = surfels_at(grid, points)
     held = len(grid)
     grid.drop_beyond(centre, 3.0)
     near = distance <= 3.0
     assert len(grid) == len(np.unique(middles[near], axis=0)) < held
-    np.testing.assert_array_equal(grid.surfels(grid.find(points[near])), before[near])
+    np.testing.assert_array_equal(surfels_at(grid, points[near]), before[near])
     far = distance > 3.0 + 2.0 * CELL * 3**0.5
     assert (grid.find(points[far]) == ABSENT).all()
 
@@ -189,18 +188,18 @@ def test_what_is_near_stays_with_its_surfels_when_the_rest_is_forgotten(rng):
 def test_a_cell_that_has_seen_enough_moves_no_more(rng):
     wall = across_x(rng, 0.25, 1.0, 9_000)
     grid = grid_of(wall)
-    before = grid.surfels(grid.find(wall))
+    before = surfels_at(grid, wall)
     drifted = wall + np.array([0.1, 0.0, 0.0])
     grid.insert(drifted, np.zeros(len(wall)), from_above(len(wall)))
-    np.testing.assert_array_equal(grid.surfels(grid.find(wall)), before)
+    np.testing.assert_array_equal(surfels_at(grid, wall), before)
 
 
 def test_one_ring_has_no_spread_of_elevation_and_two_have_half_their_distance(rng):
     points = np.column_stack([np.full(400, 10.1), rng.uniform(-0.2, 0.2, 400), np.full(400, 0.1)])
     one = grid_of(points, np.full(400, 0.25))
-    assert one.surfels(one.find(points))[:, ELEVATION_SPREAD].max() < 3e-4
+    assert surfels_at(one, points)[:, ELEVATION_SPREAD].max() < 3e-4
     two = grid_of(points, np.repeat([0.25, 0.29], 200))
-    np.testing.assert_allclose(two.surfels(two.find(points))[:, ELEVATION_SPREAD], 0.02, rtol=0.1)
+    np.testing.assert_allclose(surfels_at(two, points)[:, ELEVATION_SPREAD], 0.02, rtol=0.1)
 
 
 def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng):
@@ -208,12 +207,12 @@ def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng):
     stray = np.array([[0.25, 0.25, 0.6]]) + rng.normal(0.0, 0.02, (10, 3))
     wall = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.array([0.25, 0.25, 0.45]), half_size=2.0)
     grid = grid_of(stray)
-    assert not grid.surfels(grid.find(stray))[:, IS_PLANE].any()
+    assert not surfels_at(grid, stray)[:, IS_PLANE].any()
     grid.insert(wall, np.zeros(len(wall)), from_above(len(wall)))
-    assert not grid.surfels(grid.find(stray))[:, IS_PLANE].any()
+    assert not surfels_at(grid, stray)[:, IS_PLANE].any()
     grid._tidied = len(grid)  # so that no cell is forgotten
     grid.tidy()
-    surfels = grid.surfels(grid.find(stray))
+    surfels = surfels_at(grid, stray)
     assert surfels[:, IS_PLANE].all()
     np.testing.assert_allclose(np.abs(surfels[:, NORMAL][:, 2]), 1.0, atol=1e-3)
 
@@ -224,11 +223,11 @@ def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng):
     once = on_plane(rng, np.array([1.0, 0.0, 0.0]), np.array([30.25, 0.0, 0.0]), count=60)  # as few as a stray, alone
     grid = grid_of(np.concatenate([wall, strays, once]))
     inner = wall[np.abs(wall).max(axis=1) < 1.9]  # at its border cells have few points, too
-    seen = grid.surfels(grid.find(inner))[:, MEAN]
+    seen = surfels_at(grid, inner)[:, MEAN]
     grid.tidy()
     assert (grid.find(strays[strays[:, 2] > 1.8]) == ABSENT).all()
     assert (grid.find(once) != ABSENT).all()
-    np.testing.assert_allclose(grid.surfels(grid.find(inner))[:, MEAN], seen, atol=1e-3)
+    np.testing.assert_allclose(surfels_at(grid, inner)[:, MEAN], seen, atol=1e-3)
 
 
 def test_a_place_seen_again_and_again_takes_no_more_cells(rng):

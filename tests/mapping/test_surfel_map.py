@@ -8,7 +8,7 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
-from .shapes import across_x, insert, on_sides, surfel_map_of
+from .shapes import across_x, grass_on_a_slope, insert, on_sides, surfel_map_of
 
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
@@ -132,7 +132,7 @@ def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_
     np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])  # without a floor the world's
 
 
-def test_in_grass_a_wider_plane_is_taken_and_with_an_imu_the_finest_of_a_young_map(rng, grass_on_a_slope):
+def test_in_grass_a_wider_plane_is_taken_and_with_an_imu_the_finest_of_a_young_map(rng):
     """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off.
 
     Few sweeps of a sensor without rings are a few strokes, of which coarse cells make planes of any direction.

@@ -92,10 +92,6 @@ class Scene:
             scans.append(Scan.from_raw(points[seen], stamp, times[seen], rings[seen]))
         return scans
 
-    def images(self, count: int, twist: Sequence[float]) -> list[torch.Tensor]:
-        """Points, normals and offsets of the sweeps."""
-        return stacked(self.sweeps(count, twist))
-
     def recording(self, count: int, twist: Sequence[float], rolling: bool = True) -> PreparedRecording:
         """The sweeps with their true motions, all valid."""
         T = torch.from_numpy(exp(self.period_s * np.asarray(twist))).float().expand(count - 1, 4, 4)

@@ -72,15 +72,9 @@ def test_a_pickle_is_refused_unopened(how, tmp_path):
         (lambda _, __: None, "no such file"),
         (lambda path, _: path.write_text("some notes that are long enough"), "is no safetensors file"),
         (lambda path, _: path.mkdir(), "is no safetensors file"),
-        (lambda path, weights: save_file(weights, path), "holds tensors of another program, not weights"),
-        (
-            lambda path, weights: write_tensor_file(path, Kind("the state of a training", 1), weights, {}),
-            "holds the state of a training, not weights",
-        ),
-        (
-            lambda path, weights: write_tensor_file(path, Kind("weights", 99), weights, {}),
-            "version 99, this program reads 1 at most; use a newer",
-        ),
+        (lambda path, weights: save_file(weights, path), "another program"),
+        (lambda path, weights: write_tensor_file(path, Kind("a training", 1), weights, {}), "holds a training, not"),
+        (lambda path, weights: write_tensor_file(path, Kind("weights", 99), weights, {}), "version 99, .* use a newer"),
     ],
 )
 def test_other_files_kinds_and_versions_are_told(trained, tmp_path, make, told):

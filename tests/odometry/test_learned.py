@@ -34,12 +34,7 @@ class Told:
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:  # noqa: ARG002
         return Described(points[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
 
-    def compare(
-        self,
-        previous: Described,  # noqa: ARG002
-        points: Floats,
-        normals: Floats,
-    ) -> tuple[tuple[Candidate, ...], Described]:
+    def compare(self, _: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
         guess = self.guesses.pop(0) if len(self.guesses) > 1 else self.guesses[0]
         return (Candidate(guess, np.diag(np.full(6, self.sigma**2)), 0.0),), self.describe(points, normals)
 

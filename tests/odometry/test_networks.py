@@ -18,6 +18,8 @@ from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.losses import objective
 from lidarslam.odometry.training.pairs import PairBatch, birds, pair_of, rotate_columns
 
+from .conftest import stacked
+
 COLUMNS = 96
 FEATURE_COLUMNS = COLUMNS // 4
 TWIST = (0.0, 0.0, 1.0, 2.0, 0.5, 0.0)
@@ -37,7 +39,7 @@ def network() -> CorrelationNetwork:
 @pytest.fixture(scope="module")
 def scans(small_room) -> tuple[Tensor, Tensor]:
     """Points and normals (3, 3, H, W) each."""
-    points, normals, _ = small_room.images(3, TWIST)
+    points, normals, _ = stacked(small_room.sweeps(3, TWIST))
     return points, normals
 
 

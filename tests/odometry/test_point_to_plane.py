@@ -127,16 +127,6 @@ def test_fits_are_those_of_the_slow_sums(box_room, rolling):
         np.testing.assert_allclose(matrix, expected, atol=4e-3 * np.abs(expected).max())
 
 
-def test_an_image_without_points_says_nothing(box_room):
-    sweeps = noisy_pair(box_room, True)
-    parts = {name: 0.0 * getattr(sweeps.current, name) for name in ("points", "normals", "offsets")}
-    sums = PointToPlane(replace(sweeps, current=replace(sweeps.current, **parts)), STEP)
-    H, g = sums.normal_equations(motion(1), 0.5)
-    assert not H.any()
-    assert not g.any()
-    assert sums.fit(motion(1)).inliers == 0
-
-
 def positive(rng: np.random.Generator, size: int, weakest: float = 1.0) -> np.ndarray:
     axes = np.linalg.qr(rng.normal(size=(size, size)))[0]
     return np.ascontiguousarray(axes @ np.diag(np.geomspace(weakest, 1e3, size)) @ axes.T)

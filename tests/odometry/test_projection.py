@@ -46,12 +46,6 @@ def pixel_of(points: Points, grid: ImageGrid = GRID) -> list[tuple[int, ...]]:
     return [tuple(pixel) for one in points for pixel in np.argwhere(project(one[None], grid).index == 0).tolist()]
 
 
-def test_a_point_is_in_the_pixel_of_its_angles():
-    # 2 degrees to a row, 4 to a column
-    points = polar([2.0, 6.0, 91.0, -1.0], [-15.0, 15.0, -0.1, 0.1], 5.0)
-    assert pixel_of(points) == [(0, 0), (15, 1), (7, 22), (8, 89)]
-
-
 def test_every_pixel_holds_the_nearest_of_a_dense_cloud():
     points = random_cloud(20_000)
     row, column = place(points)
