@@ -26,22 +26,13 @@ FACES = ((2.0, 1.0), (-2.5, -1.0), (3.5, -1.0), (-4.0, 1.0))
 T_TRUE = exp([0.0, 0.01, 0.05, 0.3, 0.1, -0.05])
 
 
-def walls(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points on the walls, the floor and the ceiling of 12 m, 2.4 m wide and high."""
-    return on_sides(rng, np.array([6.0, 1.2, 1.2]), count, (1, 2))
-
-
-def faces(rng: np.random.Generator, count: int) -> FloatArray:
-    """As many points on each face of 0.4 x 0.6 m."""
-    parts = []
-    for x, side in FACES:
-        y, z = rng.uniform(0.8, 1.2, count) * side, rng.uniform(-1.2, -0.6, count)
-        parts.append(np.column_stack([np.full(count, x), y, z]))
-    return np.concatenate(parts)
-
-
 def scene(rng: np.random.Generator, on_walls: int, on_each_face: int) -> FloatArray:
-    points = np.concatenate([walls(rng, on_walls), faces(rng, on_each_face)])
+    """Points on walls, floor and ceiling of 12 m, 2.4 m wide and high, then on each face of 0.4 x 0.6 m."""
+    parts = [on_sides(rng, np.array([6.0, 1.2, 1.2]), on_walls, (1, 2))]
+    for x, side in FACES:
+        y, z = rng.uniform(0.8, 1.2, on_each_face) * side, rng.uniform(-1.2, -0.6, on_each_face)
+        parts.append(np.column_stack([np.full(on_each_face, x), y, z]))
+    points = np.concatenate(parts)
     return points + rng.normal(scale=NOISE_M, size=points.shape)
 
 

@@ -33,12 +33,6 @@ def test_where_the_world_lies_does_not_matter(trajectory, rng):
     np.testing.assert_allclose(there, FAR @ here, atol=1e-8)
 
 
-def test_keyframes_get_exactly_their_poses(trajectory, rng):
-    keyframes = np.array([5, 12, 13, 33])
-    poses = exp(rng.normal(size=(4, 6)))
-    np.testing.assert_array_equal(corrected(trajectory, keyframes, poses)[keyframes], poses)
-
-
 def test_a_rigid_move_of_all_keyframes_moves_everything(trajectory):
     keyframes = np.array([5, 12, 33])
     move = exp([0.4, -0.2, 1.5, 10.0, 20.0, -3.0])

@@ -166,19 +166,12 @@ def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper, drive_by)
     assert_recovered(back, recorded, 3)
 
 
-def test_dropped_scans_do_no_harm(mapper, drive_by):
-    recorded = dropped(drive_by, range(AT, AT + 10))
+@pytest.mark.parametrize(("missing", "then", "last"), [(10, 20, 5), pytest.param(50, 25, 3, marks=pytest.mark.slow)])
+def test_dropped_scans_do_no_harm_and_5_s_are_bridged_when_the_map_is_met_again(mapper, drive_by, missing, then, last):
+    recorded = dropped(replace(drive_by, scan_count=AT + missing + then), range(AT, AT + missing))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
-    assert_recovered(results, recorded)
-
-
-@pytest.mark.slow  # follows a hundred scans
-def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper, drive_by):
-    recorded = dropped(replace(drive_by, scan_count=AT + 75), range(AT, AT + 50))
-    results = process(mapper, recorded)
-    assert_nothing_wrong_is_believed(results, recorded)
-    assert_recovered(results, recorded, 3)
+    assert_recovered(results, recorded, last)
 
 
 @pytest.mark.slow  # follows a hundred scans

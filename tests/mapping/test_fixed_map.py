@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
@@ -140,3 +141,11 @@ def test_a_covered_sensor_is_lost_and_tracked_again(room, room_map):
     assert mapped[-1].status is Status.OK
     off_m, _ = errors(poses_of(mapped))
     assert off_m[-3:].max() < 0.03
+
+
+def test_a_map_far_from_its_origin_is_refused(rng):
+    points = np.add(rng.uniform(-5.0, 5.0, (500, 3)), [4.5e6, 5e6, 0.0])
+    fixed = FixedMap(points, np.tile([0.0, 0.0, 1.0], (500, 1)))
+    for use in (lambda: fixed.region(points[0], 10.0, 0.1), lambda: fixed.views(0.1)):
+        with pytest.raises(InputError, match=r"up to 5,000 km from its origin, and cells of 0\.1 m reach 105 km"):
+            use()

@@ -5,9 +5,13 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
+from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map import global_map as module
+from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.voxels import COUNT
+from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 from .shapes import across_x
 
@@ -142,3 +146,26 @@ def test_views_turn_with_the_submap():
         drawn = GlobalMap(0.1)
         drawn.add_means(submap.means(), exp([tip, 0.0, 0.0, 0.0, 0.0, 0.0]))
         np.testing.assert_allclose(drawn.cloud().normals.mean(axis=0), expected, atol=1e-6)
+
+
+def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng):
+    points = rng.uniform(-5.0, 5.0, (500, 3))
+    whole, moved = GlobalMap(0.05), GlobalMap(0.05)
+    whole.add(points, np.eye(4))
+    moved.add(points, np.eye(4))
+    for distance_m in (-1e7, 60_000.0, 1e12):
+        moved.add(points, exp([0.0, 0.0, 0.0, 0.0, distance_m, 0.0]))
+    moved.add_means(whole.means(), exp([0.0, 0.0, 0.0, 1e7, 0.0, 0.0]))
+    np.testing.assert_array_equal(moved.points(), whole.points())
+    assert moved.beyond == 1500 + len(whole.points())
+    drawn = drawn_map(moved, Views().placed(np.empty((0, 4, 4))), GlobalMapConfig())
+    assert "52 km" in drawn.warning
+
+
+def test_points_up_to_the_reach_are_in_the_map(rng):
+    points = rng.uniform(-5.0, 5.0, (500, 3))
+    near, far = GlobalMap(0.05), GlobalMap(0.05)
+    near.add(points, np.eye(4))
+    far.add(points, exp([0.0, 0.0, 0.0, reach_m(0.05) - 6.0, 0.0, 0.0]))
+    assert far.beyond == 0
+    assert len(far.points()) == pytest.approx(len(near.points()), rel=0.1)

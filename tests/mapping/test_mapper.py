@@ -84,10 +84,6 @@ def settled(rest_scans: list[Scan]) -> Mapper:
     return mapper
 
 
-def size(mapper: Mapper) -> int:
-    return len(mapper.local_map)
-
-
 @pytest.mark.parametrize("config", [SURFELS, LOAM], ids=["surfels", "loam"])
 def test_the_first_scan_is_the_world(config, ring_scans):
     mapper = Mapper(config)
@@ -168,11 +164,11 @@ def test_a_first_scan_of_nothing_is_lost_and_the_next_begins_the_map(mapper, res
 def test_a_scan_of_nothing_or_another_place_is_lost_goes_on_as_before_and_changes_nothing(
     settled, rest_scans, rest_truth, nothing_known, why
 ):
-    held, truth = size(settled), inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar
+    held, truth = len(settled.local_map), inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar
     (lost,) = process(settled, [nothing_known(rest_scans[15].stamp)])
     assert (lost.status, lost.registered) == (Status.LOST, False)
     assert why in lost.message
-    assert size(settled) == held
+    assert len(settled.local_map) == held
     np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_predicted)
     assert np.linalg.norm(lost.state.T_world_lidar[:3, 3] - truth[15, :3, 3]) < 0.02
     results = process(settled, rest_scans[16:])
@@ -185,14 +181,14 @@ def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_a_map_that_is_not_yo
     mapper = Mapper(MappingConfig(tracking=TrackingConfig(degraded_below=1.0)))
     mapper.process(mapper.sample(rest_scans[0]), Prior(velocity=np.zeros(6)))
     process(mapper, rest_scans[1:earlier])
-    held = size(mapper)
+    held = len(mapper.local_map)
     # A quarter of its points stand before the walls, as people do.
     crowded = rest_scans[earlier].points.copy()
     crowded[::4] *= 0.8
     (placed,) = process(mapper, [replace(rest_scans[earlier], points=crowded)])
     assert (placed.registered, placed.status) == (True, Status.DEGRADED)
     assert "fits the map" in placed.message
-    assert (size(mapper) > held) == is_inserted
+    assert (len(mapper.local_map) > held) == is_inserted
 
 
 @pytest.mark.parametrize("turned_deg", [-100.0, 180.0])
@@ -283,3 +279,51 @@ def test_along_a_corridor_loam_keeps_the_odometry(room):
         assert result.state.T_world_lidar[0, 3] == pytest.approx(0.09 * k, abs=0.02)
         np.testing.assert_allclose(result.state.T_world_lidar[1:3, 3], 0.0, atol=5e-3)
     assert (np.diff(sigmas) > 0.0).all(), "the uncertainty grows on the way"
+
+
+@pytest.mark.parametrize("config", [SURFELS, LOAM], ids=["surfels", "loam"])
+def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(config, room, drive):
+    near, beyond = Prior(np.eye(4)), Prior(exp([0.0, 0.0, 0.0, 1e7, 0.0, 0.0]), covariance=1e-12 * np.eye(6))
+    mapper = Mapper(config.model_copy(update={"cell_m": 0.05, "max_range_m": 30.0}))
+    _, lost = process(mapper, [room.ring_sweep(drive, 0.1), room.ring_sweep(drive, 0.2)], [near, beyond])
+    assert lost.status is Status.LOST
+    assert "52 km" in lost.message
+
+
+@pytest.fixture(scope="module")
+def disturbed_scans(room_scans: list[Scan]) -> list[Scan]:
+    """Thinned sweeps; two are of points that lie on nothing, so that the map is begun anew, and one is empty."""
+    chosen = [scan.select(np.arange(0, len(scan), 3)) for scan in room_scans[:12]]
+    for index in (5, 6):
+        chosen[index] = garbage(chosen[index].stamp, index)
+    chosen[9] = empty(chosen[9].stamp)
+    return chosen
+
+
+def assert_same(found: MappedScan, expected: MappedScan) -> None:
+    for name, value in vars(expected.state).items():
+        np.testing.assert_array_equal(getattr(found.state, name), value, err_msg=name)
+    np.testing.assert_array_equal(found.T_world_predicted, expected.T_world_predicted)
+    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "is_connected"):
+        assert getattr(found, name) == getattr(expected, name), name
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("method", "recording", "resumed_after"),
+    [("surfels", "disturbed_scans", (1, 6, 8)), ("loam", "ring_scans", (1, 7))],
+)
+def test_a_restored_mapper_goes_on_to_the_last_bit(
+    through_disk, request, monkeypatch, method, recording, resumed_after
+):
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
+    config, scans = MappingConfig(keypoints=600, method=method), request.getfixturevalue(recording)[:12]
+    expected = process(Mapper(config), scans)
+    assert Status.OK in {mapped.status for mapped in expected}
+    assert any("a new map" in mapped.message for mapped in expected) == (method == "surfels")
+    for after in resumed_after:
+        first, second = Mapper(config), Mapper(config)
+        process(first, scans[:after])
+        second.restore(through_disk(first.state()))
+        for found, mapped in zip(process(second, scans[after:]), expected[after:], strict=True):
+            assert_same(found, mapped)

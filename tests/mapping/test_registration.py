@@ -22,10 +22,6 @@ T_TRUE = exp([0.02, -0.03, 0.5, 0.6, -0.4, 0.1])
 TURNING = np.concatenate([np.deg2rad([0.0, 0.0, 120.0]), [1.5, 0.0, 0.0]])
 
 
-def map_of(planes: FloatArray) -> SurfelMap:
-    return surfel_map_of(planes, CELL)
-
-
 def seen(world: FloatArray, T_world_lidar: FloatArray, times: FloatArray, velocity: FloatArray) -> FloatArray:
     """Points (N, 3) of the world as measured from where the sensor was at their times (N,)."""
     T_lidar_world = inverse(T_world_lidar @ exp(times[:, None] * velocity))
@@ -55,15 +51,13 @@ def predicted(
 
 
 def register(sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap) -> Registration:
-    registration = register_sweep(sweep, prediction, surfel_map, with_velocity=True)
-    assert registration is not None
-    return registration
+    return register_sweep(sweep, prediction, surfel_map, with_velocity=True)
 
 
 @pytest.fixture(scope="module")
 def box_map() -> SurfelMap:
     rng = np.random.default_rng(5)
-    return map_of(on_sides(rng, HALF, 60_000))
+    return surfel_map_of(on_sides(rng, HALF, 60_000), CELL)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -96,7 +90,7 @@ def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(box_ma
 
 @pytest.fixture(scope="module")
 def corridor_map() -> SurfelMap:
-    return map_of(on_sides(np.random.default_rng(5), HALF, 60_000, axes=(1, 2)))
+    return surfel_map_of(on_sides(np.random.default_rng(5), HALF, 60_000, axes=(1, 2)), CELL)
 
 
 @pytest.mark.parametrize("along_m", [0.3, -0.7])
@@ -118,7 +112,7 @@ def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(corridor
 def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng):
     """Their normals are off by a little, and each would pull along the corridor a little."""
     noisy = on_sides(rng, HALF, 60_000, axes=(1, 2))
-    local_map = map_of(noisy + rng.normal(0.0, 0.02, noisy.shape))
+    local_map = surfel_map_of(noisy + rng.normal(0.0, 0.02, noisy.shape), CELL)
     sweep = snapshot(rng, axes=(1, 2))
     sweep = replace(sweep, points=sweep.points + rng.normal(0.0, 0.02, sweep.points.shape))
     refined = register(sweep, predicted(T_TRUE, metres=20.0), local_map)

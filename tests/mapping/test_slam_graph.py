@@ -20,7 +20,6 @@ from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .runs import assert_near
-from .shapes import Box, on_boxes
 
 VOXEL_M = 0.1
 CELL_M = 0.25
@@ -57,14 +56,24 @@ class Walk:
 
 def _block(rng: np.random.Generator) -> FloatArray:
     """Points on walls, floor and furniture of a corridor 4 m wide around a block of 20 x 12 m; no two places alike."""
-    boxes: list[Box] = [((0.0, 0.0, 1.25), (12.0, 8.0, 1.25)), ((0.0, 0.0, 1.25), (8.0, 4.0, 1.25))]
+    faces = []
+    for x, y in ((12.0, 8.0), (8.0, 4.0)):
+        for sign in (-1.0, 1.0):
+            faces += [((sign * x, -y, 0.0), (0.0, 2.0 * y, 2.5)), ((-x, sign * y, 0.0), (2.0 * x, 0.0, 2.5))]
+    faces.append(((-12.0, -8.0, 0.0), (24.0, 16.0, 0.0)))
     for _ in range(60):
-        x, y, _ = _along(rng.uniform(0.0, 72.0), rng.choice([-1.6, 1.6]))
-        half = rng.uniform(0.1, 0.4, 3) * [1.0, 1.0, 2.5]
-        boxes.append(((x, y, half[2]), half))
-    cloud = on_boxes(boxes, 1.0 / 60.0, rng)
+        along, side = rng.uniform(0.0, 72.0), rng.choice([-1.6, 1.6])
+        x, y, _ = _along(along, side)
+        size = rng.uniform(0.2, 0.8, 3) * [1.0, 1.0, 2.5]
+        faces += [((x, y, 0.0), (size[0], 0.0, size[2])), ((x, y, 0.0), (0.0, size[1], size[2]))]
+    clouds = []
+    for corner, extent in faces:
+        edges = np.sort(np.array(extent))[1:]
+        count = int(60.0 * edges[0] * edges[1]) + 5
+        clouds.append(np.array(corner) + rng.uniform(0.0, 1.0, (count, 3)) * extent)
+    cloud = np.concatenate(clouds)
     inside = (np.abs(cloud[:, 0]) < 7.99) & (np.abs(cloud[:, 1]) < 3.99)
-    return np.asarray(cloud[(cloud[:, 2] < 2.49) & ~inside])  # without a ceiling
+    return np.asarray(cloud[~inside])
 
 
 def _along(way: float, side: float = 0.0) -> tuple[float, float, float]:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lidarslam.mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps, point_keys
+from lidarslam.mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps
 
 Cell = tuple[int, int, int]
 near = st.integers(-3, 3)
@@ -47,11 +47,6 @@ def test_a_step_leads_to_the_neighbours_key(cells, offsets):
     np.testing.assert_array_equal(
         cell_keys(inside)[:, None] + key_steps(steps), cell_keys(inside[:, None] + steps[None])
     )
-
-
-def test_points_below_zero_lie_in_the_cells_below_zero():
-    points = np.array([[-0.01, 0.01, 0.49], [-0.51, 0.5, 0.99]])
-    assert key_cells(point_keys(points, 0.5)).tolist() == [[-1, 0, 0], [-2, 1, 1]]
 
 
 def test_rows_of_before_stay_while_the_table_grows(rng):

@@ -1,4 +1,4 @@
-"""The motions of the first scans of simulated sensors, a single sweep of which may make no map."""
+"""Starts of simulated sensors, a single sweep of which may make no map, or which are at speed at the first scan."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,15 @@ from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor
 
-from .runs import NOTHING, poses_of, process, simulated
+from .runs import NOTHING, errors, poses_of, process, simulated
 
 
 def true_poses(simulation: Simulation, scans: list[Scan]) -> FloatArray:
@@ -78,4 +80,60 @@ def test_a_drone_takes_off(seed):
     steps = inverse(inverse(truth[:-1]) @ truth[1:]) @ inverse(estimated[:-1]) @ estimated[1:]
     assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.1
     assert np.linalg.norm((inverse(truth[0]) @ truth[-1] - estimated[-1])[:3, 3]) < 0.5
+    assert Status.LOST not in {result.status for result in results}
+
+
+# What an odometry states of itself: a tenth of a degree and a centimetre.
+STATED = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3) ** 2)
+
+
+@pytest.fixture(scope="module")
+def at_speed() -> Simulation:
+    return simulated("street", "car-fast", find_sensor("vlp-16"), 12)
+
+
+@pytest.fixture(scope="module")
+def scans(at_speed: Simulation) -> list[Scan]:
+    return list(at_speed.scans())
+
+
+@pytest.fixture(scope="module")
+def truth(at_speed: Simulation, scans: list[Scan]) -> FloatArray:
+    T_map_lidar = true_poses(at_speed, scans)
+    return inverse(T_map_lidar[0]) @ T_map_lidar
+
+
+def mapped(scans: list[Scan], is_said_to_stand: bool = True) -> list[MappedScan]:
+    prior = Prior(np.eye(4), covariance=STATED) if is_said_to_stand else NOTHING
+    return process(Mapper(MappingConfig()), scans, [prior] * len(scans))
+
+
+def worst_m(results: list[MappedScan], truth: FloatArray) -> float:
+    return float(errors(poses_of(results), truth)[0].max())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("step", "metres"), [(1, 0.05), (3, 0.1)])
+def test_without_an_odometry_the_way_of_a_car_at_speed_is_found(scans, truth, step, metres):
+    """Three scans apart it is three metres: out of reach of the pose expected of a car that stands."""
+    results = mapped(scans[::step], is_said_to_stand=False)
+    assert worst_m(results, truth[::step]) < metres
+    assert [result.status for result in results] == [Status.OK] * len(results)
+
+
+def test_an_odometry_that_states_that_it_stands_is_overruled(scans, truth):
+    results = mapped(scans)
+    assert worst_m(results, truth) < 0.05
+    assert Status.LOST not in {result.status for result in results}
+    assert results[1].status is Status.DEGRADED, "the first contradiction is reported"
+    assert "predict" in results[1].message
+    assert [result.status for result in results[-6:]] == [Status.OK] * 6
+
+
+def test_scans_without_times_are_no_worse(scans, truth):
+    """Compensated already, as those of KITTI odometry: nothing within a scan shows the speed."""
+    velocities = log(inverse(truth[:-1]) @ truth[1:]) / 0.1
+    still = [Scan(move(s.points, s.time_offsets, v), s.stamp) for s, v in zip(scans[:-1], velocities, strict=True)]
+    results = mapped(still)
+    assert worst_m(results, truth[:-1]) < 0.1
     assert Status.LOST not in {result.status for result in results}

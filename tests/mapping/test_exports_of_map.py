@@ -1,12 +1,15 @@
-"""Occupancy grids of a room whose walls, furniture and slope are known, and as the map server reads them."""
+"""Occupancy grids and meshes of maps whose surfaces are known, and their files as other programs read them."""
 
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.mapping.global_map.edits import reconstruct
 from lidarslam.mapping.global_map.occupancy_grid import (
     FREE,
     OCCUPIED,
@@ -118,6 +121,14 @@ def test_without_ground_there_is_no_grid(room):
     assert occupancy_grid(points[above], normals[above], path, GridOptions()) is None
 
 
+def finished_run(folder: Path, cloud: PointCloud, path: FloatArray) -> Path:
+    """A folder with the map and the positions (N, 3) of a run."""
+    folder.mkdir()
+    write_tum(folder / "trajectory.tum", Trajectory(0.1 * np.arange(len(path)), make_transform(np.eye(3), path)))
+    write_cloud(folder / "map.ply", cloud)
+    return folder
+
+
 def _read(file: Path) -> tuple[dict[str, object], FloatArray]:
     """As map_server does, by a parser of our own: occupancy of each pixel, the first row at the top."""
     about: dict[str, object] = {}
@@ -131,13 +142,9 @@ def _read(file: Path) -> tuple[dict[str, object], FloatArray]:
     return about, (255.0 - pixels.reshape(int(height), int(width))) / 255.0
 
 
-def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
+def test_files_of_grids_mean_the_same_to_the_map_server(room, tmp_path):
     points, normals, path = room
-    run, out = tmp_path / "run", tmp_path / "map.yaml"
-    run.mkdir()
-    T = np.array([make_transform(np.eye(3), each) for each in path])
-    write_tum(run / "trajectory.tum", Trajectory(0.1 * np.arange(len(path)), T))
-    write_cloud(run / "map.ply", PointCloud(points, normals))
+    run, out = finished_run(tmp_path / "run", PointCloud(points, normals), path), tmp_path / "map.yaml"
     command = ["export-grid", str(run), "--out", str(out)]
     succeeds(*command)
     cloud = load_map(run)  # in single precision
@@ -153,3 +160,49 @@ def test_the_files_mean_the_same_to_the_map_server(room, tmp_path):
     assert lidarslam(*command).exit_code == 1
     succeeds(*command, "--overwrite")
     assert lidarslam("export-grid", run, "--out", tmp_path / "map.png").exit_code == 1
+
+
+RADIUS_M = 3.0
+
+
+@pytest.fixture(scope="module")
+def bowl() -> PointCloud:
+    """The lower half of a sphere, seen from its inside, red on one side."""
+    rng = np.random.default_rng(3)
+    outwards = rng.normal(size=(20_000, 3))
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    outwards = outwards[outwards[:, 2] < 0.0]
+    rgb = np.where(outwards[:, :1] > 0.0, np.array([255, 0, 0]), np.array([0, 0, 255])).astype(np.uint8)
+    return PointCloud(RADIUS_M * outwards, -outwards, PointAttributes(rgb=rgb))
+
+
+def distances(vertices: FloatArray) -> FloatArray:
+    return np.abs(np.linalg.norm(vertices, axis=1) - RADIUS_M)
+
+
+def test_the_surface_of_a_mesh_is_the_one_that_was_measured(bowl):
+    mesh = reconstruct(bowl, 0.15)
+    inner = mesh.vertices[:, 2] < -0.3  # at the rim the surface goes on, for the edge of a cell
+    assert distances(mesh.vertices[inner]).max() < 0.05
+    assert distances(mesh.vertices).max() < 0.15
+    assert distances(mesh.vertices).mean() < 0.01
+    assert mesh.vertices[:, 2].max() < 0.2  # not closed over the top
+    corners = mesh.vertices[mesh.triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    assert area == pytest.approx(2.0 * np.pi * RADIUS_M**2, rel=0.1)
+    assert (mesh.colours[mesh.vertices[:, 0] > 0.3, 0] == 255).all()
+    assert (mesh.colours[mesh.vertices[:, 0] < -0.3, 2] == 255).all()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl"])
+def test_files_of_meshes_are_read_by_others(bowl, tmp_path, suffix):
+    run, out = finished_run(tmp_path / "run", bowl, np.zeros((2, 3))), tmp_path / f"mesh{suffix}"
+    command = ["export-mesh", str(run), "--out", str(out), "--cell", "0.3"]
+    succeeds(*command)
+    mesh = o3d.io.read_triangle_mesh(str(out))
+    assert len(mesh.triangles) > 500
+    assert distances(np.asarray(mesh.vertices)).max() < 0.3
+    colours = np.asarray(mesh.vertex_colors)
+    assert suffix in (".obj", ".stl") or (len(colours) and set(np.unique(colours)) == {0.0, 1.0})
+    assert lidarslam(*command).exit_code == 1
+    assert lidarslam("export-mesh", run, "--out", "mesh.off").exit_code == 2
