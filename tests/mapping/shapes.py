@@ -1,4 +1,4 @@
-"""Points on known surfaces, and the map of surfels that they give."""
+"""Points on known surfaces, what else may be known of them, and the map of surfels that they give."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -40,6 +41,16 @@ def on_boxes(boxes: Iterable[Box], area_m2: float, rng: np.random.Generator, noi
 def across_x(rng: np.random.Generator, x: float, half_size: float, count: int) -> FloatArray:
     """Points (N, 3) on a square piece of a wall across the x axis."""
     return np.column_stack([np.full(count, x), rng.uniform(-half_size, half_size, (count, 2))])
+
+
+def attributes(rng: np.random.Generator, count: int, after_s: float = 0.0) -> PointAttributes:
+    """Of so many points, all that there are; their times in any order."""
+    return PointAttributes(
+        intensity=rng.uniform(0.0, 300.0, count).astype(np.float32),
+        rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        ring=rng.integers(0, 128, count).astype(np.int32),
+        time=1_700_000_000.0 + after_s + 1e-4 * rng.permutation(count),
+    )
 
 
 def elevations_of(points: FloatArray) -> FloatArray:

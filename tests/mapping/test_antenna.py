@@ -5,12 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.georeference import GnssTrack, TooFewPositionsError, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.edges import ProjectedTrack
 from lidarslam.mapping.pose_graph.optimizer import optimise
+
+from .runs import assert_near
 
 SCANS, EVERY, PERIOD_S = 600, 10, 0.1
 ANTENNA = np.array([-0.5, 0.2, 1.0])
@@ -95,9 +97,7 @@ def measured(trajectory: Trajectory, noise_m: float, rng: np.random.Generator) -
 def test_the_pose_of_the_world_is_found(loop, rng):
     track, projected = measured(loop, 0.0, rng)
     found = align_to_track(loop, track, projected, SCALE)
-    error = inverse(T_MAP_WORLD) @ found.T_map_world
-    assert np.linalg.norm(error[:3, 3]) < 1e-3
-    assert rotation_angle(error) < 1e-4  # the prior of the tilt counts little
+    assert_near(found.T_map_world, T_MAP_WORLD, 1e-3, np.rad2deg(1e-4))  # the prior of the tilt counts little
     assert (found.matched, found.rms_m) == (40, pytest.approx(0.0, abs=1e-3))
     expected = SCALE * loop.positions @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3]
     np.testing.assert_allclose(found.positions(loop.positions), expected, atol=1e-3)
@@ -108,9 +108,7 @@ def test_outliers_count_little(loop, rng):
     track, projected = measured(loop, 0.05, rng)
     projected[::5, 0] += rng.uniform(10.0, 30.0, len(projected[::5]))
     found = align_to_track(loop, track, projected, SCALE)
-    error = inverse(T_MAP_WORLD) @ found.T_map_world
-    assert np.linalg.norm(error[:3, 3]) < 0.15
-    assert rotation_angle(error) < np.deg2rad(0.3)
+    assert_near(found.T_map_world, T_MAP_WORLD, 0.15, 0.3)
     assert found.median_m < 0.2
     assert found.rms_m > 5.0
 

@@ -13,22 +13,15 @@ from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.voxels import COUNT
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 
-from .shapes import across_x
+from .shapes import across_x, attributes
 
 VOXEL_M = 0.5
-EPOCH = 1_700_000_000.0
 
 
 def some(rng: np.random.Generator, count: int, number: int, names: str = "intensity rgb ring time") -> PointAttributes:
     """Attributes of a scan's points; every fifth has no intensity."""
-    intensity = rng.uniform(0.0, 65535.0, count).astype(np.float32)
-    intensity[::5] = np.nan
-    known = PointAttributes(
-        intensity=intensity,
-        rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        ring=rng.integers(0, 128, count).astype(np.int32),
-        time=EPOCH + 0.1 * number + rng.permutation(count) * 1e-4,
-    )
+    known = attributes(rng, count, 0.1 * number)
+    known.intensity[::5] = np.nan
     return known.only(names.split())
 
 

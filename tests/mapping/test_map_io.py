@@ -11,22 +11,17 @@ from lidarslam.mapping.global_map import point_cloud
 from lidarslam.mapping.global_map.point_cloud import PointCloud, require_format, write_cloud
 from lidarslam.storage.finished_run import load_map
 
+from .shapes import attributes
+
 FORMATS = ["map.ply", "map.pcd", "map.laz", "map.e57"]
 
 
 @pytest.fixture
 def cloud(rng: np.random.Generator) -> PointCloud:
     """Points with all attributes; one has no intensity, one no ring."""
-    count = 500
-    normals = rng.normal(size=(count, 3))
-    known = PointAttributes(
-        intensity=rng.uniform(0.0, 300.0, count).astype(np.float32),
-        rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        ring=rng.integers(0, 128, count).astype(np.int32),
-        time=1_700_000_000.0 + 1e-4 * rng.permutation(count),
-    )
+    normals, known = rng.normal(size=(500, 3)), attributes(rng, 500)
     known.intensity[3], known.ring[4] = np.nan, -1
-    points = rng.normal(0.0, 30.0, (count, 3)).astype(np.float32).astype(np.float64)
+    points = rng.normal(0.0, 30.0, (500, 3)).astype(np.float32).astype(np.float64)
     return PointCloud(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), known)
 
 

@@ -266,7 +266,7 @@ def test_a_sensor_that_was_carried_away_is_relocalised_in_loams_map(ring_scans, 
 
 
 def test_along_a_corridor_loam_keeps_the_odometry(room):
-    """Walls, floor and ceiling along x, the sensor's way; of the odometry alone it comes that it moves."""
+    """Walls, floor and ceiling along x, the sensor's way, look alike from everywhere: only the odometry tells it."""
     corridor, way = replace(room, half_size=(1e3, 1.5, 1.2), pillars=()), exp([0.0, 0.0, 0.0, 0.09, 0.0, 0.0])
     seen = corridor.ring_sweep(lambda time: np.broadcast_to(np.eye(4), (len(time), 4, 4)), 0.0)
     near = seen.select(np.linalg.norm(seen.points, axis=1) < 6.0)  # else incidence is grazing
