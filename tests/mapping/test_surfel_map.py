@@ -78,6 +78,19 @@ def test_a_ring_bent_around_a_corner_or_on_the_ground_is_no_plane(elevation_deg,
     assert len(surfel_map_of(points, CELL).match(points, HERE)) == 0
 
 
+@pytest.mark.parametrize(("elevation_deg", "counts"), [(-15.0, True), (-1.0, False)])
+def test_what_a_ring_draws_from_afar_as_the_sensor_pitches_is_no_plane(elevation_deg, counts):
+    """The ground rises by 15 degrees where the pitch is off by ever more: no other ring contradicts that."""
+    local_map = SurfelMap(CELL, 100.0)
+    for step in range(12):
+        moved = np.array([0.08 * step, 0.0, 0.02 * step])
+        points = ring(elevation_deg) + moved
+        insert(local_map, points, moved)
+    matched = len(np.unique(local_map.match(points, make_transform(np.eye(3), moved)).index))
+    assert (matched > 0.8 * len(points)) == counts
+    assert counts or matched == 0
+
+
 def test_two_rings_on_walls_show_them():
     points = np.concatenate([ring(3.0, CORNER), ring(6.0, CORNER)])
     away = np.abs(points[:, 0] - points[:, 1] * 4.0 / 5.0) > 2.5  # from the corner
