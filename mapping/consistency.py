@@ -59,9 +59,9 @@ LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
 # Least contradicting pairs of a stretch. A single one counts where another confirms it and it has so many votes, or, in
 # runs of fewer tested pairs, where it has more or the pose has less than a share of them. In the sparse scans of a
-# Mid-360, chance makes one of 9.9 or 10.9 votes, with a quarter of them at the pose; slips leave next to none.
+# Mid-360, chance makes one of 9.9 to 12.1 votes, with a quarter of them at the pose; slips leave next to none.
 _LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE = 2, 4, 10.0
-_MANY_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 12.0, 0.2
+_MANY_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 14.0, 0.2
 
 
 @dataclass(frozen=True, eq=False)
