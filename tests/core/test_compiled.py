@@ -70,18 +70,18 @@ def loaded_from_disk(function: Any) -> int:
     return sum(function.stats.cache_hits.values())
 
 
+def total_and_hits(module: ModuleType) -> tuple[float, int]:
+    return module.total(np.arange(4.0)), loaded_from_disk(module.total)
+
+
 def kept(folder: Path) -> list[Path]:
     return sorted(folder.glob("__pycache__/*.nb[ic]"))
 
 
 def test_computes_and_is_kept_for_the_next_process(load: Load, tmp_path: Path) -> None:
-    first = load("sums", SOURCE)
-    assert first.total(np.arange(4.0)) == 6.0
-    assert loaded_from_disk(first.total) == 0
+    assert total_and_hits(load("sums", SOURCE)) == (6.0, 0)
     assert kept(tmp_path)
-    second = load("sums", SOURCE)
-    assert second.total(np.arange(4.0)) == 6.0
-    assert loaded_from_disk(second.total) == 1
+    assert total_and_hits(load("sums", SOURCE)) == (6.0, 1)
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
@@ -92,12 +92,8 @@ def test_a_damaged_file_costs_time_only_and_is_made_anew(load: Load, tmp_path: P
     assert damaged
     for file in damaged:
         file.write_bytes(left)
-    again = load("sums", SOURCE)
-    assert again.total(np.arange(4.0)) == 6.0
-    assert loaded_from_disk(again.total) == 0
-    healed = load("sums", SOURCE)
-    assert healed.total(np.arange(4.0)) == 6.0
-    assert loaded_from_disk(healed.total) == 1
+    assert total_and_hits(load("sums", SOURCE)) == (6.0, 0)
+    assert total_and_hits(load("sums", SOURCE)) == (6.0, 1)
 
 
 def test_a_full_disk_costs_time_only(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,15 +179,14 @@ def test_an_installation_that_cannot_be_written_is_not_compiled_anew(
 ) -> None:
     module = load("sums", SOURCE)
     assert is_compiled(module)
-    assert module.total(np.arange(4.0)) == 6.0
-    assert loaded_from_disk(module.total) == 1
+    assert total_and_hits(module) == (6.0, 1)
     assert module.total(np.arange(4)) == 6  # of other types: kept by the user
     assert sum(1 for _ in unprivileged.rglob("*.nbc")) == 1
     again = load("sums", SOURCE)
     assert (again.total(np.arange(4)), loaded_from_disk(again.total)) == (6, 1)
     changed = load("sums", SOURCE + "# changed")
     assert not is_compiled(changed)
-    assert (changed.total(np.arange(4.0)), loaded_from_disk(changed.total)) == (6.0, 0)
+    assert total_and_hits(changed) == (6.0, 0)
 
 
 def test_damage_to_an_installation_that_cannot_be_written_costs_time_once(
@@ -199,9 +194,8 @@ def test_damage_to_an_installation_that_cannot_be_written_costs_time_once(
 ) -> None:
     for file in kept(tmp_path):
         file.write_bytes(b"\x80\x04broken")
-    for hits in (0, 1):
-        module = load("sums", SOURCE)
-        assert (module.total(np.arange(4.0)), loaded_from_disk(module.total)) == (6.0, hits)
+    assert total_and_hits(load("sums", SOURCE)) == (6.0, 0)
+    assert total_and_hits(load("sums", SOURCE)) == (6.0, 1)
 
 
 def test_who_compiles_anew_at_every_start_is_told_so_once(
@@ -213,8 +207,7 @@ def test_who_compiles_anew_at_every_start_is_told_so_once(
     compiled_module._warn_of_compiling_anew.cache_clear()
     warning = "set NUMBA_CACHE_DIR to a folder that can be written"
     module = load("sums", SOURCE)
-    assert module.total(np.arange(4.0)) == 6.0
-    assert loaded_from_disk(module.total) == 1  # compiled by who installed it
+    assert total_and_hits(module) == (6.0, 1)  # compiled by who installed it
     assert warning not in caplog.text
     assert module.total(np.arange(4)) == 6
     assert load("more", SOURCE).total(np.arange(4.0)) == 6.0

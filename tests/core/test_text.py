@@ -52,8 +52,9 @@ def test_no_text_holds_a_control_character_afterwards(text: str) -> None:
         shown.encode("utf-8")
 
 
-def test_lines_of_ours_stay_lines() -> None:
+def test_lines_of_ours_stay_lines_and_line_breaks_in_names_become_none() -> None:
     assert printable("source  a\ntopic  \x1b[2J\n") == "source  a\ntopic  \\x1b[2J\n"
+    assert joined(["written to a\nb", "next"]) == "written to a\\nb\nnext"
 
 
 def test_the_middle_of_a_long_text_is_left_out() -> None:
@@ -61,10 +62,6 @@ def test_the_middle_of_a_long_text_is_left_out() -> None:
     assert shown.startswith("begin")
     assert shown.endswith("xend")
     assert len(shown) < 120
-
-
-def test_a_line_break_in_a_name_is_no_line() -> None:
-    assert joined(["written to a\nb", "next"]) == "written to a\\nb\nnext"
 
 
 @pytest.mark.parametrize(
