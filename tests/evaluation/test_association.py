@@ -25,12 +25,19 @@ def test_equal_stamps_give_the_reference_to_the_last_bit(random_drive):
     assert found.to_json() == {"matched": 24, "estimate": 24, "reference": 50}
 
 
-def test_reference_is_interpolated_at_the_stamps_of_the_estimate():
-    reference = moving(np.arange(0.0, 5.0, 0.2))
-    stamps = np.linspace(0.03, 4.7, 31)
-    found = associate(moving(stamps), reference)
-    assert len(found) == 31
-    np.testing.assert_allclose(found.reference.T_world_lidar, moving(stamps).T_world_lidar, atol=1e-12)
+@pytest.mark.parametrize(
+    ("reference_s", "estimate_s", "rows"),
+    [
+        (np.arange(0.0, 5.0, 0.2), np.linspace(0.03, 4.7, 31), list(range(31))),
+        (np.arange(0.0, 10.0, 2.0), np.array([0.01, 1.0, 2.015, 3.99, 5.0]), [0, 2, 3]),
+        (np.arange(1.0, 2.05, 0.1), np.array([0.97, 0.985, 1.5, 2.015, 2.03]), [1, 2, 3]),
+    ],
+    ids=["between poses", "in a gap only close to a pose", "beyond the ends only within the tolerance"],
+)
+def test_the_reference_is_interpolated_at_the_stamps_of_the_estimate(reference_s, estimate_s, rows):
+    found = associate(moving(estimate_s), moving(reference_s), tolerance_s=0.02, max_gap_s=0.5)
+    assert found.rows.tolist() == rows
+    np.testing.assert_allclose(found.reference.T_world_lidar, moving(estimate_s[rows]).T_world_lidar, atol=1e-12)
 
 
 def test_a_long_gap_of_the_reference_is_not_bridged():
@@ -41,22 +48,6 @@ def test_a_long_gap_of_the_reference_is_not_bridged():
     assert not ((found.estimate.stamps > 2.0) & (found.estimate.stamps < 5.0)).any()
     assert np.array_equal(estimate.stamps[found.rows], found.estimate.stamps)
     assert len(associate(estimate, reference, max_gap_s=3.0)) == 28
-
-
-def test_within_a_gap_a_stamp_close_to_a_reference_pose_is_matched():
-    reference = moving(np.arange(0.0, 10.0, 2.0))
-    stamps = np.array([0.01, 1.0, 2.015, 3.99, 5.0])
-    found = associate(moving(stamps), reference, tolerance_s=0.02, max_gap_s=0.5)
-    assert found.rows.tolist() == [0, 2, 3]
-    np.testing.assert_allclose(found.reference.T_world_lidar, moving(stamps[[0, 2, 3]]).T_world_lidar, atol=1e-12)
-
-
-def test_beyond_the_ends_only_the_tolerance_is_extrapolated():
-    reference = moving(np.arange(1.0, 2.05, 0.1))
-    stamps = np.array([0.97, 0.985, 1.5, 2.015, 2.03])
-    found = associate(moving(stamps), reference, tolerance_s=0.02)
-    assert found.rows.tolist() == [1, 2, 3]
-    np.testing.assert_allclose(found.reference.T_world_lidar, moving(stamps[1:4]).T_world_lidar, atol=1e-12)
 
 
 def test_extrapolation_does_not_trust_two_poses_a_microsecond_apart():

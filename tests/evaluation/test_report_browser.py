@@ -1,6 +1,5 @@
 """The report in a real browser, spoken to over the DevTools protocol's pipe."""
 
-import base64
 import json
 import os
 import select
@@ -91,9 +90,6 @@ class Browser:
         answer = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
-
-    def screenshot(self) -> bytes:
-        return base64.b64decode(self.send("Page.captureScreenshot", captureBeyondViewport=True)["data"])
 
     def _summarise(self) -> Visit:
         visit = Visit()

@@ -1,12 +1,47 @@
-"""A small world whose surfaces have formulas, and the distance to them."""
+"""A small world whose surfaces have formulas, and the distance to them; the program's worlds, and rays cast in them."""
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World
+from lidarslam.core.scan import Scan
+from lidarslam.simulation.mesh import Caster
+from lidarslam.simulation.motion import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import RangeModel, find_sensor
+from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World, build_world
+
+EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
+
+cached_world = cache(build_world)
+
+
+@cache
+def caster_of(name: str, seed: int) -> Caster:
+    """Casts rays in one of the program's worlds."""
+    return Caster(cached_world(name, seed))
+
+
+def cast(caster: Caster, origins: FloatArray, direction: FloatArray) -> FloatArray:
+    """Distances (N,) along unit vectors (3,) or (N, 3) to what stands still, infinite where nothing is hit."""
+    rays = np.broadcast_to(direction, origins.shape)
+    return caster.cast(origins, rays, np.zeros(0), np.inf).ranges
+
+
+def simulation_in(world: World, carrier: str, height_m: float, scans: int) -> Simulation:
+    """A recording of an upright VLP-16."""
+    motion = motion_along_route(carrier, world, seed=2)
+    return Simulation(world, find_sensor("vlp-16"), motion, mount_pose("upright", height_m), scans, seed=5)
+
+
+def in_world(simulation: Simulation, scan: Scan) -> FloatArray:
+    """The points (N, 3) of a scan, each by the true pose at its own time."""
+    T = simulation.T_world_lidar_at(scan.stamp + scan.time_offsets)
+    return np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
 
 
 def _turn(yaw: float) -> FloatArray:
@@ -14,7 +49,8 @@ def _turn(yaw: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _yard() -> World:
+@pytest.fixture(scope="session")
+def yard() -> World:
     """A rolling yard of 60 x 50 m within walls, with blocks, poles and a car that goes round.
 
     The ground is soft hills with the middle free for a route of 28 x 18 m.
@@ -35,12 +71,6 @@ def _yard() -> World:
     corners = np.array([[14.0, 9.0], [-14.0, 9.0], [-14.0, -9.0], [14.0, -9.0]])
     route = Route(np.column_stack([corners, ground.height_at(corners)]), 4.0, 2.0, 10.0, 10.0)
     return World("yard", 0, route, Boxes(centres, half_sizes, turns), poles, (ground,), (mover,))
-
-
-@pytest.fixture(scope="session")
-def yard() -> World:
-    """The yard."""
-    return _yard()
 
 
 @pytest.fixture(scope="session")

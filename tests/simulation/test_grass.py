@@ -5,27 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.noise import ranges_in_grass
-from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import reference_map
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Grass, HeightField
 
-EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
+from .conftest import EXACT, in_world, simulation_in
+
 HEIGHT_M = 0.2
-
-
 LAWN = Grass(HeightField(np.array([-500.0, -500.0]), 1000.0, np.full((2, 2), HEIGHT_M)), 0.3)
 
 
 @pytest.fixture(scope="module")
 def simulation(yard):
-    motion = motion_along_route("car", yard, seed=2)
-    sensor = replace(find_sensor("vlp-16"), ranging=EXACT)
-    world = replace(yard, movers=(), grass=LAWN)
-    return Simulation(world, sensor, motion, mount_pose("upright", 1.73), 50, seed=5)
+    grown = simulation_in(replace(yard, movers=(), grass=LAWN), "car", 1.73, 50)
+    return replace(grown, sensor=replace(grown.sensor, ranging=EXACT))
+
+
+@pytest.fixture(scope="module")
+def mown(simulation):
+    return replace(simulation, world=replace(simulation.world, grass=None))
 
 
 @pytest.mark.parametrize("cosine", [1.0, 0.3, 0.06])
@@ -42,8 +40,7 @@ def test_the_law(cosine, rng):
 
 def test_a_scan_ends_above_the_ground_within_the_grass(simulation):
     sweep = simulation.scan(30)
-    T = simulation.T_world_lidar_at(sweep.scan.stamp + sweep.scan.time_offsets)
-    points = np.einsum("nij,nj->ni", T[:, :3, :3], sweep.scan.points) + T[:, :3, 3]
+    points = in_world(simulation, sweep.scan)
     ranges = np.linalg.norm(sweep.scan.points, axis=1)
     is_shortened = ranges < sweep.true_ranges - 1e-3
     above = points[is_shortened, 2] - simulation.world.ground_at(points[is_shortened, :2])
@@ -56,14 +53,12 @@ def test_a_scan_ends_above_the_ground_within_the_grass(simulation):
     np.testing.assert_array_equal(simulation.scan(30).scan.points, sweep.scan.points)
 
 
-def test_walls_stand_before_grass(simulation, yard):
-    bare = replace(simulation, world=replace(yard, movers=()))
-    grown, mown = simulation.scan(10), bare.scan(10)
-    walls, behind = ({tuple(point) for point in one.scan.points if point[2] > 0.0} for one in (mown, grown))
+def test_walls_stand_before_grass(simulation, mown):
+    sweeps = mown.scan(10), simulation.scan(10)
+    walls, behind = ({tuple(point) for point in sweep.scan.points if point[2] > 0.0} for sweep in sweeps)
     assert len(walls) > 1000
     assert len(walls & behind) > 0.98 * len(walls)  # which ones are lost is drawn anew
 
 
-def test_the_reference_map_is_of_the_ground(simulation, yard):
-    bare = replace(simulation, world=replace(yard, movers=()))
-    np.testing.assert_array_equal(reference_map(simulation, step=25).points, reference_map(bare, step=25).points)
+def test_the_reference_map_is_of_the_ground(simulation, mown):
+    np.testing.assert_array_equal(reference_map(simulation, step=25).points, reference_map(mown, step=25).points)

@@ -1,33 +1,20 @@
 """Corridor, stairs and crowd have the measures they are named for, and their people walk as they should."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.mesh import Caster
 from lidarslam.simulation.motion import Sway
 from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.world import World, build_world
+from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, STANDING
 
-SEEDS = (0, 1)
+from .conftest import cached_world, cast, caster_of
+
 RISE_M, TREAD_M = 0.17, 0.28
-world_of, each_seed = cache(build_world), pytest.mark.parametrize("seed", SEEDS)
+each_seed = pytest.mark.parametrize("seed", [0, 1])
 LEFT, RIGHT, UP, DOWN = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-
-
-@cache
-def caster_of(name: str, seed: int) -> Caster:
-    return Caster(world_of(name, seed))
-
-
-def cast(name: str, seed: int, origins: FloatArray, direction: FloatArray) -> FloatArray:
-    """Distances (N,) from origins (N, 3) to the nearest static surface in one direction (3,)."""
-    rays = np.broadcast_to(direction, origins.shape)
-    return caster_of(name, seed).cast(origins, rays, np.zeros(0), 200.0).ranges
 
 
 def corridor_length(world: World) -> float:
@@ -36,16 +23,16 @@ def corridor_length(world: World) -> float:
 
 @each_seed
 def test_a_corridor_is_two_metres_wide_and_has_boxes_along_its_walls(seed: int) -> None:
-    length = corridor_length(world_of("corridor", seed))
+    length, caster = corridor_length(cached_world("corridor", seed)), caster_of("corridor", seed)
     assert 24.0 <= length <= 40.0
     x = np.arange(0.02 - length, -0.02, 0.02)
     high = np.column_stack([x, np.zeros(len(x)), np.full(len(x), 1.2)])
     for sideways in (LEFT, RIGHT):
-        np.testing.assert_allclose(cast("corridor", seed, high, sideways), 1.0, atol=1e-3)
-    np.testing.assert_allclose(cast("corridor", seed, high, UP), 1.4, atol=1e-3)
-    np.testing.assert_allclose(cast("corridor", seed, high, DOWN), 1.2, atol=1e-3)
+        np.testing.assert_allclose(cast(caster, high, sideways), 1.0, atol=1e-3)
+    np.testing.assert_allclose(cast(caster, high, UP), 1.4, atol=1e-3)
+    np.testing.assert_allclose(cast(caster, high, DOWN), 1.2, atol=1e-3)
     low = high - [0.0, 0.0, 1.0]
-    widths = np.stack([cast("corridor", seed, low, sideways) for sideways in (LEFT, RIGHT)])
+    widths = np.stack([cast(caster, low, sideways) for sideways in (LEFT, RIGHT)])
     assert widths.min() > 0.54
     runs = np.diff(np.pad(widths < 0.9, ((0, 0), (1, 1))).astype(int), axis=1)
     starts, stops = (np.argwhere(runs == sign) for sign in (1, -1))
@@ -57,10 +44,10 @@ def test_a_corridor_is_two_metres_wide_and_has_boxes_along_its_walls(seed: int) 
 
 @each_seed
 def test_a_corridor_opens_into_a_yard_and_recordings_begin_deep_in_it(seed: int) -> None:
-    world = world_of("corridor", seed)
+    world = cached_world("corridor", seed)
     length, waypoints = corridor_length(world), world.route.waypoints
     mouth = np.array([[-0.5, 0.0, 1.2]])
-    ahead = cast("corridor", seed, mouth, np.array([1.0, 0.0, 0.0]))
+    ahead = cast(caster_of("corridor", seed), mouth, np.array([1.0, 0.0, 0.0]))
     assert 5.0 < ahead[0] < 41.0  # a tree may stand before the far side
     assert np.ptp(waypoints[:, 1]) > 13.0
     motion = motion_along_route("handheld", world, seed)
@@ -72,7 +59,7 @@ def test_a_corridor_opens_into_a_yard_and_recordings_begin_deep_in_it(seed: int)
 
 @each_seed
 def test_a_carrier_climbs_the_stairs_smoothly_and_comes_down_again(seed: int) -> None:
-    world = world_of("stairs", seed)
+    world = cached_world("stairs", seed)
     motion = replace(motion_along_route("handheld", world, seed), sway=Sway())
     times = np.arange(0.0, motion.duration_s, 0.01)
     z = motion.pose_at(times)[:, 2, 3]
@@ -90,7 +77,7 @@ def test_a_carrier_climbs_the_stairs_smoothly_and_comes_down_again(seed: int) ->
 
 @each_seed
 def test_a_crowd_is_around_the_start_and_half_of_it_goes_along(seed: int) -> None:
-    world = world_of("crowd", seed)
+    world = cached_world("crowd", seed)
     motion = motion_along_route("handheld", world, seed)
     assert len(world.movers) == COMPANIONS + STANDING + CROSSING == 30
     times = np.arange(0.0, 8.0, 0.5)

@@ -1,11 +1,12 @@
 """Whole recordings: made, read back, replaced or refused, and by the command line."""
 
+import shlex
+from pathlib import Path
+
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial import cKDTree
 
-from lidarslam.cli import main
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import transform_points
 from lidarslam.core.trajectory import read_tum
@@ -15,6 +16,8 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.record import RecordRequest, record
 from lidarslam.simulation.world import Boxes, HeightField, Route, World
 from lidarslam.simulation.writers import FORMATS
+
+from ..conftest import lidarslam, succeeds
 
 SCANS = 3
 
@@ -76,6 +79,7 @@ def test_a_recording_of_every_format_is_true(name, tmp_path):
     true_map = cKDTree(coordinates(read_ply(out / "map.ply")))
     assert true_map.n == summary.map_points
     truth = read_tum(out / "ground_truth.tum")
+    assert_readme_tells(out, summary.source, name)
     for recording in map(open_recording, {out, summary.source}):
         assert len(recording) == summary.scans == SCANS
         assert recording.describe().ground_truth is not None
@@ -91,6 +95,15 @@ def test_a_recording_of_every_format_is_true(name, tmp_path):
             assert np.quantile(distances, 0.99) < 0.12
 
 
+def assert_readme_tells(out: Path, source: Path, name: str) -> None:
+    """How the recording was made, what to type, and what its files are."""
+    text = (out / "README.md").read_text()
+    assert f"lidarslam simulate --out {shlex.quote(str(out))} --world hall --sensor vlp-16 --motion tracked" in text
+    assert f"--mount tilted --scans {SCANS} --seed 4 --format {name}\n" in text
+    assert f"lidarslam run {shlex.quote(str(source))}" in text
+    assert all(file in text for file in ("ground_truth.tum", "map.ply"))
+
+
 def test_same_request_same_bytes(tmp_path):
     one, same, other = folders = [tmp_path / name for name in ("one", "same", "other")]
     for folder, seed in zip(folders, (4, 4, 5), strict=True):
@@ -99,20 +112,6 @@ def test_same_request_same_bytes(tmp_path):
         if path.name != "README.md":  # which names the folder
             assert path.read_bytes() == (same / path.name).read_bytes()
     assert (other / "scan_000000.ply").read_bytes() != (one / "scan_000000.ply").read_bytes()
-
-
-@pytest.mark.parametrize("name", ["kitti", "rosbag1"])
-def test_readme_says_how_it_was_made_and_what_to_type(name, tmp_path):
-    out = tmp_path / "hall"
-    summary = record(request(out, format=name, scans=1), silently)
-    text = (out / "README.md").read_text()
-    assert f"lidarslam simulate --out {out} --world hall --sensor vlp-16 --motion tracked --mount tilted" in text
-    assert f"--scans 1 --seed 4 --format {name}\n" in text
-    assert f"lidarslam run {summary.source}" in text
-    assert summary.source.exists()
-    for entry in out.iterdir():
-        if entry.suffix in (".tum", ".ply"):
-            assert entry.name in text
 
 
 def test_nothing_is_left_of_a_recording_that_failed(tmp_path):
@@ -182,15 +181,12 @@ def test_a_speed_is_kept_and_written_down(tmp_path):
 
 def test_command(tmp_path):
     out = tmp_path / "hall"
-    arguments = ["simulate", "--out", str(out), "--world", "hall", "--scans", "2"]
-    done = CliRunner().invoke(main, arguments)
-    assert done.exit_code == 0, done.output
-    assert f"next: lidarslam run {out}" in done.output
-    assert "2 scans of a vlp-16 (upright, handheld) in hall, seed 0" in done.output
-    again = CliRunner().invoke(main, arguments)
+    arguments = ["simulate", "--out", out, "--world", "hall", "--scans", "2"]
+    said = succeeds(*arguments)
+    assert f"next: lidarslam run {out}" in said
+    assert "2 scans of a vlp-16 (upright, handheld) in hall, seed 0" in said
+    again = lidarslam(*arguments)
     assert again.exit_code == 1
     assert "holds a recording already" in again.output
-    assert CliRunner().invoke(main, [*arguments, "--overwrite"]).exit_code == 0
-    shown = CliRunner().invoke(main, ["info", str(out)])
-    assert shown.exit_code == 0
-    assert "/velodyne_points" in shown.output
+    succeeds(*arguments, "--overwrite")
+    assert "/velodyne_points" in succeeds("info", out)

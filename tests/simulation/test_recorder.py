@@ -8,18 +8,16 @@ import pytest
 from lidarslam.core.geometry import transform_points
 from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.noise import bloom, measure, range_sigma
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import RangeModel, find_sensor
 
-EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
+from .conftest import EXACT, in_world, simulation_in
+
 NOISY = RangeModel(0.3, 100.0, 0.01, 0.0003, 0.003, 0.002)
 
 
 @pytest.fixture(scope="module")
 def simulation(yard):
-    motion = motion_along_route("tracked-harsh", yard, seed=2)
-    return Simulation(yard, find_sensor("vlp-16"), motion, mount_pose("upright", 0.6), 300, seed=5)
+    return simulation_in(yard, "tracked-harsh", 0.6, 300)
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +25,6 @@ def turning(simulation):
     """The scan of the fastest turn."""
     yaw = np.unwrap(np.arctan2(*simulation.ground_truth.T_world_lidar[:, [1, 0], 0].T))
     return int(np.abs(np.diff(yaw)).argmax())
-
-
-def exact(simulation):
-    return replace(simulation, sensor=replace(simulation.sensor, ranging=EXACT))
-
-
-def in_world(simulation, scan):
-    """The points, each by the true pose at its own time."""
-    T = simulation.T_world_lidar_at(scan.stamp + scan.time_offsets)
-    return np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
 
 
 def same_bytes(a, b):
@@ -48,7 +36,7 @@ def same_bytes(a, b):
 @pytest.mark.parametrize("mount", ["upright", "tilted"])
 def test_exact_scans_lie_on_the_surfaces(sensor, mount, simulation, distance_to_yard):
     model = replace(find_sensor(sensor), ranging=EXACT)
-    simulated = exact(replace(simulation, sensor=model, T_body_lidar=mount_pose(mount, 0.6)))
+    simulated = replace(simulation, sensor=model, T_body_lidar=mount_pose(mount, 0.6))
     for index in (0, 120):
         sweep = simulated.scan(index)
         points = in_world(simulated, sweep.scan)[~sweep.moving]
@@ -58,7 +46,7 @@ def test_exact_scans_lie_on_the_surfaces(sensor, mount, simulation, distance_to_
 
 def test_the_sweep_rolls(simulation, turning, distance_to_yard):
     """With one pose for the whole sweep the points are far off when the sensor turns."""
-    simulated = exact(simulation)
+    simulated = replace(simulation, sensor=replace(simulation.sensor, ranging=EXACT))
     sweep = simulated.scan(turning)
     still = transform_points(simulated.ground_truth.T_world_lidar[turning], sweep.scan.points)
     assert np.quantile(distance_to_yard(still[~sweep.moving]), 0.75) > 0.2

@@ -7,12 +7,10 @@ import pytest
 from scipy.spatial import KDTree
 
 from lidarslam.simulation.mesh import Mesh, box_mesh, pieces_near
-from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import SeenSurfaces, reference_map, sample_seen
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import Boxes
+
+from .conftest import in_world, simulation_in
 
 # A square of 10 m split into two triangles, facing up.
 SQUARE = Mesh(
@@ -26,8 +24,7 @@ def grid(x, y, z):
 
 @pytest.fixture(scope="module")
 def recording(yard):
-    motion = motion_along_route("tracked", yard, seed=2)
-    return Simulation(yard, find_sensor("vlp-16"), motion, mount_pose("upright", 0.6), 400, seed=5)
+    return simulation_in(yard, "tracked", 0.6, 400)
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +76,8 @@ def test_normals_are_of_the_side_that_was_seen():
 
 def test_the_map_covers_the_scans(recording, yard_map):
     sweep = recording.scan(80)
-    T = recording.T_world_lidar_at(sweep.scan.stamp + sweep.scan.time_offsets)
-    points = np.einsum("nij,nj->ni", T[:, :3, :3], sweep.scan.points) + T[:, :3, 3]
     still = ~sweep.moving & np.isfinite(sweep.true_ranges)
-    gaps, _ = KDTree(yard_map.points).query(points[still])
+    gaps, _ = KDTree(yard_map.points).query(in_world(recording, sweep.scan)[still])
     assert np.quantile(gaps, 0.98) < 0.25
     inside = np.linalg.norm(yard_map.points[:, :2], axis=1).min()
     assert inside > 2.5  # the middle block's inside is not seen

@@ -1,19 +1,19 @@
 """Every world: the same from the same seed, free along the way, standing on its ground; indoors closed all round."""
 
 from collections.abc import Iterator
-from functools import cache
 
 import numpy as np
-import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.simulation.mesh import Mesh, box_mesh, cylinder_mesh, merge, world_mesh
+from lidarslam.simulation.mesh import Caster, box_mesh, cylinder_mesh, merge
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import WORLDS, World, build_world
 from lidarslam.simulation.worlds.building import UP
 from lidarslam.simulation.worlds.paths import Clearance, loop_length, subdivide_loop
+
+from .conftest import cached_world, cast, caster_of
 
 # Name: shortest and longest route, most boxes, most cylinders.
 INDOORS = {
@@ -35,9 +35,6 @@ STEEPEST = {"office": 0.0, "tunnel": 0.2, "hall": 0.12, "stairs": 0.17 / 0.28 + 
 # Below this above the floor lie rails, kerbs and roughness, which legs and wheels go over.
 FLOOR_M = 0.15
 
-Scene = o3d.t.geometry.RaycastingScene
-cached_world = cache(build_world)
-
 
 def cases(*names: str) -> pytest.MarkDecorator:
     """Each world and seed; a second one of the large worlds, which take seconds to build, with the slow tests."""
@@ -49,23 +46,6 @@ def cases(*names: str) -> pytest.MarkDecorator:
 
 each_inside, each_outside, each_world = cases(*INDOORS), cases(*OUTDOORS), cases(*INDOORS, *OUTDOORS)
 each_seed = pytest.mark.parametrize("seed", SEEDS)
-
-
-def scene_of_mesh(mesh: Mesh) -> Scene:
-    scene = Scene()
-    scene.add_triangles(mesh.vertices.astype(np.float32), np.asarray(mesh.triangles, dtype=np.uint32))
-    return scene
-
-
-@cache
-def scene_of(name: str, seed: int) -> Scene:
-    return scene_of_mesh(world_mesh(cached_world(name, seed)))
-
-
-def cast(scene: Scene, origins: FloatArray, directions: FloatArray) -> FloatArray:
-    """Distance (N,) along unit vectors (N, 3), infinite where nothing is hit."""
-    rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).reshape(-1, 6)
-    return np.asarray(scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy())
 
 
 def arrays_of(world: World) -> Iterator[FloatArray]:
@@ -114,7 +94,7 @@ def test_it_is_finite_and_of_the_stated_size(name: str, seed: int) -> None:
 @each_inside
 def test_indoor_routes_are_driven_on_something_and_gentle(name: str, seed: int) -> None:
     points, _, _ = level_frames(cached_world(name, seed), 0.5)
-    below = cast(scene_of(name, seed), points + 0.5 * UP, np.array([0.0, 0.0, -1.0]))
+    below = cast(caster_of(name, seed), points + 0.5 * UP, np.array([0.0, 0.0, -1.0]))
     assert np.abs(below - 0.5).max() < 0.12
     waypoints = cached_world(name, seed).route.waypoints
     steps = np.roll(waypoints, -1, axis=0) - waypoints
@@ -127,15 +107,15 @@ def test_nothing_stands_on_the_route(name: str, seed: int) -> None:
     """Rays to both sides, along and upwards meet nothing in the free space of the route, save the ground outdoors."""
     world = cached_world(name, seed)
     solids = merge([box_mesh(world.boxes), cylinder_mesh(world.cylinders)])
-    scene = scene_of(name, seed) if name in INDOORS else scene_of_mesh(solids)
+    caster = caster_of(name, seed) if name in INDOORS else Caster(world, solids)
     points, ahead, left = level_frames(world, 0.05 if name in INDOORS else 0.1)
     side, height = world.route.free_side_m, world.route.free_height_m
     for z in np.linspace(FLOOR_M, height, 8):
         # At a corner "ahead" is only known up to the corner.
         for direction, reach in ((left, side), (-left, side), (ahead, 0.05), (-ahead, 0.05)):
-            assert cast(scene, points + z * UP, direction).min() > reach - 1e-3
+            assert cast(caster, points + z * UP, direction).min() > reach - 1e-3
     for offset in np.linspace(-side, side, 7):
-        assert cast(scene, points + offset * left + FLOOR_M * UP, UP).min() > height - FLOOR_M - 1e-3
+        assert cast(caster, points + offset * left + FLOOR_M * UP, UP).min() > height - FLOOR_M - 1e-3
 
 
 @each_inside
@@ -144,7 +124,7 @@ def test_rays_do_not_get_out(name: str, seed: int) -> None:
     directions = np.random.default_rng(seed).normal(size=(150, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.repeat(points + 1.0 * UP, len(directions), axis=0)
-    distances = cast(scene_of(name, seed), origins, np.tile(directions, (len(points), 1)))
+    distances = cast(caster_of(name, seed), origins, np.tile(directions, (len(points), 1)))
     assert np.isfinite(distances).all()
     assert (distances < 60.0).mean() > 0.995
 
