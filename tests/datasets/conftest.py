@@ -1,7 +1,9 @@
 """Point clouds as the drivers lay them out, bags that hold them, and files of scans."""
 
+import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,11 +12,43 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+STAMP_NS = 1_700_000_000_250_000_000
+PERIOD_NS = 100_000_000
+LATENCY_NS = 37_000_123  # from the stamp of the header to the recording
+
+# Kinds of bags and how they are compressed.
+COMPRESSIONS = [
+    ("bag", (Rosbag1Writer.CompressionFormat.BZ2,)),
+    ("bag", (Rosbag1Writer.CompressionFormat.LZ4,)),
+    ("db3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
+    ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
+]
+
 _DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def stamps_ns(count: int) -> list[int]:
+    """Stamps of scans at 10 Hz."""
+    return [STAMP_NS + number * PERIOD_NS for number in range(count)]
+
+
+def execute(file: Path, statement: str, *values: Any) -> list[Any]:
+    """The rows that a statement finds in a database, or none if it changes it."""
+    with closing(sqlite3.connect(file)) as database, database:
+        return database.execute(statement, values).fetchall()
+
+
+def point_table(points: np.ndarray, **columns: np.ndarray) -> np.ndarray:
+    """Coordinates (N, 3) in float32, and further columns as they are."""
+    parts = {**dict(zip("xyz", points.T.astype("<f4"), strict=True)), **columns}
+    table = np.empty(len(points), [(name, part.dtype, part.shape[1:]) for name, part in parts.items()])
+    for name, part in parts.items():
+        table[name] = part
+    return table
 
 
 def _layout(point_step, **fields):
@@ -186,6 +220,7 @@ class BagKit:
         self, points: np.ndarray, offset_ns: np.ndarray, lines: np.ndarray, stamp_ns: int, timebase: int, package: str
     ) -> Any:
         """A Livox CustomMsg."""
+        named = [dict(zip("xyz", map(float, point), strict=True)) for point in points]
         return self.new(
             f"{package}/CustomMsg",
             header=self.header(stamp_ns),
@@ -194,17 +229,8 @@ class BagKit:
             lidar_id=1,
             rsvd=np.zeros(3, np.uint8),
             points=[
-                self.new(
-                    f"{package}/CustomPoint",
-                    offset_time=int(time),
-                    x=float(x),
-                    y=float(y),
-                    z=float(z),
-                    reflectivity=9,
-                    tag=16,
-                    line=int(line),
-                )
-                for (x, y, z), time, line in zip(points, offset_ns, lines, strict=True)
+                self.new(f"{package}/CustomPoint", offset_time=int(time), line=int(line), reflectivity=9, tag=16, **xyz)
+                for xyz, time, line in zip(named, offset_ns, lines, strict=True)
             ],
         )
 
@@ -285,6 +311,17 @@ def ros2_kit(tmp_path: Path) -> BagKit:
 
 
 @pytest.fixture
+def velodyne_clouds(make_sweep: Callable[..., SimpleNamespace]) -> Callable[[BagKit, int], list[tuple[int, Any]]]:
+    """So many clouds of a Velodyne, with their times of recording."""
+
+    def made(kit: BagKit, count: int) -> list[tuple[int, Any]]:
+        clouds = [kit.cloud(make_sweep("velodyne", ns).records, ns) for ns in stamps_ns(count)]
+        return [(ns + LATENCY_NS, cloud) for ns, cloud in zip(stamps_ns(count), clouds, strict=True)]
+
+    return made
+
+
+@pytest.fixture
 def make_bag_kit(tmp_path: Path) -> Callable[[str], BagKit]:
     """A bag of a given kind."""
     return lambda kind: BagKit(kind, tmp_path)
@@ -293,13 +330,7 @@ def make_bag_kit(tmp_path: Path) -> Callable[[str], BagKit]:
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "u4": "uint", "i4": "int"}
 
 
-@pytest.fixture(scope="session")
-def formats() -> SimpleNamespace:
-    """Tables of points as the bytes of scan files."""
-    return SimpleNamespace(pcd=_pcd_bytes, ply=_ply_bytes)
-
-
-def _pcd_bytes(table: np.ndarray, data: str = "binary") -> bytes:
+def pcd_bytes(table: np.ndarray, data: str = "binary") -> bytes:
     """A PCD file."""
     kinds = {"f": "F", "u": "U", "i": "I"}
     types = [table.dtype[name] for name in table.dtype.names]
@@ -335,7 +366,7 @@ def _lzf_literals(data: bytes) -> bytes:
     return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
 
 
-def _ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes = b"", faces: bool = False) -> bytes:
+def ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes = b"", faces: bool = False) -> bytes:
     """A PLY file; other elements may come before the vertices, and a face behind them."""
     properties = "".join(f"property {_PLY_NAMES[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names)
     header = f"ply\nformat {encoding} 1.0\ncomment made by a test\n{before}element vertex {len(table)}\n{properties}"

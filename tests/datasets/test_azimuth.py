@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.lib.recfunctions import append_fields, repack_fields
 
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.times.azimuth import are_as_measured, offsets_from_order, sweep_order
+
+from .conftest import point_table, stamps_ns
 
 PERIOD_S, COLUMNS = 0.1, 900
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
@@ -56,13 +59,7 @@ def record(folder: Path, every=1, stamps=True, rings=True, count=12, **options) 
     folder.mkdir()
     for number in range(count):
         points, _, ring = sweep(number * every * PERIOD_S, **options)
-        names = [(name, "f4") for name in "xyz"] + ([("ring", "u2")] if rings else [])
-        table = np.zeros(len(points), names)
-        for column, name in enumerate("xyz"):
-            table[name] = points[:, column]
-        if rings:
-            table["ring"] = ring
-        np.save(folder / f"{number:03d}.npy", table)
+        np.save(folder / f"{number:03d}.npy", point_table(points, **({"ring": ring} if rings else {})))
     if stamps:
         np.savetxt(folder / "times.txt", np.arange(count) * every * PERIOD_S)
     return folder
@@ -158,10 +155,7 @@ def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
     folder = record(tmp_path / "raw")
     for path in folder.glob("*.npy"):
         table = np.load(path)
-        timed = np.zeros(len(table), [*table.dtype.descr, ("time", "f4")])
-        for name in table.dtype.names:
-            timed[name] = table[name]
-        np.save(path, timed)
+        np.save(path, append_fields(table, "time", np.zeros(len(table), "f4"), usemask=False))
     recording = open_recording(folder)
     assert next(recording.scans()).time_offsets.max() == pytest.approx(PERIOD_S, abs=1e-3)
     assert recording.warnings == (
@@ -171,13 +165,9 @@ def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
 
 def test_clouds_of_a_bag(bag_kit):
     messages = []
-    for number in range(60):
+    for number, stamp_ns in enumerate(stamps_ns(60)):
         points, times, rings = sweep(number * PERIOD_S)
-        records = np.zeros((1, len(points)), [(name, "f4") for name in "xyz"] + [("ring", "u2")])
-        for column, name in enumerate("xyz"):
-            records[name] = points[:, column]
-        records["ring"] = rings
-        stamp_ns = 1_700_000_000_000_000_000 + round(number * PERIOD_S * 1e9)
+        records = point_table(points, ring=rings.astype("u2"))[None]
         messages.append((stamp_ns, bag_kit.cloud(records, stamp_ns)))
     recording = open_recording(bag_kit.write({"/points": messages}))
     assert recording.describe().point_time.field == "azimuth"
@@ -191,11 +181,7 @@ def test_a_real_drive_with_its_times_hidden(tmp_path, real_data):
     if not source.is_dir():
         pytest.skip("needs vlp16_loop")
     for path in source.glob("*.npy"):
-        table = np.load(path)
-        hidden = np.zeros(len(table), [(name, "f4") for name in "xyz"] + [("ring", "u2")])
-        for name in hidden.dtype.names:
-            hidden[name] = table[name]
-        np.save(tmp_path / path.name, hidden)
+        np.save(tmp_path / path.name, repack_fields(np.load(path)[["x", "y", "z", "ring"]]))
     found, known = open_recording(tmp_path), open_recording(source)
     for mine, given in zip(found.scans(0, None, 50), known.scans(0, None, 50), strict=True):
         scale = given.time_offsets.max() / mine.time_offsets.max()

@@ -16,9 +16,10 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.registry import open_recording
 
+from .conftest import pcd_bytes, ply_bytes, point_table
+
 POINTS = 120
 SCANS = 4
-STAMP_NS = 1_700_000_000_250_000_000
 HEADER_WORDS = (
     "", "0", "-1", "1", "3", "119", "121", "4294967295", "1000000000000", "9" * 30, "nan", "x y z", "x", "_", "F", "8",
     "ascii", "binary", "binary_compressed", "binary_big_endian", "vertex", "list", "float", "double", "\u00e9", "('x',",
@@ -88,14 +89,9 @@ def damages(draw):
 
 @pytest.fixture(scope="module")
 def table() -> np.ndarray:
-    rng = np.random.default_rng(3)
-    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2")]
-    points = np.zeros(POINTS, fields)
-    for axis in "xyz":
-        points[axis] = rng.uniform(-20.0, 20.0, POINTS)
-    points["t"] = np.linspace(0, 100_000_000, POINTS)
-    points["ring"] = np.arange(POINTS) % 16
-    return points
+    points = np.random.default_rng(3).uniform(-20.0, 20.0, (POINTS, 3))
+    times = np.linspace(0, 100_000_000, POINTS).astype("<u4")
+    return point_table(points, intensity=np.zeros(POINTS, "<f4"), t=times, ring=(np.arange(POINTS) % 16).astype("<u2"))
 
 
 def _as_bin(points: np.ndarray) -> bytes:
@@ -106,25 +102,20 @@ FORMATS = ("plain.bin", "structured.npy", "ascii.pcd", "binary.pcd", "binary_com
            "binary_little_endian.ply", "binary_big_endian.ply")  # fmt: skip
 
 
-@pytest.fixture
-def encode(formats):
+def encode(name: str, points: np.ndarray) -> bytes:
     """The bytes of a file of points, by its name."""
-
-    def encoded(name: str, points: np.ndarray) -> bytes:
-        kind, _, suffix = name.partition(".")
-        if suffix in ("pcd", "ply"):
-            return bytes((formats.pcd if suffix == "pcd" else formats.ply)(points, kind))
-        out = io.BytesIO()
-        np.save(out, points)
-        return _as_bin(points) if suffix == "bin" else out.getvalue()
-
-    return encoded
+    kind, _, suffix = name.partition(".")
+    if suffix in ("pcd", "ply"):
+        return (pcd_bytes if suffix == "pcd" else ply_bytes)(points, kind)
+    out = io.BytesIO()
+    np.save(out, points)
+    return _as_bin(points) if suffix == "bin" else out.getvalue()
 
 
 @pytest.mark.parametrize("name", FORMATS)
 @fuzzed
 @given(damage=damages(), place=st.integers(0, SCANS - 1))
-def test_folder_of_damaged_scans(tmp_path, table, encode, name, damage, place):
+def test_folder_of_damaged_scans(tmp_path, table, name, damage, place):
     data = encode(name, table)
     header = len(data) - len(encode(name, table[:0])) if name == "plain.bin" else len(encode(name, table[:0]))
     for index in range(SCANS):
@@ -166,6 +157,12 @@ def _check_truth(source: Path) -> None:
     assert truth is None or np.isfinite(truth.T_world_lidar).all()
 
 
+RAW_TIMES = {
+    "velodyne_points/timestamps": 0.0,
+    "velodyne_points/timestamps_start": -0.05,
+    "velodyne_points/timestamps_end": 0.05,
+    "oxts/timestamps": 0.013,
+}
 RAW_FILES = (
     "velodyne_points/timestamps.txt",
     "velodyne_points/timestamps_start.txt",
@@ -183,12 +180,9 @@ def test_damaged_kitti_raw_drive(tmp_path, table, name, damage):
     drive = tmp_path / "drive"
     (drive / "velodyne_points" / "data").mkdir(parents=True, exist_ok=True)
     (drive / "oxts" / "data").mkdir(parents=True, exist_ok=True)
-    for folder, shift in (("velodyne_points/timestamps", 0.0), ("oxts/timestamps", 0.013)):
+    for path, shift in RAW_TIMES.items():
         lines = [f"2011-09-26 13:02:{25 + 0.1 * index + shift:012.9f}\n" for index in range(SCANS)]
-        (drive / f"{folder}.txt").write_text("".join(lines))
-    for which, shift in (("start", -0.05), ("end", 0.05)):
-        lines = [f"2011-09-26 13:02:{25 + 0.1 * index + shift:012.9f}\n" for index in range(SCANS)]
-        (drive / "velodyne_points" / f"timestamps_{which}.txt").write_text("".join(lines))
+        (drive / f"{path}.txt").write_text("".join(lines))
     for index in range(SCANS):
         (drive / "velodyne_points" / "data" / f"{index:010d}.bin").write_bytes(_as_bin(table))
         numbers = [49.0 + 1e-6 * index, 8.4, 110.0, *np.zeros(27)]
@@ -200,36 +194,29 @@ def test_damaged_kitti_raw_drive(tmp_path, table, name, damage):
     _check_truth(drive)
 
 
+@pytest.fixture
+def bag(bag_kit, velodyne_clouds) -> dict[Path, bytes]:
+    """The file of a bag and, if it is a folder, its metadata; what is in them."""
+    file = bag_kit.storage_file(bag_kit.write({"/points": velodyne_clouds(bag_kit, SCANS)}))
+    return {path: path.read_bytes() for path in (file, file.with_name("metadata.yaml")) if path.exists()}
+
+
 @fuzzed
 @given(damage=damages(), what=st.sampled_from(["file", "metadata"]))
-def test_damaged_bags(bag_kit, make_sweep, damage, what):
-    kit, kept = bag_kit, bag_kit.folder / "kept"
-    path = kit.folder / ("drive.bag" if kit.kind == "bag" else "drive")
-    if not kept.exists():
-        sweeps = [make_sweep("velodyne", STAMP_NS + i * 10**8) for i in range(SCANS)]
-        stamps = [STAMP_NS + i * 10**8 for i in range(SCANS)]
-        clouds = [(ns, kit.cloud(sweep.records, ns)) for ns, sweep in zip(stamps, sweeps, strict=True)]
-        assert kit.write({"/points": clouds}) == path
-        kept.mkdir()
-        (kept / "file").write_bytes(kit.storage_file(path).read_bytes())
-        if path.is_dir():
-            (kept / "metadata").write_bytes((path / "metadata.yaml").read_bytes())
-    file = kit.storage_file(path)
-    file.write_bytes((kept / "file").read_bytes())
-    if path.is_dir():
-        (path / "metadata.yaml").write_bytes((kept / "metadata").read_bytes())
-    if what == "metadata" and path.is_dir():
-        data = (kept / "metadata").read_bytes()
-        (path / "metadata.yaml").write_bytes(damage(data, len(data)))
-        check(path)
+def test_damaged_bags(bag, damage, what):
+    for path, content in bag.items():
+        path.write_bytes(content)
+    file, *metadata = bag
+    if what == "metadata" and metadata:
+        metadata[0].write_bytes(damage(bag[metadata[0]], len(bag[metadata[0]])))
+        check(file.parent)
     else:
-        data = (kept / "file").read_bytes()
-        file.write_bytes(damage(data, min(len(data), 600)))
+        file.write_bytes(damage(bag[file], min(len(bag[file]), 600)))
         check(file)
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "plain.bin"])
-def test_a_header_that_promises_more_than_there_is(tmp_path, table, encode, name):
+def test_a_header_that_promises_more_than_there_is(tmp_path, table, name):
     """One point more, and so many that making room for them would fill any memory."""
     data = encode(name, table)
     for promised in ("121", "1000000000000"):
@@ -256,7 +243,7 @@ def test_pickled_objects_are_never_unpickled(tmp_path):
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith((".pcd", ".ply"))])
-def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, encode, name):
+def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, name):
     lie = encode(name, table).replace(b"POINTS 120", b"POINTS 0").replace(b"element vertex 120", b"element vertex 0")
     (tmp_path / name).write_bytes(lie)
     with pytest.raises(InputError, match=r"promises no points, and .* bytes follow|is truncated"):
@@ -265,7 +252,7 @@ def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, 
 
 @pytest.mark.parametrize("before", [False, True])
 @pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith(".ply")])
-def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, encode, name, before):
+def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, name, before):
     header, body = encode(name, table).split(b"end_header\n")
     faces, vertex = b"element face 1000000000000\nproperty uchar n\n", header.index(b"element vertex")
     header = header[:vertex] + faces + header[vertex:] if before else header + faces

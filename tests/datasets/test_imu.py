@@ -13,7 +13,8 @@ from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros import made_messages
 
-STAMP_NS = 1_700_000_000_250_000_000
+from .conftest import STAMP_NS
+
 IMU_PERIOD_NS = 5_000_000
 T_LIDAR_BASE = exp([0.1, -0.2, 0.3, 0.5, 0.0, -1.0])
 T_BASE_IMU = exp([0.0, 0.0, 3.0, 0.1, 0.2, 0.3])
@@ -54,65 +55,54 @@ def transforms(kit, *edges):
     return made_messages.transforms(kit.store, *named)
 
 
-def clouds(kit, make_sweep):
-    return [
-        (stamp_ns + 10**8, kit.cloud(make_sweep("velodyne", stamp_ns).records, stamp_ns))
-        for stamp_ns in (STAMP_NS, STAMP_NS + 10**8)
-    ]
+@pytest.fixture
+def write_bag(velodyne_clouds):
+    """Write a bag of two clouds and other topics."""
+    return lambda kit, topics: kit.write({"/points": velodyne_clouds(kit, 2), **topics})
 
 
 @pytest.mark.parametrize("frame_id", ["imu", "imu_link", "/a/longer_name_of_23_bytes"])  # CDR pads behind it
-def test_every_kind_of_bag(bag_kit, make_sweep, samples, frame_id):
-    path = bag_kit.write({"/points": clouds(bag_kit, make_sweep), "/imu": samples.messages(bag_kit, frame_id)})
-    imu = open_recording(path).imu
+def test_every_kind_of_bag(bag_kit, write_bag, samples, frame_id):
+    imu = open_recording(write_bag(bag_kit, {"/imu": samples.messages(bag_kit, frame_id)})).imu
     samples.assert_found(imu)
     assert imu.T_lidar_imu is None
     assert imu.notes == ()
     assert imu.rate_hz == pytest.approx(200.0, rel=1e-3)
 
 
-def test_a_bag_without_one(ros2_kit, make_sweep):
-    recording = open_recording(ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": "sensor_msgs/msg/Imu"}))
+def test_a_bag_without_one(ros2_kit, write_bag):
+    recording = open_recording(write_bag(ros2_kit, {"/imu": "sensor_msgs/msg/Imu"}))
     assert recording.imu is None
     assert recording.describe().imu is None
 
 
-def test_the_extrinsic_goes_along_the_chain_of_frames(bag_kit, make_sweep, samples):
+def test_the_extrinsic_goes_along_the_chain_of_frames(bag_kit, write_bag, samples):
     static = [(STAMP_NS, transforms(bag_kit, ("base", "/imu", T_BASE_IMU), ("base", "mast", np.eye(4))))]
     static += [(STAMP_NS + 1, transforms(bag_kit, ("mast", "lidar", inverse(T_LIDAR_BASE))))]
-    path = bag_kit.write(
-        {"/points": clouds(bag_kit, make_sweep), "/imu": samples.messages(bag_kit), "/tf_static": static}
-    )
-    recording = open_recording(path)
-    np.testing.assert_allclose(recording.imu.T_lidar_imu, T_LIDAR_BASE @ T_BASE_IMU, atol=1e-12)
+    path = write_bag(bag_kit, {"/imu": samples.messages(bag_kit), "/tf_static": static})
+    np.testing.assert_allclose(open_recording(path).imu.T_lidar_imu, T_LIDAR_BASE @ T_BASE_IMU, atol=1e-12)
     text = describe_source(path, ReaderConfig())
     assert "/imu, 41 samples at 200 Hz, extrinsic known" in text
     assert "An IMU is there: run with --odometry learned+imu." in text
 
 
-def test_frames_that_are_not_connected(ros2_kit, make_sweep, samples):
+def test_frames_that_are_not_connected(ros2_kit, write_bag, samples):
     static = [(STAMP_NS, transforms(ros2_kit, ("base", "imu", T_BASE_IMU), ("map", "lidar", np.eye(4))))]
-    path = ros2_kit.write(
-        {"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit), "/tf_static": static}
-    )
+    path = write_bag(ros2_kit, {"/imu": samples.messages(ros2_kit), "/tf_static": static})
     assert open_recording(path).imu.T_lidar_imu is None
     assert "extrinsic unknown" in describe_source(path, ReaderConfig())
 
 
-def test_one_frame_for_both(ros2_kit, make_sweep, samples):
-    path = ros2_kit.write(
-        {"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit, frame_id="lidar")}
-    )
-    imu = open_recording(path).imu
+def test_one_frame_for_both(ros2_kit, write_bag, samples):
+    imu = open_recording(write_bag(ros2_kit, {"/imu": samples.messages(ros2_kit, frame_id="lidar")})).imu
     np.testing.assert_array_equal(imu.T_lidar_imu, np.eye(4))
     assert "share the frame 'lidar'" in imu.notes[0]
 
 
-def test_samples_in_disorder_repeated_and_broken(ros2_kit, make_sweep, samples):
+def test_samples_in_disorder_repeated_and_broken(ros2_kit, write_bag, samples):
     order = [*range(5, 41), 3, 3, *range(5)]
     samples.w[10] = np.nan
-    path = ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit, order=order)})
-    imu = open_recording(path).imu
+    imu = open_recording(write_bag(ros2_kit, {"/imu": samples.messages(ros2_kit, order=order)})).imu
     kept = np.delete(np.arange(41), 10)
     np.testing.assert_array_equal(imu.stamps, samples.stamps[kept])
     np.testing.assert_array_equal(imu.angular_velocities, samples.w[kept])
@@ -120,9 +110,9 @@ def test_samples_in_disorder_repeated_and_broken(ros2_kit, make_sweep, samples):
     assert "2 IMU samples with the stamp of another left out." in imu.notes
 
 
-def test_accelerations_in_g(ros2_kit, make_sweep, rng):
+def test_accelerations_in_g(ros2_kit, write_bag, rng):
     samples = Samples(rng, in_g=True)
-    path = ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit)})
+    path = write_bag(ros2_kit, {"/imu": samples.messages(ros2_kit)})
     imu = open_recording(path).imu
     samples.assert_found(imu, rtol=1e-12)
     assert "in g" in imu.notes[0]
@@ -141,15 +131,13 @@ def test_accelerations_without_gravity(rng):
         ({"/camera/imu": "base", "/vn100/data": "front_imu"}, "/vn100/data"),
     ],
 )
-def test_of_several_the_nearest(ros2_kit, make_sweep, rng, names, expected):
-    messages = [(t, m) for t, m in clouds(ros2_kit, make_sweep)]
-    for _, message in messages:
-        message.header.frame_id = "front_lidar"
+def test_of_several_the_nearest(ros2_kit, velodyne_clouds, rng, names, expected):
+    clouds = velodyne_clouds(ros2_kit, 2)
+    for _, cloud in clouds:
+        cloud.header.frame_id = "front_lidar"
     found = {name: Samples(rng, 60 - 10 * k) for k, name in enumerate(names)}
-    path = ros2_kit.write(
-        {"/front/points": messages}
-        | {name: found[name].messages(ros2_kit, frame_id) for name, frame_id in names.items()}
-    )
+    recorded = {name: found[name].messages(ros2_kit, frame_id) for name, frame_id in names.items()}
+    path = ros2_kit.write({"/front/points": clouds, **recorded})
     found[expected].assert_found(open_recording(path).imu)
     other = next(name for name in names if name != expected)
     found[other].assert_found(open_recording(path, ReaderConfig(imu_topic=other)).imu)
@@ -157,11 +145,12 @@ def test_of_several_the_nearest(ros2_kit, make_sweep, rng, names, expected):
         _ = open_recording(path, ReaderConfig(imu_topic="/none")).imu
 
 
-def test_where_no_cloud_is_stamped_samples_have_the_times_of_recording(ros2_kit, make_sweep, samples):
-    unset = [(t, ros2_kit.cloud(make_sweep("velodyne", STAMP_NS).records, 0)) for t, _ in clouds(ros2_kit, make_sweep)]
-    path = ros2_kit.write({"/points": unset, "/imu": samples.messages(ros2_kit)})
-    imu = open_recording(path).imu
-    np.testing.assert_allclose(imu.stamps, samples.stamps + 1e-3, atol=1e-6)
+def test_where_no_cloud_is_stamped_samples_have_the_times_of_recording(ros2_kit, velodyne_clouds, samples):
+    clouds = velodyne_clouds(ros2_kit, 2)
+    for _, cloud in clouds:
+        cloud.header.stamp.sec = cloud.header.stamp.nanosec = 0
+    path = ros2_kit.write({"/points": clouds, "/imu": samples.messages(ros2_kit)})
+    np.testing.assert_allclose(open_recording(path).imu.stamps, samples.stamps + 1e-3, atol=1e-6)
 
 
 def folder_of_scans(path: Path, count=3):
@@ -185,13 +174,10 @@ def test_a_table_beside_the_scans(tmp_path, samples, unit):
     (folder / "imu.csv").write_text("\n".join([*head, *rows, ""]))
     recording = open_recording(folder)
     samples.assert_found(recording.imu)
-    if unit == "ns":
-        assert recording.imu.T_lidar_imu is None
-    else:
+    known = "unknown" if unit == "ns" else "known"
+    assert f"imu.csv, 41 samples at 200 Hz, extrinsic {known}" in describe_source(folder, ReaderConfig())
+    if known == "known":
         np.testing.assert_allclose(recording.imu.T_lidar_imu, T_BASE_IMU, atol=1e-12)
-    assert f"imu.csv, 41 samples at 200 Hz, extrinsic {'unknown' if unit == 'ns' else 'known'}" in describe_source(
-        folder, ReaderConfig()
-    )
     assert len(recording) == 3
 
 

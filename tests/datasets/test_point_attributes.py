@@ -1,5 +1,7 @@
 """Intensity and colour come out of every reader as they were recorded."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -8,18 +10,13 @@ from lidarslam.datasets.point_table import raw_cloud, read_colours, read_intensi
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
-STAMP_NS = 1_700_000_000_250_000_000
-XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4")]
+from .conftest import STAMP_NS, point_table, stamps_ns
+
 RGB = np.array([[255, 128, 0], [1, 2, 3], [0, 0, 255], [255, 255, 255]], dtype=np.uint8)
 PACKED = (RGB.astype(np.uint32) << np.array([16, 8, 0], dtype=np.uint32)).sum(axis=1, dtype=np.uint32)
 
 
-def table(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Four points with these columns."""
-    made = np.ones(4, [*XYZ, *((name, values.dtype) for name, values in columns.items())])
-    for name, values in columns.items():
-        made[name] = values
-    return made
+table = partial(point_table, np.ones((4, 3)))  # four points with further columns
 
 
 @pytest.mark.parametrize(
@@ -32,7 +29,7 @@ def table(columns: dict[str, np.ndarray]) -> np.ndarray:
     ],
 )
 def test_the_field_of_intensity(names, field):
-    read = read_intensities(table({name: np.full(4, place, "f4") for place, name in enumerate(names)}))
+    read = read_intensities(table(**{name: np.full(4, place, "f4") for place, name in enumerate(names)}))
     assert (read is None) if field is None else read[0] == names.index(field)
 
 
@@ -47,17 +44,15 @@ def test_the_field_of_intensity(names, field):
     ],
 )
 def test_the_fields_of_colour(names, colour):
-    read = read_colours(table({name: np.full(4, place, "u4") for place, name in enumerate(names)}))
+    read = read_colours(table(**{name: np.full(4, place, "u4") for place, name in enumerate(names)}))
     assert (read is None) if colour is None else read[0].tolist() == colour
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2", "u4", "i4", "f4", "f8"])
-@pytest.mark.parametrize("highest", [1, 255, 65535])
+@pytest.mark.parametrize("highest", [1, 255])
 def test_intensities_keep_their_scale(kind, highest):
-    if highest > np.iinfo("u1").max and kind == "u1":
-        pytest.skip("holds no such number")
     recorded = (np.array([0.0, 0.25, 0.5, 1.0]) * highest).astype(kind)
-    read = read_intensities(table({"intensity": recorded}))
+    read = read_intensities(table(intensity=recorded))
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read, recorded.astype(np.float32))
 
@@ -77,18 +72,13 @@ COLOURS = {
 }
 
 
-@pytest.mark.parametrize("columns", COLOURS.values(), ids=list(COLOURS))
-def test_colours_of_every_type(columns):
-    np.testing.assert_array_equal(read_colours(table(columns)), RGB)
-
-
 def test_a_packed_colour_of_another_size_is_none():
-    assert read_colours(table({"rgb": PACKED.astype(np.uint64)})) is None
+    assert read_colours(table(rgb=PACKED.astype(np.uint64))) is None
 
 
 @pytest.mark.parametrize("columns", COLOURS.values(), ids=list(COLOURS))
 def test_point_cloud2(ros2_kit, columns):
-    records = table(columns | {"intensity": np.arange(4, dtype=np.uint16) * 20_000}).reshape(2, 2)
+    records = table(**columns, intensity=np.arange(4, dtype=np.uint16) * 20_000).reshape(2, 2)
     if any(values.dtype.byteorder == ">" for values in columns.values()):
         records = records.astype(records.dtype.newbyteorder(">"))
     cloud = decode_point_cloud2(
@@ -99,7 +89,7 @@ def test_point_cloud2(ros2_kit, columns):
 
 
 def test_fields_that_cannot_be_read_are_no_attributes(ros2_kit):
-    message = ros2_kit.cloud(table({"intensity": np.ones(4, dtype="f4"), "rgb": PACKED}).reshape(1, 4), STAMP_NS)
+    message = ros2_kit.cloud(table(intensity=np.ones(4, dtype="f4"), rgb=PACKED).reshape(1, 4), STAMP_NS)
     message.fields[3].datatype, message.fields[4].offset = 99, 1000
     cloud = decode_point_cloud2(message)
     assert len(cloud.points) == 4
@@ -107,11 +97,9 @@ def test_fields_that_cannot_be_read_are_no_attributes(ros2_kit):
 
 
 def test_a_bag_in_which_some_scans_have_a_field(bag_kit):
-    with_field = table({"intensity": np.arange(4, dtype="f4")}).reshape(1, 4)
-    messages = [
-        (STAMP_NS + k * 10**8, bag_kit.cloud(one, STAMP_NS + k * 10**8))
-        for k, one in enumerate([with_field, table({}).reshape(1, 4), with_field])
-    ]
+    with_field = table(intensity=np.arange(4, dtype="f4")).reshape(1, 4)
+    records = with_field, table().reshape(1, 4), with_field
+    messages = [(ns, bag_kit.cloud(one, ns)) for ns, one in zip(stamps_ns(3), records, strict=True)]
     scans = list(open_recording(bag_kit.write({"/points": messages})).scans())
     assert [None if scan.intensities is None else scan.intensities.tolist() for scan in scans] == [
         [0.0, 1.0, 2.0, 3.0], None, [0.0, 1.0, 2.0, 3.0],
@@ -129,7 +117,7 @@ def test_livox(bag_kit):
 @pytest.mark.parametrize("suffix", ["bin", "npy", "columns.npy", "pcd", "ply"])
 def test_folders(tmp_path, suffix):
     intensity = np.array([0.0, 0.25, 0.5, 1.0], dtype=np.float32)
-    points = table({"intensity": intensity, **COLOURS["bytes"]})
+    points = table(intensity=intensity, **COLOURS["bytes"])
     numbers = np.column_stack([points[name] for name in ("x", "y", "z", "intensity")])
     file = tmp_path / f"000000.{suffix.rpartition('.')[2]}"
     if suffix == "bin":

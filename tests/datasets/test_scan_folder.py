@@ -15,42 +15,32 @@ from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.times.stamps import read_stamps, stamps_from_names
 
+from .conftest import pcd_bytes, ply_bytes, point_table
+
 EPOCH = 1583836591.25
-RICH = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("intensity", "<f4"),
-        ("t", "<u4"),
-        ("ring", "<u2"),
-        ("label", "i1"),
-        ("clock", "<f8"),
-    ]
-)
 
 
 def _rich(rng: np.random.Generator, count: int = 200) -> np.ndarray:
-    table = np.zeros(count, RICH)
-    for name in "xyz":
-        table[name] = rng.uniform(1.0, 30.0, count)
-    table["intensity"] = rng.uniform(0.0, 255.0, count)
-    table["t"] = np.linspace(0, 99_000_000, count)  # nanoseconds of a sweep of 0.1 s
-    table["ring"] = np.arange(count) % 16 + 300
-    table["label"] = -(np.arange(count) % 100)
-    table["clock"] = EPOCH + 1e-6 * np.arange(count)
-    return table
+    numbers = np.arange(count)
+    return point_table(
+        rng.uniform(1.0, 30.0, (count, 3)),
+        intensity=rng.uniform(0.0, 255.0, count).astype("<f4"),
+        t=np.linspace(0, 99_000_000, count).astype("<u4"),  # nanoseconds of a sweep of 0.1 s
+        ring=(numbers % 16 + 300).astype("<u2"),
+        label=-(numbers % 100).astype("i1"),
+        clock=EPOCH + 1e-6 * numbers,
+    )
 
 
-def _write(formats, folder: Path, name: str, table: np.ndarray) -> None:
+def _write(folder: Path, name: str, table: np.ndarray) -> None:
     suffix = name.rpartition(".")[2]
     folder.mkdir(parents=True, exist_ok=True)
     if suffix == "npy":
         np.save(folder / name, table)
     elif suffix == "pcd":
-        (folder / name).write_bytes(formats.pcd(table, "binary"))
+        (folder / name).write_bytes(pcd_bytes(table, "binary"))
     elif suffix == "ply":
-        (folder / name).write_bytes(formats.ply(table, "binary_little_endian"))
+        (folder / name).write_bytes(ply_bytes(table, "binary_little_endian"))
     else:
         np.column_stack([table[n] for n in ("x", "y", "z", "intensity")]).astype("<f4").tofile(folder / name)
 
@@ -60,24 +50,23 @@ def _points(table: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
-def test_pcd_keeps_every_field_and_type(formats, tmp_path, rng, data):
+def test_pcd_keeps_every_field_and_type(tmp_path, rng, data):
     table = _rich(rng)
-    (tmp_path / "a.pcd").write_bytes(formats.pcd(table, data))
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(table, data))
     read = read_pcd(tmp_path / "a.pcd")
-    assert read.dtype == RICH
+    assert read.dtype == table.dtype
     np.testing.assert_array_equal(read, table)
 
 
-def test_pcd_with_padding_and_vector_fields(formats, tmp_path, rng):
-    dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("_", "u1", (4,)), ("normal", "<f4", (3,))])
-    table = np.zeros(5, dtype)
-    table["x"], table["normal"] = np.arange(5) + 1.0, rng.uniform(size=(5, 3))
+def test_pcd_with_padding_and_vector_fields(tmp_path, rng):
+    normals = rng.uniform(size=(5, 3)).astype("<f4")
+    table = point_table(rng.uniform(1.0, 9.0, (5, 3)), _=np.zeros((5, 4), "u1"), normal=normals)
     for data in ("binary", "binary_compressed"):
-        (tmp_path / "a.pcd").write_bytes(formats.pcd(table, data))
+        (tmp_path / "a.pcd").write_bytes(pcd_bytes(table, data))
         read = read_pcd(tmp_path / "a.pcd")
         np.testing.assert_array_equal(read["x"], table["x"])
-        np.testing.assert_array_equal(read["normal"], table["normal"])
-    twice = formats.pcd(table, "binary").replace(b"FIELDS x y z _ normal", b"FIELDS x y z _ _")
+        np.testing.assert_array_equal(read["normal"], normals)
+    twice = pcd_bytes(table, "binary").replace(b"FIELDS x y z _ normal", b"FIELDS x y z _ _")
     (tmp_path / "a.pcd").write_bytes(twice)
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["x"], table["x"])
 
@@ -90,24 +79,22 @@ def test_pcd_as_other_programs_write_it(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_ply_keeps_every_property_and_type(formats, tmp_path, rng, encoding):
+def test_ply_keeps_every_property_and_type(tmp_path, rng, encoding):
     table = _rich(rng)
     before, prefix = "element sensor 2\nproperty double height\n", b"1.5\n2.5\n"
     if encoding != "ascii":
         prefix = np.array([1.5, 2.5], "<f8" if "little" in encoding else ">f8").tobytes()
-    (tmp_path / "a.ply").write_bytes(formats.ply(table, encoding, before, prefix, faces=True))
+    (tmp_path / "a.ply").write_bytes(ply_bytes(table, encoding, before, prefix, faces=True))
     read = read_ply(tmp_path / "a.ply")
-    assert read.dtype.names == RICH.names
-    for name in RICH.names:
-        np.testing.assert_array_equal(read[name], table[name])
-        assert read.dtype[name].newbyteorder("<") == RICH[name].newbyteorder("<")
+    np.testing.assert_array_equal(read, table)
+    assert read.dtype.newbyteorder("<") == table.dtype
 
 
-def test_open3d_agrees_on_pcd(formats, tmp_path, rng):
+def test_open3d_agrees_on_pcd(tmp_path, rng):
     o3d = pytest.importorskip("open3d", exc_type=ImportError)
     table = _rich(rng, 3000)  # repeats, so that Open3D's compressor writes short, long and overlapping copies
     table["intensity"] = 7.0
-    (tmp_path / "a.pcd").write_bytes(formats.pcd(table, "binary"))
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(table, "binary"))
     cloud = o3d.t.io.read_point_cloud(str(tmp_path / "a.pcd"))
     for compressed in (True, False):
         o3d.t.io.write_point_cloud(str(tmp_path / "b.pcd"), cloud, write_ascii=False, compressed=compressed)
@@ -117,11 +104,11 @@ def test_open3d_agrees_on_pcd(formats, tmp_path, rng):
 
 
 @pytest.mark.parametrize("suffix", ["bin", "pcd", "ply", "npy"])
-def test_reads_every_format_with_times_and_rings(formats, tmp_path, rng, suffix):
+def test_reads_every_format_with_times_and_rings(tmp_path, rng, suffix):
     folder = tmp_path / "scans"
     tables = [_rich(rng, 150 + i) for i in range(3)]
     for index, table in enumerate(tables):
-        _write(formats, folder, f"scan_{index}.{suffix}", table)
+        _write(folder, f"scan_{index}.{suffix}", table)
     assert choose_reader(folder) == "scan-folder"
     recording = open_recording(folder)
     assert len(recording) == 3
@@ -138,19 +125,19 @@ def test_reads_every_format_with_times_and_rings(formats, tmp_path, rng, suffix)
     info = recording.describe()
     assert (info.reader, info.scans, len(info.first)) == ("scan-folder", 3, 150)
     assert info.rate_hz == pytest.approx(10.0)
-    if suffix != "bin":
+    if suffix != "bin":  # which has no times
         assert (info.point_time.field, info.point_time.unit, info.point_time.reference) == ("t", "ns", "relative")
         assert info.first.time_offsets.max() == pytest.approx(0.099)
         assert [(f.name, f.type_name) for f in info.fields][4:6] == [("t", "uint32"), ("ring", "uint16")]
         assert info.first.rings is not None
 
 
-def test_time_options(formats, tmp_path, rng):
+def test_time_options(tmp_path, rng):
     table = _rich(rng)
-    _write(formats, tmp_path, "scan_0.npy", table)
+    _write(tmp_path, "scan_0.npy", table)
     assert next(open_recording(tmp_path, ReaderConfig(time_reference="none")).scans()).time_offsets is None
     table["t"] //= 1000  # microseconds, as their span says; a given unit is not questioned
-    _write(formats, tmp_path, "scan_0.npy", table)
+    _write(tmp_path, "scan_0.npy", table)
     for config, factor in ((ReaderConfig(), 1e-6), (ReaderConfig(time_unit="ns", time_reference="relative"), 1e-9)):
         scan = next(open_recording(tmp_path, config).scans())
         np.testing.assert_allclose(scan.time_offsets, table["t"] * factor, atol=1e-15)
@@ -159,27 +146,22 @@ def test_time_options(formats, tmp_path, rng):
 
 
 def _absolute(rng, start: float, count: int = 100) -> np.ndarray:
-    dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
-    table = np.zeros(count, dtype)
-    for name in "xyz":
-        table[name] = rng.uniform(1.0, 30.0, count)
-    table["timestamp"] = start + np.linspace(0.0, 0.0625, count)
-    return table
+    return point_table(rng.uniform(1.0, 30.0, (count, 3)), timestamp=start + np.linspace(0.0, 0.0625, count))
 
 
-def test_absolute_times_count_from_the_stamp(formats, tmp_path, rng):
+def test_absolute_times_count_from_the_stamp(tmp_path, rng):
     for index in range(3):
-        _write(formats, tmp_path, f"{EPOCH + 0.1 * index:.6f}.ply", _absolute(rng, EPOCH + 0.1 * index - 0.03125))
+        _write(tmp_path, f"{EPOCH + 0.1 * index:.6f}.ply", _absolute(rng, EPOCH + 0.1 * index - 0.03125))
     for index, scan in enumerate(open_recording(tmp_path).scans()):
         assert scan.stamp == pytest.approx(EPOCH + 0.1 * index, abs=1e-6)
         np.testing.assert_allclose([scan.time_offsets.min(), scan.time_offsets.max()], [-0.03125, 0.03125], atol=1e-6)
 
 
-def test_absolute_times_give_the_stamps_where_there_are_none(formats, tmp_path, rng):
+def test_absolute_times_give_the_stamps_where_there_are_none(tmp_path, rng):
     for index in range(3):
         table = _absolute(rng, EPOCH + 0.05 * index)
         table["timestamp"][7] = 0.0  # a missing return
-        _write(formats, tmp_path, f"scan_{index}.ply", table)
+        _write(tmp_path, f"scan_{index}.ply", table)
     recording = open_recording(tmp_path)
     scans = list(recording.scans())
     np.testing.assert_allclose([s.stamp for s in scans], EPOCH + 0.05 * np.arange(3), rtol=0.0, atol=1e-6)
@@ -191,10 +173,10 @@ def test_absolute_times_give_the_stamps_where_there_are_none(formats, tmp_path, 
     assert info.first_stamp == pytest.approx(EPOCH, abs=1e-6)
 
 
-def test_points_on_another_clock_than_times_txt_are_one_warning(formats, tmp_path, rng, caplog):
+def test_points_on_another_clock_than_times_txt_are_one_warning(tmp_path, rng, caplog):
     """A clock that begins at zero is ambiguous, so that several scans are looked at; 1.7 s are 1.7e9 s read as ns."""
     for index in range(40):
-        _write(formats, tmp_path, f"scan_{index}.npy", _absolute(rng, 1.7e9 + 0.1 * index, 20))
+        _write(tmp_path, f"scan_{index}.npy", _absolute(rng, 1.7e9 + 0.1 * index, 20))
     (tmp_path / "times.txt").write_text("".join(f"{0.1 * index:.3f}\n" for index in range(40)))
     with caplog.at_level(logging.WARNING):
         recording = open_recording(tmp_path)
@@ -211,18 +193,18 @@ def test_points_on_another_clock_than_times_txt_are_one_warning(formats, tmp_pat
     assert [note for note in info.notes if "clock" in note] == [warning]
 
 
-def _write_numbered(formats, folder: Path, rng, names: list[str]) -> None:
+def _write_numbered(folder: Path, rng, names: list[str]) -> None:
     """Scans whose number of points is 10, 11, ... in the order given."""
     for place, name in enumerate(names):
-        _write(formats, folder, name, _rich(rng, 10 + place))
+        _write(folder, name, _rich(rng, 10 + place))
 
 
 def _sizes(recording) -> list[int]:
     return [len(scan) for scan in recording.scans()]
 
 
-def test_names_are_sorted_as_people_count(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path, rng, ["scan_0.bin", "scan_2.bin", "scan_10.bin", "scan_11.bin", "scan_100.bin"])
+def test_names_are_sorted_as_people_count(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["scan_0.bin", "scan_2.bin", "scan_10.bin", "scan_11.bin", "scan_100.bin"])
     assert _sizes(open_recording(tmp_path)) == [10, 11, 12, 13, 14]
 
 
@@ -233,14 +215,11 @@ def test_names_are_sorted_as_people_count(formats, tmp_path, rng):
         (["9.9.ply", "10.05.ply"], [9.9, 10.05]),
         (["1311868164360000000.bin", "1311868164460000000.bin"], [1311868164.36, 1311868164.46]),
         (["1311868164360000.npy", "1311868164460000.npy"], [1311868164.36, 1311868164.46]),
-        (
-            ["cloud_1583836591_82590976.pcd", "cloud_1583836591_182590976.pcd"],
-            [1583836591.082590976, 1583836591.182591],
-        ),
+        (["cloud_1583836591_82590976.pcd", "cloud_1583836591_182590976.pcd"], [1583836591.082591, 1583836591.182591]),
     ],
 )
-def test_stamps_from_names(formats, tmp_path, rng, names, stamps):
-    _write_numbered(formats, tmp_path, rng, names)
+def test_stamps_from_names(tmp_path, rng, names, stamps):
+    _write_numbered(tmp_path, rng, names)
     recording = open_recording(tmp_path)
     assert _sizes(recording) == [10 + i for i in range(len(names))]
     np.testing.assert_allclose([scan.stamp for scan in recording.scans()], stamps, rtol=0.0, atol=3e-7)
@@ -252,28 +231,27 @@ def test_names_that_are_no_stamps(stems):
     assert stamps_from_names(stems) is None
 
 
-def test_without_stamps_the_rate_gives_them(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path, rng, ["000000.bin", "000001.bin", "000002.bin"])
-    recording = open_recording(tmp_path, ReaderConfig(rate_hz=20.0))
-    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [0.0, 0.05, 0.1])
-    assert any("20 scans a second are assumed, as set." in warning for warning in recording.warnings)
-    assert "at an assumed 20.00 Hz" in describe_source(tmp_path, ReaderConfig(rate_hz=20.0))
-
-
-def test_an_assumed_rate_is_a_warning_that_says_how_to_give_it(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path, rng, ["000000.bin", "000001.bin"])
-    warnings = open_recording(tmp_path).warnings
-    assert any("10 scans a second are assumed" in said and "--set reader.rate_hz=5" in said for said in warnings)
-    (tmp_path / "times.txt").write_text("0.0\n0.5\n")
+@pytest.mark.parametrize(
+    ("config", "rate_hz", "told"),
+    [(ReaderConfig(), 10.0, "--set reader.rate_hz=5"), (ReaderConfig(rate_hz=20.0), 20.0, "as set")],
+)
+def test_without_stamps_an_assumed_rate_gives_them_and_is_a_warning(tmp_path, rng, config, rate_hz, told):
+    _write_numbered(tmp_path, rng, ["000000.bin", "000001.bin", "000002.bin"])
+    recording = open_recording(tmp_path, config)
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], np.arange(3) / rate_hz)
+    (warning,) = (said for said in recording.warnings if f"{rate_hz:.0f} scans a second are assumed" in said)
+    assert told in warning
+    assert f"at an assumed {rate_hz:.2f} Hz" in describe_source(tmp_path, config)
+    (tmp_path / "times.txt").write_text("0.0\n0.5\n1.0\n")
     assert open_recording(tmp_path).warnings == ()
     assert "at 2.00 Hz" in describe_source(tmp_path, ReaderConfig())
 
 
 @pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])
 @pytest.mark.parametrize("above", [False, True])
-def test_a_stamp_file_comes_first(formats, tmp_path, rng, name, above):
+def test_a_stamp_file_comes_first(tmp_path, rng, name, above):
     folder = tmp_path / "scans"
-    _write_numbered(formats, folder, rng, ["5.5.bin", "6.5.bin", "7.5.bin"])
+    _write_numbered(folder, rng, ["5.5.bin", "6.5.bin", "7.5.bin"])
     (tmp_path / name if above else folder / name).write_text("0.5\n0.75\n1.5\n")
     recording = open_recording(folder)
     assert [scan.stamp for scan in recording.scans()] == [0.5, 0.75, 1.5]
@@ -286,32 +264,25 @@ def test_a_stamp_file_comes_first(formats, tmp_path, rng, name, above):
         ("0.5\n1.5\n2.5\n3.5\n", [0.5, 1.5, 2.5], "4 stamps for 3 scans; the first are taken."),
     ],
 )
-def test_stamps_of_another_number_than_the_scans_are_a_warning(formats, tmp_path, rng, lines, stamps, warning):
-    _write_numbered(formats, tmp_path, rng, ["a1.bin", "a2.bin", "a3.bin"])
+def test_stamps_of_another_number_than_the_scans_are_a_warning(tmp_path, rng, lines, stamps, warning):
+    _write_numbered(tmp_path, rng, ["a1.bin", "a2.bin", "a3.bin"])
     (tmp_path / "times.txt").write_text(lines)
     recording = open_recording(tmp_path)
     assert [scan.stamp for scan in recording.scans()] == stamps
     assert recording.warnings == (f"times.txt has {warning}",)
 
 
-def test_a_scan_with_a_number_for_its_name_has_the_line_of_that_number(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path, rng, ["000001.bin", "000003.bin"])
+def test_a_scan_with_a_number_for_its_name_has_the_line_of_that_number(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["000001.bin", "000003.bin"])
     (tmp_path / "times.txt").write_text("0.0\n0.1\n0.25\n0.35\n0.45\n")
     recording = open_recording(tmp_path)
     assert [scan.stamp for scan in recording.scans()] == [0.1, 0.35]
     assert recording.warnings == ("times.txt has 5 stamps for 2 scans; each takes the line of its number, from 0 on.",)
 
 
-def test_stamp_file_formats(formats, tmp_path):
-    lines = [
-        "# stamps",
-        "1311868164.36",
-        "1311868164460000000",
-        "1311868164560000",
-        "",
-        "2011-07-28 15:49:24.660000000",
-    ]
-    (tmp_path / "times.txt").write_text("\n".join(lines))
+def test_stamp_file_formats(tmp_path):
+    numbers = "1311868164.36\n1311868164460000000\n1311868164560000\n"
+    (tmp_path / "times.txt").write_text(f"# stamps\n{numbers}\n2011-07-28 15:49:24.660000000")
     expected = [1311868164.36, 1311868164.46, 1311868164.56, np.nan, 1311868164.66]
     np.testing.assert_allclose(read_stamps(tmp_path / "times.txt"), expected, rtol=0.0, atol=3e-7)
     for wrong in ("0.1 0.2", "nan", "inf", "soon", "2011-99-28 15:49:24.66"):
@@ -320,19 +291,19 @@ def test_stamp_file_formats(formats, tmp_path):
             read_stamps(tmp_path / "times.txt")
 
 
-def test_stamps_that_do_not_increase_are_interpolated(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path, rng, [f"{i}.bin" for i in range(4)])
+def test_stamps_that_do_not_increase_are_interpolated(tmp_path, rng):
+    _write_numbered(tmp_path, rng, [f"{i}.bin" for i in range(4)])
     (tmp_path / "times.txt").write_text("1.0\n1.5\n1.5\n2.5\n")
     recording = open_recording(tmp_path)
     np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [1.0, 1.5, 2.0, 2.5])
     assert any("1 stamp of times.txt" in note for note in recording.describe().notes)
 
 
-@pytest.mark.parametrize("name", ["ground_truth.tum", "groundtruth.tum", "groundtruth.txt", "ground_truth.txt"])
+@pytest.mark.parametrize("name", ["ground_truth.tum", "ground_truth.txt"])
 @pytest.mark.parametrize("above", [False, True])
-def test_truth_beside_the_scans_or_above(formats, tmp_path, rng, name, above):
+def test_truth_beside_the_scans_or_above(tmp_path, rng, name, above):
     folder = tmp_path / "scans"
-    _write_numbered(formats, folder, rng, ["0.bin", "1.bin"])
+    _write_numbered(folder, rng, ["0.bin", "1.bin"])
     assert open_recording(folder).ground_truth is None
     truth = Trajectory(np.array([0.0, 0.1]), np.stack([np.eye(4), exp([0.0, 0.1, 0.2, 1.0, 2.0, 3.0])]))
     path = tmp_path / name if above else folder / name
@@ -342,40 +313,28 @@ def test_truth_beside_the_scans_or_above(formats, tmp_path, rng, name, above):
     assert recording.describe().ground_truth.samefile(path)
 
 
-def test_a_map_beside_the_scans_is_no_scan(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path / "a", rng, ["0.bin", "1.bin"])
-    _write(formats, tmp_path / "a", "map.ply", _rich(rng))
-    _write(formats, tmp_path / "a", ".0.bin", _rich(rng))
-    _write_numbered(formats, tmp_path / "b", rng, ["scan_1.ply", "scan_2.ply"])
-    _write(formats, tmp_path / "b", "map.ply", _rich(rng))
-    for name in "ab":
-        recording = open_recording(tmp_path / name)
-        assert _sizes(recording) == [10, 11]
-        assert any("map.ply" in note for note in recording.describe().notes)
+@pytest.mark.parametrize("scans", [["0.bin", "1.bin"], ["scan_1.ply", "scan_2.ply"]])
+def test_a_map_beside_the_scans_is_no_scan(tmp_path, rng, scans):
+    _write_numbered(tmp_path, rng, [*scans, "map.ply", ".0.bin"])
+    recording = open_recording(tmp_path)
+    assert _sizes(recording) == [10, 11]
+    assert any("map.ply" in note for note in recording.describe().notes)
 
 
 def test_bin_with_other_numbers_of_columns(tmp_path, rng):
-    five = rng.uniform(1.0, 20.0, size=(32, 5)).astype(np.float32)
+    """32 points of five are 40 of four by size; only the ring numbers tell them apart."""
+    five, four, three = (rng.uniform(1.0, 20.0, shape).astype(np.float32) for shape in ((32, 5), (40, 4), (7, 3)))
     five[:, 4] = np.arange(32)
-    three = rng.uniform(1.0, 20.0, size=(7, 3)).astype(np.float32)
-    for name, cloud in (("five", five), ("three", three)):
-        (tmp_path / name).mkdir()
-        cloud.tofile(tmp_path / name / "0.bin")
-        np.testing.assert_array_equal(next(open_recording(tmp_path / name).scans()).points, cloud[:, :3])
-    # 32 points of five are 40 of four by size; only the ring numbers tell them apart.
-    np.testing.assert_array_equal(next(open_recording(tmp_path / "five").scans()).rings, np.arange(32))
-    (tmp_path / "four").mkdir()
-    four = rng.uniform(1.0, 20.0, size=(40, 4)).astype(np.float32)
-    four.tofile(tmp_path / "four" / "0.bin")
-    np.testing.assert_array_equal(next(open_recording(tmp_path / "four").scans()).points, four[:, :3])
-    (tmp_path / "six").mkdir()
-    (tmp_path / "six" / "0.bin").write_bytes(bytes(4 * 7 + 1))
-    with pytest.raises(InputError, match="16 bytes each"):
-        open_recording(tmp_path / "six")
+    for cloud in (five, four, three):
+        cloud.tofile(tmp_path / "0.bin")
+        scan = next(open_recording(tmp_path).scans())
+        np.testing.assert_array_equal(scan.points, cloud[:, :3])
+        assert (scan.rings is None) == (cloud is not five)
     five[0, 4] = 0.5
-    five[:31].tofile(tmp_path / "five" / "0.bin")
-    with pytest.raises(InputError, match="20 bytes with a ring"):
-        open_recording(tmp_path / "five")
+    for content, told in ((bytes(4 * 7 + 1), "16 bytes each"), (five[:31].tobytes(), "20 bytes with a ring")):
+        (tmp_path / "0.bin").write_bytes(content)
+        with pytest.raises(InputError, match=told):
+            open_recording(tmp_path)
 
 
 def test_organised_and_plain_npy(tmp_path, rng):
@@ -388,20 +347,17 @@ def test_organised_and_plain_npy(tmp_path, rng):
         np.save(tmp_path / "0.npy", wrong)
         with pytest.raises(InputError, match=r"0\.npy: expected an array \(N, 3\)"):
             next(open_recording(tmp_path).scans())
-    np.save(tmp_path / "0.npy", np.array([{"x": 1}]), allow_pickle=True)
-    with pytest.raises(InputError, match=r"0\.npy: cannot be read"):
-        next(open_recording(tmp_path).scans())
 
 
-def test_ply_with_lists_before_the_vertices_is_refused(formats, tmp_path, rng):
+def test_ply_with_lists_before_the_vertices_is_refused(tmp_path, rng):
     before = "element face 1\nproperty list uchar int vertex_indices\n"
-    (tmp_path / "0.ply").write_bytes(formats.ply(_rich(rng), "ascii", before, b"3 0 1 2\n"))
+    (tmp_path / "0.ply").write_bytes(ply_bytes(_rich(rng), "ascii", before, b"3 0 1 2\n"))
     with pytest.raises(InputError, match="plain type"):
         next(open_recording(tmp_path).scans())
 
 
-def test_a_file_is_no_folder(formats, tmp_path, rng):
-    _write_numbered(formats, tmp_path, rng, ["0.bin"])
+def test_a_file_is_no_folder(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["0.bin"])
     with pytest.raises(InputError, match="give the folder"):
         open_recording(tmp_path / "0.bin", ReaderConfig(name="scan-folder"))
     (tmp_path / "none").mkdir()
@@ -413,9 +369,5 @@ def test_a_file_is_no_folder(formats, tmp_path, rng):
 def test_a_real_folder_of_bin(real_data):
     recording = open_recording(real_data / "kitti_raw_stop/2011_09_26/2011_09_26_drive_stop_sync/velodyne_points/data")
     info = recording.describe()
-    assert (info.scans, info.first.rings is not None, [field.name for field in info.fields][-1]) == (
-        78,
-        False,
-        "intensity",
-    )
+    assert (info.scans, info.first.rings, info.fields[-1].name) == (78, None, "intensity")
     assert 100_000 < len(info.first) < 130_000
