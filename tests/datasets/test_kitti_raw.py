@@ -30,12 +30,10 @@ def uncorrected(monkeypatch):
 
 def _stamp_lines(seconds: np.ndarray) -> str:
     """Lines as KITTI writes them, nanoseconds included; NaN is a blank line."""
-    lines = []
-    for value in seconds:
-        if np.isnan(value):
-            lines.append("")
-            continue
-        lines.append(str(MIDNIGHT + np.timedelta64(round(value * 1e9), "ns")).replace("T", " "))
+    instants = [MIDNIGHT + np.timedelta64(0 if np.isnan(s) else round(s * 1e9), "ns") for s in seconds]
+    lines = [
+        "" if np.isnan(s) else str(instant).replace("T", " ") for s, instant in zip(seconds, instants, strict=True)
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -99,8 +97,13 @@ def _write_drive(root: Path, rng: np.random.Generator, rows: int = 8, missing: t
     return drive
 
 
-def test_reads_scans_at_the_mid_stamps(tmp_path, rng, uncorrected):
-    drive = _write_drive(tmp_path, rng)
+@pytest.fixture
+def drive(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """A drive of eight scans."""
+    return _write_drive(tmp_path, rng)
+
+
+def test_reads_scans_at_the_mid_stamps(drive, uncorrected):
     assert choose_reader(drive) == "kitti-raw"
     recording = open_recording(drive)
     scans = list(recording.scans())
@@ -113,18 +116,18 @@ def test_reads_scans_at_the_mid_stamps(tmp_path, rng, uncorrected):
     assert recording.describe().notes[-1].endswith("0.25 m (median).")
 
 
-def test_the_unit_is_an_imu(tmp_path, rng):
-    recording = open_recording(_write_drive(tmp_path, rng))
+def test_the_unit_is_an_imu(drive):
+    recording = open_recording(drive)
     imu = recording.imu
     np.testing.assert_allclose(imu.stamps, FIRST_STAMP + _oxts_times(8), rtol=0.0, atol=3e-7)
     np.testing.assert_allclose(imu.T_lidar_imu, T_LIDAR_IMU, atol=1e-9)
-    for k in range(8):
-        np.testing.assert_allclose(imu.angular_velocities[k], _T_enu_imu(0.0)[:3, :3].T @ [0.0, 0.0, TURN], atol=0.01)
+    turning = _T_enu_imu(0.0)[:3, :3].T @ [0.0, 0.0, TURN]
+    np.testing.assert_allclose(imu.angular_velocities, np.tile(turning, (8, 1)), atol=0.01)
     np.testing.assert_allclose(np.linalg.norm(imu.accelerations, axis=1), np.hypot(9.81, SPEED * TURN), rtol=0.01)
     summary = recording.describe().imu
     assert (summary.name, summary.samples, round(summary.rate_hz), summary.has_extrinsic) == ("oxts", 8, 10, True)
-    (tmp_path / "2011_09_26" / "calib_imu_to_velo.txt").unlink()
-    assert open_recording(tmp_path / "2011_09_26" / recording.name).imu.T_lidar_imu is None
+    (drive.parent / "calib_imu_to_velo.txt").unlink()
+    assert open_recording(drive).imu.T_lidar_imu is None
 
 
 def test_rows_of_missing_scans_are_skipped(tmp_path, rng):
@@ -146,8 +149,7 @@ def test_offsets_run_from_the_rear_over_the_left_to_the_rear():
     np.testing.assert_allclose(offsets, expected, atol=1e-6)
 
 
-def test_a_point_has_its_own_sweeps_start_and_end(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
+def test_a_point_has_its_own_sweeps_start_and_end(drive):
     # Sweep 2 is longer on its first half, still within what is plausible.
     stamps = MID_S * np.arange(8)
     starts = stamps - 0.050
@@ -161,8 +163,8 @@ def test_a_point_has_its_own_sweeps_start_and_end(tmp_path, rng):
     np.testing.assert_allclose(two.time_offsets, [-0.056, -0.028, 0.0265], atol=1e-6)
 
 
-def test_truth_is_the_lidars_pose_at_the_oxts_stamps(tmp_path, rng):
-    recording = open_recording(_write_drive(tmp_path, rng))
+def test_truth_is_the_lidars_pose_at_the_oxts_stamps(drive):
+    recording = open_recording(drive)
     truth = recording.ground_truth
     times = _oxts_times(8)
     np.testing.assert_allclose(truth.stamps, FIRST_STAMP + times, rtol=0.0, atol=3e-7)
@@ -186,36 +188,22 @@ def test_truth_without_oxts_stamps_uses_those_of_the_scans(tmp_path, rng):
     np.testing.assert_allclose(truth.T_world_lidar, inverse(T_enu_lidar[0]) @ T_enu_lidar, atol=1e-6)
 
 
-def test_oxts_rows_that_run_backwards_are_left_out(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
-    times = _oxts_times(8)
-    times[4] = times[1]
+def test_times_that_cannot_be_are_mended_or_left_out_and_told(drive):
+    """A scan's stamp that repeats is interpolated, an odd start of a sweep replaced, an earlier pose left out."""
+    stamps, starts, times = MID_S * np.arange(8), MID_S * np.arange(8) - 0.050, _oxts_times(8)
+    stamps[5], starts[3], times[4] = stamps[4], starts[3] - 5.0, times[1]
+    (drive / "velodyne_points" / "timestamps.txt").write_text(_stamp_lines(stamps))
+    (drive / "velodyne_points" / "timestamps_start.txt").write_text(_stamp_lines(starts))
     (drive / "oxts" / "timestamps.txt").write_text(_stamp_lines(times))
     recording = open_recording(drive)
+    scans = list(recording.scans())
+    expected = FIRST_STAMP + MID_S * np.arange(8)
+    np.testing.assert_allclose([scan.stamp for scan in scans], expected, rtol=0.0, atol=1e-6)
+    assert all(-0.053 < scan.time_offsets.min() < -0.04 for scan in scans)
     np.testing.assert_allclose(recording.ground_truth.stamps, FIRST_STAMP + np.delete(times, 4), rtol=0.0, atol=3e-7)
-    assert any("1 oxts rows" in note for note in recording.describe().notes)
-
-
-def test_scan_stamps_that_repeat_are_interpolated(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
-    stamps = MID_S * np.arange(8)
-    stamps[5] = stamps[4]
-    (drive / "velodyne_points" / "timestamps.txt").write_text(_stamp_lines(stamps))
-    recording = open_recording(drive)
-    read = np.array([scan.stamp for scan in recording.scans()])
-    np.testing.assert_allclose(read, FIRST_STAMP + MID_S * np.arange(8), rtol=0.0, atol=1e-6)
-    assert any("1 stamp of timestamps.txt" in note for note in recording.describe().notes)
-
-
-def test_implausible_starts_are_replaced(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
-    starts = MID_S * np.arange(8) - 0.050
-    starts[3] -= 5.0
-    (drive / "velodyne_points" / "timestamps_start.txt").write_text(_stamp_lines(starts))
-    recording = open_recording(drive)
-    for scan in recording.scans():
-        assert -0.053 < scan.time_offsets.min() < -0.04
-    assert any("1 start and 0 ends" in note for note in recording.describe().notes)
+    notes = recording.describe().notes
+    for told in ("1 stamp of timestamps.txt", "1 start and 0 ends", "1 oxts rows"):
+        assert any(told in note for note in notes)
 
 
 def test_without_stamps_the_rate_gives_scans_truth_and_offsets(tmp_path, rng):
@@ -231,8 +219,7 @@ def test_without_stamps_the_rate_gives_scans_truth_and_offsets(tmp_path, rng):
     assert any("5 scans a second" in note for note in recording.describe().notes)
 
 
-def test_without_starts_and_ends_sweeps_are_seamless(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
+def test_without_starts_and_ends_sweeps_are_seamless(drive):
     for which in ("start", "end"):
         (drive / "velodyne_points" / f"timestamps_{which}.txt").unlink()
     offsets = next(open_recording(drive).scans(2)).time_offsets
@@ -240,15 +227,13 @@ def test_without_starts_and_ends_sweeps_are_seamless(tmp_path, rng):
     assert 0.045 < offsets.max() <= MID_S / 2
 
 
-def test_camera_calibration_is_rectified(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
+def test_camera_calibration_is_rectified(drive):
     np.testing.assert_allclose(open_recording(drive).T_cam_lidar, T_RECT_CAM @ T_CAM_LIDAR, atol=1e-9)
     (drive.parent / "calib_cam_to_cam.txt").unlink()
     assert open_recording(drive).T_cam_lidar is None
 
 
-def test_without_calibration_or_oxts_there_is_no_truth(tmp_path, rng):
-    drive = _write_drive(tmp_path, rng)
+def test_without_calibration_or_oxts_there_is_no_truth(drive):
     (drive.parent / "calib_imu_to_velo.txt").unlink()
     recording = open_recording(drive)
     assert recording.ground_truth is None

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
@@ -18,14 +19,14 @@ PERIOD_NS = 100_000_000
 T_EGO_LIDAR = exp([0.0, 0.0, 0.1, 1.35, 0.0, 1.64])
 
 
-def _T_city_ego(index: float) -> np.ndarray:
-    return exp([0.0, 0.0, 1.1, 1500.0, 900.0, 12.0]) @ exp(np.multiply(index, [0.0, 0.0, 0.02, 0.9, 0.0, 0.0]))
+def _T_city_ego(index: ArrayLike) -> np.ndarray:
+    return exp([0.0, 0.0, 1.1, 1500.0, 900.0, 12.0]) @ exp(np.multiply.outer(index, [0.0, 0.0, 0.02, 0.9, 0.0, 0.0]))
 
 
-def _pose_columns(poses: list[np.ndarray]) -> dict[str, list[float]]:
-    quaternions = np.array([Rotation.from_matrix(T[:3, :3]).as_quat() for T in poses])
+def _pose_columns(T: np.ndarray) -> dict[str, list[float]]:
+    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat()
     columns = dict(zip(("qx", "qy", "qz", "qw"), quaternions.T.tolist(), strict=True))
-    return {**columns, **{name: [T[row, 3] for T in poses] for row, name in enumerate(("tx_m", "ty_m", "tz_m"))}}
+    return {**columns, **dict(zip(("tx_m", "ty_m", "tz_m"), T[:, :3, 3].T.tolist(), strict=True))}
 
 
 def _write(path: Path, columns: dict[str, object]) -> None:
@@ -52,10 +53,9 @@ def log(tmp_path: Path, rng: np.random.Generator) -> SimpleNamespace:
         _write(folder / "sensors" / "lidar" / f"{START_NS + index * PERIOD_NS}.feather", columns)
     times = np.arange(-5, 40)
     stamps = START_NS + times * (PERIOD_NS // 10)
-    poses = [_T_city_ego(time / 10) for time in times]
-    _write(folder / "city_SE3_egovehicle.feather", {"timestamp_ns": stamps, **_pose_columns(poses)})
+    _write(folder / "city_SE3_egovehicle.feather", {"timestamp_ns": stamps, **_pose_columns(_T_city_ego(times / 10))})
     sensors = {"sensor_name": ["ring_front_center", "up_lidar", "down_lidar"]}
-    mounted = _pose_columns([np.eye(4), T_EGO_LIDAR, exp([3.1, 0.0, 0.0, 1.35, 0.0, 1.5])])
+    mounted = _pose_columns(np.stack([np.eye(4), T_EGO_LIDAR, exp([3.1, 0.0, 0.0, 1.35, 0.0, 1.5])]))
     _write(folder / "calibration" / "egovehicle_SE3_sensor.feather", {**sensors, **mounted})
     return SimpleNamespace(folder=folder, clouds=clouds)
 
@@ -77,7 +77,7 @@ def test_the_truth_is_of_the_same_frame(log: SimpleNamespace) -> None:
     truth = open_recording(log.folder).ground_truth
     assert len(truth) == 45
     stamps = (START_NS + np.arange(4) * PERIOD_NS) * 1e-9
-    np.testing.assert_allclose(truth.at(stamps), [_T_city_ego(i) @ T_EGO_LIDAR for i in range(4)], atol=1e-6)
+    np.testing.assert_allclose(truth.at(stamps), _T_city_ego(np.arange(4)) @ T_EGO_LIDAR, atol=1e-6)
 
 
 def test_without_calibration_both_stay_in_the_vehicles_frame(log: SimpleNamespace) -> None:

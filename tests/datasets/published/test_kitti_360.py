@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import exp, inverse, make_transform, transform_points
+from lidarslam.core.geometry import exp, inverse, transform_points
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import choose_reader, open_recording
 
@@ -18,27 +18,24 @@ FIRST = 3  # frames before have no pose, as the car stood still
 
 def T_world_lidar(time):
     """A car on a circle to the left, far from the origin of the world."""
-    yaw, radius = TURN * time, SPEED / TURN
-    c, s = np.cos(yaw), np.sin(yaw)
-    return make_transform(
-        [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [800.0 + radius * s, 3900.0 + radius * (1.0 - c), 116.0]
-    )
+    return exp([0.0, 0.0, 0.0, 800.0, 3900.0, 116.0]) @ exp(np.multiply.outer(time, [0.0, 0.0, TURN, SPEED, 0.0, 0.0]))
 
 
 def row(T):
     return " ".join(f"{value:.10f}" for value in T[:3].ravel())
 
 
+def put_back(points, times):
+    """Points (N, 3) of the LiDAR in the world, each from the pose at its own time (N,)."""
+    return transform_points(T_world_lidar(times), points[:, None])[:, 0]
+
+
 def _sweep(stamp):
     """What a laser measures that turns clockwise from the rear, and where that is in the world."""
     azimuth = np.linspace(np.pi, -np.pi, 721)[:-1] - 1e-4
-    offsets = -PERIOD_S * azimuth / (2.0 * np.pi)
     points = np.column_stack([10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth), np.linspace(-2.0, 2.0, 720)])
-    in_world = [
-        transform_points(T_world_lidar(stamp + offset), point[None])[0]
-        for offset, point in zip(offsets, points, strict=True)
-    ]
-    return np.column_stack([points, np.full(720, 0.25)]).astype("<f4"), np.array(in_world)
+    in_world = put_back(points, stamp - PERIOD_S * azimuth / (2.0 * np.pi))
+    return np.column_stack([points, np.full(720, 0.25)]).astype("<f4"), in_world
 
 
 @pytest.fixture
@@ -78,20 +75,17 @@ def test_truth_is_that_of_the_lidar_at_the_scans_with_a_pose(root):
     truth, stamps = recording.ground_truth, [scan.stamp for scan in recording.scans()]
     np.testing.assert_allclose(np.diff(stamps), PERIOD_S, atol=1e-6)
     np.testing.assert_array_equal(truth.stamps, stamps[FIRST:])
-    expected = [inverse(T_world_lidar(PERIOD_S * FIRST)) @ T_world_lidar(PERIOD_S * k) for k in range(FIRST, 8)]
-    np.testing.assert_allclose(truth.T_world_lidar, expected, atol=1e-6)
+    expected = T_world_lidar(PERIOD_S * np.arange(FIRST, 8))
+    np.testing.assert_allclose(truth.T_world_lidar, inverse(expected[0]) @ expected, atol=1e-6)
 
 
 def test_points_by_their_times_lie_where_they_stand(root):
     recording = open_recording(root, ReaderConfig(sequence="0"))
     scan = next(recording.scans(start=5))
     _, in_world = _sweep(PERIOD_S * 5)
-    put_back = [
-        transform_points(T_world_lidar(PERIOD_S * 5 + offset), point[None])[0]
-        for offset, point in zip(scan.time_offsets, scan.points, strict=True)
-    ]
     as_measured = transform_points(T_world_lidar(PERIOD_S * 5), scan.points)
-    assert np.linalg.norm(put_back - in_world, axis=1).max() < 1e-4
+    compensated = put_back(scan.points, PERIOD_S * 5 + scan.time_offsets)
+    assert np.linalg.norm(compensated - in_world, axis=1).max() < 1e-4
     assert np.linalg.norm(as_measured - in_world, axis=1).max() > 0.3
     info = recording.describe()
     assert (info.point_time.field, info.imu) == ("azimuth", None)

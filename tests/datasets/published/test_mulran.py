@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import inverse, make_transform
+from lidarslam.core.geometry import exp, inverse
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import choose_reader, open_recording
@@ -14,22 +14,16 @@ PERIOD_NS = 99_778_780
 EAST, NORTH, SPEED, TURN = 353_067.5, 4_026_008.25, 9.0, 0.3  # UTM metres, m/s, rad/s
 
 
-def turn(degrees):
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
+POSE_TIMES = -0.05 + 0.01 * np.arange(60)  # seconds from the first scan on
 
 # On the roof, 1.7 m before the rear axle, facing backwards.
-T_BASE_LIDAR = make_transform(turn(179.6654), [1.7042, -0.021, 1.8047])
+T_BASE_LIDAR = exp([0.0, 0.0, np.deg2rad(179.6654), 0.0, 0.0, 0.0])
+T_BASE_LIDAR[:3, 3] = [1.7042, -0.021, 1.8047]
 
 
 def T_utm_base(time):
     """A car on a circle to the left."""
-    yaw = TURN * time
-    radius = SPEED / TURN
-    return make_transform(
-        turn(np.rad2deg(yaw)), [EAST + radius * np.sin(yaw), NORTH + radius * (1.0 - np.cos(yaw)), 25.5]
-    )
+    return exp([0.0, 0.0, 0.0, EAST, NORTH, 25.5]) @ exp(np.multiply.outer(time, [0.0, 0.0, TURN, SPEED, 0.0, 0.0]))
 
 
 def sweep(index):
@@ -51,16 +45,13 @@ def sequence(tmp_path):
     stamps_ns = [FIRST_NS + k * PERIOD_NS for k in range(4)]
     for k, stamp_ns in enumerate(stamps_ns):
         sweep(k).tofile(folder / "Ouster" / f"{stamp_ns}.bin")
-    with (folder / "global_pose.csv").open("w") as file:
-        for k in range(60):
-            time = -0.05 + 0.01 * k
-            numbers = ",".join(repr(float(v)) for v in T_utm_base(time)[:3].ravel())
-            file.write(f"{FIRST_NS + round(1e9 * time)},{numbers}\n")
     (folder / "data_stamp.csv").write_text("".join(f"{stamp_ns},ouster\n" for stamp_ns in stamps_ns))
-    with (folder / "xsens_imu.csv").open("w") as file:
-        for k in range(50):
-            numbers = [0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3, 0.01, 0.02, TURN, 0.5, SPEED * TURN, 9.81, 1.0, 2.0, 3.0]
-            file.write(f"{FIRST_NS + k * 10_000_000},{','.join(map(str, numbers))}\n")
+    poses = {FIRST_NS + round(1e9 * time): T_utm_base(time)[:3].ravel() for time in POSE_TIMES}
+    imu = [0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3, 0.01, 0.02, TURN, 0.5, SPEED * TURN, 9.81, 1.0, 2.0, 3.0]
+    samples = {FIRST_NS + k * 10_000_000: imu for k in range(50)}
+    for name, rows in (("global_pose.csv", poses), ("xsens_imu.csv", samples)):
+        lines = [f"{stamp_ns},{','.join(repr(float(v)) for v in row)}\n" for stamp_ns, row in rows.items()]
+        (folder / name).write_text("".join(lines))
     return folder
 
 
@@ -87,7 +78,7 @@ def test_scans_with_columns_for_times_and_lasers_for_rings(sequence):
 def test_truth_is_that_of_the_lidar(sequence):
     truth = open_recording(sequence).ground_truth
     assert len(truth) == 60
-    T_utm_lidar = np.stack([T_utm_base(-0.05 + 0.01 * k) @ T_BASE_LIDAR for k in range(60)])
+    T_utm_lidar = T_utm_base(POSE_TIMES) @ T_BASE_LIDAR
     np.testing.assert_allclose(truth.T_world_lidar, inverse(T_utm_lidar[0]) @ T_utm_lidar, atol=1e-4)
     # The base is behind the LiDAR, which moves outwards in the bend: faster than the base by the lever arm.
     speed = truth.length_m / truth.duration_s

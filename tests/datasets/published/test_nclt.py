@@ -44,18 +44,13 @@ def session(tmp_path):
     for k in range(5):
         T_down_body, _ = pose(0.2 * k)
         in_body = transform_points(inverse(T_down_body), WALL)
-        (folder / "velodyne_sync" / f"{FIRST_US + k * PERIOD_US}.bin").write_bytes(
-            packed(in_body, np.arange(len(WALL)) % 32)
-        )
-    with (tmp_path / "groundtruth_2012-01-08.csv").open("w") as file:
-        file.write(f"{FIRST_US - 20_000}, nan, nan, nan, nan, nan, nan\n")
-        for k in range(100):
-            row = ", ".join(repr(float(v)) for v in pose(0.01 * k)[1])
-            file.write(f"{FIRST_US + 10_000 * k}, {row}\n")
-    with (folder / "ms25.csv").open("w") as file:
-        for k in range(60):
-            row = [0.1, 0.2, 0.3, 0.05, 0.24, -9.80, 0.001, 0.002, TURN]
-            file.write(f"{FIRST_US + 20_000 * k},{','.join(map(str, row))}\n")
+        file = folder / "velodyne_sync" / f"{FIRST_US + k * PERIOD_US}.bin"
+        file.write_bytes(packed(in_body, np.arange(len(WALL)) % 32))
+    rows = [f"{FIRST_US + 10_000 * k}, {', '.join(repr(float(v)) for v in pose(0.01 * k)[1])}\n" for k in range(100)]
+    unknown = f"{FIRST_US - 20_000}, nan, nan, nan, nan, nan, nan\n"
+    (tmp_path / "groundtruth_2012-01-08.csv").write_text("".join([unknown, *rows]))
+    sample = f"0.1,0.2,0.3,0.05,0.24,-9.80,0.001,0.002,{TURN}\n"
+    (folder / "ms25.csv").write_text("".join(f"{FIRST_US + 20_000 * k},{sample}" for k in range(60)))
     return folder
 
 
