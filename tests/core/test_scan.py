@@ -70,8 +70,7 @@ def test_organised_clouds_are_flattened_row_by_row():
 def test_a_scan_may_come_out_empty(points):
     scan = Scan.from_raw(points, 0.0)
     assert scan.points.shape == (0, 3)
-    assert scan.time_offsets is None
-    assert scan.rings is None
+    assert scan.time_offsets is scan.rings is None
 
 
 @pytest.mark.parametrize("field", ["time_offsets", "rings"])

@@ -170,20 +170,24 @@ def test_tum_dialects(text, written):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("read", "text", "words"),
     [
-        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got 7"),
-        ("# header\n1 0 0 0 zero 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got '1 0 0 0 zero 0 0 1'"),
-        ("1 0 0 0 0 0 0 nan\n", r"poses\.txt.*no poses"),
-        ("1 0 0 0 0 0 0 0\n", r"poses\.txt.*no poses"),
-        ("1 0 0 0 90 0 45 1\n", r"poses\.txt.*no poses"),
-        ("# only a header\n", r"poses\.txt: holds no pose; expected"),
-        (b"\xff\xfe\x00\x01", r"poses\.txt: cannot be read as text"),
+        (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got 7"),
+        (read_tum, "# header\n1 0 0 0 zero 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got '1 0 0 0 zero 0 0 1'"),
+        (read_tum, "1 0 0 0 0 0 0 nan\n", r"poses\.txt.*no poses"),
+        (read_tum, "1 0 0 0 0 0 0 0\n", r"poses\.txt.*no poses"),
+        (read_tum, "1 0 0 0 90 0 45 1\n", r"poses\.txt.*no poses"),
+        (read_tum, "# only a header\n", r"poses\.txt: holds no pose; expected"),
+        (read_tum, b"\xff\xfe\x00\x01", r"poses\.txt: cannot be read as text"),
+        (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt:1: expected 12 numbers, got 11"),
+        (read_kitti_poses, "2 0 0 0 0 2 0 0 0 0 2 0\n", r"poses\.txt.*no poses"),
+        (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 -1 0\n", r"poses\.txt.*no poses"),
+        (read_kitti_poses, "", r"poses\.txt: holds no pose; expected twelve"),
     ],
 )
-def test_what_is_wrong_with_a_tum_file(text, words, written):
+def test_what_is_wrong_with_a_file_is_told(read, text, words, written):
     with pytest.raises(InputError, match=words):
-        read_tum(written(text))
+        read(written(text))
 
 
 def test_rounded_kitti_rotations_are_mended(written, random_trajectory):
@@ -192,20 +196,6 @@ def test_rounded_kitti_rotations_are_mended(written, random_trajectory):
     back = read_kitti_poses(written(text))
     assert is_rigid(back, 1e-12)
     np.testing.assert_allclose(back, poses, atol=3e-3)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt:1: expected 12 numbers, got 11"),
-        ("2 0 0 0 0 2 0 0 0 0 2 0\n", r"poses\.txt.*no poses"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", r"poses\.txt.*no poses"),
-        ("", r"poses\.txt: holds no pose; expected twelve"),
-    ],
-)
-def test_what_is_wrong_with_a_kitti_file(text, words, written):
-    with pytest.raises(InputError, match=words):
-        read_kitti_poses(written(text))
 
 
 def test_trajectories_are_saved_and_loaded_as_kitti_poses(random_trajectory, tmp_path):

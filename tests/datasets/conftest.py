@@ -53,26 +53,13 @@ def point_table(points: np.ndarray, **columns: np.ndarray) -> np.ndarray:
 
 def _layout(point_step, **fields):
     """A record type from `name=(type, offset)`."""
-    return np.dtype(
-        {
-            "names": list(fields),
-            "formats": [kind for kind, _ in fields.values()],
-            "offsets": [offset for _, offset in fields.values()],
-            "itemsize": point_step,
-        }
-    )
+    kinds, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": list(fields), "formats": kinds, "offsets": offsets, "itemsize": point_step})
 
 
 _XYZ = {"x": ("f4", 0), "y": ("f4", 4), "z": ("f4", 8)}
-_OUSTER = {
-    **_XYZ,
-    "intensity": ("f4", 16),
-    "t": ("u4", 20),
-    "reflectivity": ("u2", 24),
-    "ring": ("u2", 26),
-    "ambient": ("u2", 28),
-    "range": ("u4", 32),
-}
+_OUSTER = {"intensity": ("f4", 16), "t": ("u4", 20), "reflectivity": ("u2", 24), "ring": ("u2", 26)}
+_OUSTER |= {"ambient": ("u2", 28), "range": ("u4", 32)}
 
 
 def _relative(dtype, factor):
@@ -96,7 +83,7 @@ _DRIVERS = {
         _layout(22, **_XYZ, intensity=("f4", 12), ring=("u2", 16), time=("f4", 18)),
         ("time", "s", "relative", _relative("f4", 1)),
     ),
-    "ouster": (_layout(48, **_OUSTER), ("t", "ns", "relative", _relative("u4", 1e9))),
+    "ouster": (_layout(48, **_XYZ, **_OUSTER), ("t", "ns", "relative", _relative("u4", 1e9))),
     "hesai": (
         _layout(48, **_XYZ, intensity=("f4", 16), timestamp=("f8", 24), ring=("u2", 32)),
         ("timestamp", "s", "absolute", _epoch_seconds),
@@ -203,18 +190,10 @@ class BagKit:
             self.new("sensor_msgs/PointField", name=name, offset=offset, datatype=_DATATYPES[kind.str[1:]], count=1)
             for name, (kind, offset) in records.dtype.fields.items()
         ]
-        values = {
-            "header": self.header(stamp_ns),
-            "height": height,
-            "width": width,
-            "fields": fields,
-            "is_bigendian": False,
-            "point_step": point_step,
-            "row_step": rows.shape[1],
-            "data": rows.reshape(-1),
-            "is_dense": False,
-        }
-        return self.new("sensor_msgs/PointCloud2", **{**values, **changes})
+        shape = {"height": height, "width": width, "point_step": point_step, "row_step": rows.shape[1]}
+        content = {"fields": fields, "is_bigendian": False, "is_dense": False, "data": rows.reshape(-1)}
+        values = {"header": self.header(stamp_ns), **shape, **content, **changes}
+        return self.new("sensor_msgs/PointCloud2", **values)
 
     def livox(
         self, points: np.ndarray, offset_ns: np.ndarray, lines: np.ndarray, stamp_ns: int, timebase: int, package: str

@@ -85,9 +85,7 @@ def test_places_without_a_return_have_no_time():
     points, _, rings = sweep(0.0)
     points[::5], points[1::5] = 0.0, np.nan
     found = offsets_from_order(RawCloud(points, rings=rings), PERIOD_S)
-    assert np.isnan(found[::5]).all()
-    assert np.isnan(found[1::5]).all()
-    assert np.isfinite(found[2::5]).all()
+    np.testing.assert_array_equal(np.isfinite(found), np.arange(len(found)) % 5 > 1)
 
 
 @pytest.mark.parametrize("order", ["firing", "rings"])
@@ -158,9 +156,8 @@ def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
         np.save(path, append_fields(table, "time", np.zeros(len(table), "f4"), usemask=False))
     recording = open_recording(folder)
     assert next(recording.scans()).time_offsets.max() == pytest.approx(PERIOD_S, abs=1e-3)
-    assert recording.warnings == (
-        "The time field 'time' holds one value alone (0); the times follow from the azimuth instead.",
-    )
+    (warning,) = recording.warnings
+    assert "'time' holds one value alone (0); the times follow from the azimuth" in warning
 
 
 def test_clouds_of_a_bag(bag_kit):

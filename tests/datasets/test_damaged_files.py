@@ -215,6 +215,12 @@ def test_damaged_bags(bag, damage, what):
         check(file)
 
 
+def assert_refused(file: Path, content: bytes, words: str) -> None:
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        next(open_recording(file.parent).scans())
+
+
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "plain.bin"])
 def test_a_header_that_promises_more_than_there_is(tmp_path, table, name):
     """One point more, and so many that making room for them would fill any memory."""
@@ -226,9 +232,7 @@ def test_a_header_that_promises_more_than_there_is(tmp_path, table, name):
             length = len(f"({promised},), ") - len("(120,), ")
             lie = data.replace(b"(120,), }" + b" " * length, f"({promised},), }}".encode())
         assert lie != data
-        (tmp_path / name).write_bytes(lie)
-        with pytest.raises(InputError, match="truncated"):
-            next(open_recording(tmp_path).scans())
+        assert_refused(tmp_path / name, lie, "truncated")
 
 
 def test_pickled_objects_are_never_unpickled(tmp_path):
@@ -245,9 +249,7 @@ def test_pickled_objects_are_never_unpickled(tmp_path):
 @pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith((".pcd", ".ply"))])
 def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, name):
     lie = encode(name, table).replace(b"POINTS 120", b"POINTS 0").replace(b"element vertex 120", b"element vertex 0")
-    (tmp_path / name).write_bytes(lie)
-    with pytest.raises(InputError, match=r"promises no points, and .* bytes follow|is truncated"):
-        next(open_recording(tmp_path).scans())
+    assert_refused(tmp_path / name, lie, r"promises no points, and .* bytes follow|is truncated")
 
 
 @pytest.mark.parametrize("before", [False, True])
@@ -258,13 +260,9 @@ def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, n
     header = header[:vertex] + faces + header[vertex:] if before else header + faces
     for points in (b"element vertex 120", b"element vertex 0"):
         lie = header.replace(b"element vertex 120", points) + b"end_header\n" + body
-        (tmp_path / name).write_bytes(lie)
-        with pytest.raises(InputError, match=r"1,000,000,000,000 other elements .* truncated"):
-            next(open_recording(tmp_path).scans())
+        assert_refused(tmp_path / name, lie, r"1,000,000,000,000 other elements .* truncated")
 
 
-def test_an_empty_scan_is_none_of_them(tmp_path):
-    (tmp_path / "a.ply").write_bytes(
-        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n\n"
-    )
+def test_an_empty_scan_is_none_of_them(tmp_path, table):
+    (tmp_path / "a.ply").write_bytes(encode("ascii.ply", table[:0]) + b"\n")
     assert len(next(open_recording(tmp_path).scans())) == 0

@@ -19,6 +19,7 @@ KEYS = {
     "source", "reader", "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan",
     "fields", "point_time", "ground_truth", "imu", "notes", "topics", "topic_choices",
 }  # fmt: skip
+HAS = dict.fromkeys(("has_intensities", "has_colours", "has_rings"), False)
 CLOUDS = Topic("/points", "sensor_msgs/msg/PointCloud2", 3)
 
 
@@ -45,19 +46,11 @@ def described(bag: Path, monkeypatch: pytest.MonkeyPatch, info: RecordingInfo | 
 def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.array([[1.0, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     first = Scan.from_raw(points, 10.0, np.array([-0.05, 0.05, 0.0]), np.array([0, 1, 2]), np.arange(3.0))
-    info = RecordingInfo(
-        "rosbag",
-        3,
-        first,
-        10.2,
-        bag.with_suffix(".tum"),
-        PointTimeModel("t", "ns", "relative"),
-        "/points",
-        (CLOUDS, Topic("/imu\x7f\x1b", "sensor_msgs/msg/Imu", 40)),
-        (PointField("x", "float32"), PointField("t", "uint32")),
-        ("A note.",),
-        ImuSummary("/imu", 40, 200.0, False, ("Another.",)),
-    )
+    topics = (CLOUDS, Topic("/imu\x7f\x1b", "sensor_msgs/msg/Imu", 40))
+    fields = (PointField("x", "float32"), PointField("t", "uint32"))
+    times, truth = PointTimeModel("t", "ns", "relative"), bag.with_suffix(".tum")
+    imu = ImuSummary("/imu", 40, 200.0, False, ("Another.",))
+    info = RecordingInfo("rosbag", 3, first, 10.2, truth, times, "/points", topics, fields, ("A note.",), imu)
     assert described(bag, monkeypatch, info) == {
         "source": str(bag),
         "reader": "rosbag",
@@ -67,13 +60,7 @@ def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "last_stamp_s": 10.2,
         "duration_s": pytest.approx(0.2),
         "rate_hz": pytest.approx(10.0),
-        "first_scan": {
-            "points": 2,
-            "dropped_points": 1,
-            "has_intensities": True,
-            "has_colours": False,
-            "has_rings": True,
-        },
+        "first_scan": {"points": 2, "dropped_points": 1, **HAS, "has_intensities": True, "has_rings": True},
         "fields": [{"name": "x", "type": "float32"}, {"name": "t", "type": "uint32"}],
         "point_time": {"field": "t", "unit": "ns", "reference": "relative", "first_s": -0.05, "last_s": 0.05},
         "ground_truth": str(bag.with_suffix(".tum")),
@@ -91,11 +78,9 @@ def test_what_is_not_there_is_null(bag: Path, monkeypatch: pytest.MonkeyPatch) -
     info = RecordingInfo("scan-folder", 1, Scan.from_raw(np.ones((1, 3)), 5.0), 5.0, None, None)
     content = described(bag, monkeypatch, info)
     assert set(content) == KEYS
-    assert [key for key in KEYS if content[key] is None] == [
-        key for key in KEYS if key in ("topic", "rate_hz", "point_time", "ground_truth", "imu")
-    ]
-    none = dict.fromkeys(("has_intensities", "has_colours", "has_rings"), False)
-    assert content["first_scan"] == {"points": 1, "dropped_points": 0, **none}
+    nothing = {key for key in KEYS if content[key] is None}
+    assert nothing == {"topic", "rate_hz", "point_time", "ground_truth", "imu"}
+    assert content["first_scan"] == {"points": 1, "dropped_points": 0, **HAS}
 
 
 def test_topics_to_choose_from(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at, take_in
@@ -39,20 +40,19 @@ def test_a_scan_of_two_million_points_is_thinned_and_said(rng):
     assert "2,000,000 points at 1.0" in faults.warnings()[0]
 
 
-@pytest.mark.parametrize("scale", [100.0, 1000.0])
-def test_centimetres_and_millimetres_are_told(rng, scale):
-    room = rng.uniform(-6.0, 6.0, (1000, 3))
-    room = room[np.linalg.norm(room, axis=1) > 1.0]
-    scan, faults = seen(scale * room)
-    assert len(scan) == len(room)
-    assert faults.warnings()[0].startswith("1 scan looks like centimetres or millimetres, where metres are expected")
+def at(directions: FloatArray, ranges: FloatArray) -> FloatArray:
+    return directions * (ranges / np.linalg.norm(directions, axis=1))[:, None]
 
 
-def test_millimetres_of_a_sensor_with_a_narrow_view_are_told(rng):
-    directions = rng.normal(size=(1000, 3)) * [0.2, 0.4, 0.2] + [1.0, 0.0, 0.0]
-    hall = _at(directions, rng.uniform(0.8, 9.0, 1000))
-    assert len(seen(hall)[1].warnings()) == 0
-    assert len(seen(1000.0 * hall)[1].warnings()) == 1
+@pytest.mark.parametrize(
+    ("is_narrow", "scale"), [(False, 1.0), (False, 100.0), (False, 1000.0), (True, 1.0), (True, 1000.0)]
+)
+def test_centimetres_and_millimetres_are_told(rng, is_narrow, scale):
+    around = rng.normal(size=(1000, 3))
+    directions = around * [0.2, 0.4, 0.2] + [1.0, 0.0, 0.0] if is_narrow else around
+    scan, faults = seen(scale * at(directions, rng.uniform(0.8, 9.0, 1000)))
+    assert len(scan) == 1000
+    assert ["centimetres or millimetres" in said for said in faults.warnings()] == [True] * (scale > 1.0)
 
 
 def test_an_aircraft_and_a_ship_see_far(rng):
@@ -60,13 +60,9 @@ def test_an_aircraft_and_a_ship_see_far(rng):
     for height in (50.0, 500.0, 3000.0):
         assert seen(down * height * rng.uniform(0.8, 1.0, (1000, 1)))[1].warnings() == ()
     forward = rng.normal(size=(1000, 3)) * [0.1, 0.4, 0.2] + [1.0, 0.0, 0.0]
-    assert seen(_at(forward, rng.uniform(300.0, 2000.0, 1000)))[1].warnings() == ()
+    assert seen(at(forward, rng.uniform(300.0, 2000.0, 1000)))[1].warnings() == ()
     around = rng.normal(size=(1000, 3)) * [1.0, 1.0, 0.1]
-    assert seen(_at(around, rng.uniform(30.0, 390.0, 1000)))[1].warnings() == ()
-
-
-def _at(directions, ranges):
-    return directions * (ranges / np.linalg.norm(directions, axis=1))[:, None]
+    assert seen(at(around, rng.uniform(30.0, 390.0, 1000)))[1].warnings() == ()
 
 
 @pytest.mark.parametrize("span_s", [0.0, 1e-4])
@@ -83,10 +79,7 @@ def test_times_of_no_sweep_are_told(rng, span_s):
 def test_times_shifted_away_from_the_stamp_are_told(rng, shift_s, told):
     points = rng.uniform(-8.0, 8.0, (1000, 3))
     _, faults = seen(points, time_offsets=np.linspace(0.0, 0.1, 1000) + shift_s)
-    assert len(faults.warnings()) == bool(told)
-    if told:
-        assert faults.warnings()[0].startswith("1 scan is stamped outside its sweep")
-        assert told in faults.warnings()[0]
+    assert ["stamped outside its sweep" in said and told in said for said in faults.warnings()] == [True] * bool(told)
 
 
 def test_points_without_a_time_are_counted(rng):
@@ -94,10 +87,9 @@ def test_points_without_a_time_are_counted(rng):
     times[::4] = np.nan
     faults = Faults()
     look_at(Scan.from_raw(points, 1.0, times), faults)
-    assert faults.warnings() == (
-        "1 scan has points without a time, which were given one between those of their neighbours; the first: 250"
-        " points at 1.000000000",
-    )
+    (said,) = faults.warnings()
+    assert said.startswith("1 scan has points without a time")
+    assert said.endswith("250 points at 1.000000000")
 
 
 def test_all_points_at_one_place_are_told():
@@ -127,9 +119,7 @@ def taken(recording):
 def test_stamps_that_no_lidar_has_are_told_once(period_s, told):
     scans, faults = taken(Recorded(*(Scan(np.ones((3, 3)), 1000.0 + period_s * number) for number in range(8))))
     assert len(scans) == 8
-    assert len(faults.warnings()) == told
-    if told:
-        assert faults.warnings()[0].startswith("7 scans are stamped within a millisecond of the one before")
+    assert [said.startswith("7 scans are stamped within a millisecond") for said in faults.warnings()] == [True] * told
 
 
 def test_a_driver_that_hangs_repeats_a_scan_which_counts_once(rng):
@@ -140,10 +130,9 @@ def test_a_driver_that_hangs_repeats_a_scan_which_counts_once(rng):
     scans, faults = taken(Recorded(*(Scan(points.copy(), 0.1 * number) for number, points in enumerate(clouds))))
     assert [scan.stamp for scan in scans] == [0.0, 0.1, 0.4]
     assert faults.left_out == 2
-    assert faults.warnings() == (
-        "2 scans were left out: they have the points of the scan before, as from a driver that hangs;"
-        " the first: at 0.200000000",
-    )
+    (said,) = faults.warnings()
+    assert "they have the points of the scan before" in said
+    assert said.endswith("the first: at 0.200000000")
 
 
 def spinning(times_sign=1.0, mirror=1.0):
@@ -157,25 +146,24 @@ def spinning(times_sign=1.0, mirror=1.0):
     return Scan(points, 1.0, time_offsets=offsets, rings=np.tile(np.arange(16, dtype=np.int32), len(azimuths)))
 
 
-@pytest.mark.parametrize(
-    ("scan", "told"),
-    [(spinning(), False), (spinning(mirror=-1.0), True), (spinning(times_sign=-1.0), True)],
-    ids=["clockwise", "mirrored", "reversed"],
-)
-def test_mirrored_axes_and_reversed_times_turn_the_other_way(scan, told):
-    _, faults = taken(Recorded(scan))
-    assert len(faults.warnings()) == told
-    if told:
-        assert faults.warnings()[0].startswith("1 scan turns counter-clockwise as seen from above")
-
-
-def test_a_sensor_upside_down_turns_the_other_way_and_is_right():
-    _, faults = taken(MountedRecording(Recorded(spinning()), "upside-down"))
-    assert faults.warnings() == ()
-
-
-def test_the_strokes_of_a_scanning_mirror_are_no_turn():
+def strokes():
+    """Of a scanning mirror, which are no turn."""
     scan = spinning(mirror=-1.0)
     bent = scan.points + [0.0, 0.0, 2.0] * np.sin(9.0 * np.arctan2(scan.points[:, 1], scan.points[:, 0]))[:, None]
-    _, faults = taken(Recorded(replace(scan, points=bent)))
-    assert faults.warnings() == ()
+    return replace(scan, points=bent)
+
+
+@pytest.mark.parametrize(
+    ("recording", "told"),
+    [
+        (Recorded(spinning()), False),
+        (Recorded(spinning(mirror=-1.0)), True),
+        (Recorded(spinning(times_sign=-1.0)), True),
+        (MountedRecording(Recorded(spinning()), "upside-down"), False),
+        (Recorded(strokes()), False),
+    ],
+    ids=["clockwise", "mirrored", "reversed", "clockwise upside down", "strokes"],
+)
+def test_mirrored_axes_and_reversed_times_turn_the_other_way(recording, told):
+    _, faults = taken(recording)
+    assert ["turns counter-clockwise as seen from above" in said for said in faults.warnings()] == [True] * told

@@ -30,11 +30,8 @@ def uncorrected(monkeypatch):
 
 def _stamp_lines(seconds: np.ndarray) -> str:
     """Lines as KITTI writes them, nanoseconds included; NaN is a blank line."""
-    instants = [MIDNIGHT + np.timedelta64(0 if np.isnan(s) else round(s * 1e9), "ns") for s in seconds]
-    lines = [
-        "" if np.isnan(s) else str(instant).replace("T", " ") for s, instant in zip(seconds, instants, strict=True)
-    ]
-    return "\n".join(lines) + "\n"
+    lines = ["" if np.isnan(s) else str(MIDNIGHT + np.timedelta64(round(s * 1e9), "ns")) for s in seconds]
+    return "\n".join(lines).replace("T", " ") + "\n"
 
 
 def _T_enu_imu(time: float) -> np.ndarray:

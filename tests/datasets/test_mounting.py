@@ -67,16 +67,14 @@ def cast(
     return (ranges + noise)[seen, None] * directions[seen]
 
 
-@cache
-def street(count: int = 5) -> list[FloatArray]:
-    return [cast(rays(), 0.8 * number, BOXES) for number in range(count)]
+def drive_past(directions: FloatArray, step_m: float, boxes: list, **surroundings: float) -> list[FloatArray]:
+    """Five scans, each so far along the street or the room."""
+    return [cast(directions, step_m * number, boxes, **surroundings) for number in range(5)]
 
 
 @cache
-def corridor(count: int = 5) -> list[FloatArray]:
-    """Two metres wide and 2.6 high."""
-    walls = [((-40.0, 1.0, -2.0), (40.0, 1.2, 2.0)), ((-40.0, -1.2, -2.0), (40.0, -1.0, 2.0))]
-    return [cast(rays(-15.0, 15.0), 0.2 * number, walls, ceiling_m=0.9) for number in range(count)]
+def street() -> list[FloatArray]:
+    return drive_past(rays(), 0.8, BOXES)
 
 
 class Recorded:
@@ -146,7 +144,7 @@ def test_angles_are_those_of_the_recorded_axes():
 
 
 def test_scans_truth_and_extrinsics_are_turned_together():
-    clouds = [points[::50] @ turn(*QUARTERS["left"]).T for points in street(2)]
+    clouds = [points[::50] @ turn(*QUARTERS["left"]).T for points in street()[:2]]
     recorded = Recorded(clouds)
     mounted = MountedRecording(recorded, "left")
     T = transform_of("left")
@@ -162,11 +160,9 @@ def test_scans_truth_and_extrinsics_are_turned_together():
 
 
 def test_an_upright_recording_is_left_alone():
-    recorded = Recorded(street(2))
+    recorded = Recorded(street()[:2])
     mounted = MountedRecording(recorded, "auto")
-    assert [scan.points is own.points for scan, own in zip(mounted.scans(), recorded.scans(), strict=True)] == [
-        True
-    ] * 2
+    assert all(scan.points is own.points for scan, own in zip(mounted.scans(), recorded.scans(), strict=True))
     np.testing.assert_array_equal(mounted.ground_truth.T_world_lidar, recorded.ground_truth.T_world_lidar)
     assert mounted.warnings == recorded.warnings
 
@@ -187,46 +183,47 @@ def test_an_odd_attitude_is_guessed_by_its_angles():
     assert up[2] > np.cos(np.deg2rad(2.0))
 
 
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120), (0, 55, 0)])
-def test_a_sensor_that_is_tilted_is_left_alone(angles):
-    assert guess_mounting(points @ turn(*angles).T for points in street()) == UPRIGHT
-
-
-@pytest.mark.parametrize("angles", [(0, 0, 0), (180, 0, 0), (25, 0, 0)])
-def test_walls_of_a_corridor_are_no_ground(angles):
-    assert guess_mounting(points @ turn(*angles).T for points in corridor()) == UPRIGHT
-
-
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, 90, 0), (180, 0, 0)])
-def test_a_dome_that_sees_the_ceiling_and_not_the_floor_is_left_alone(angles):
-    walls = [((-6.0, 4.0, -2.0), (6.0, 4.2, 9.0)), ((-6.0, -3.2, -2.0), (6.0, -3.0, 9.0))]
-    walls += [((6.0, -4.0, -2.0), (6.2, 5.0, 9.0)), ((-6.2, -4.0, -2.0), (-6.0, 5.0, 9.0))]
-    room = [cast(rays(-7.0, 52.0), 0.1 * number, walls, ceiling_m=1.2) for number in range(5)]
-    assert guess_mounting(points @ turn(*angles).T for points in room) == UPRIGHT
-
-
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -30, 0)])
-@pytest.mark.parametrize(
-    "opposite", [[((-3.0, -16.1, -4.0), (3.0, -16.0, 3.0))], []], ids=["a wall opposite", "nothing opposite"]
-)
-def test_the_wall_beside_a_gallery_is_no_ground(angles, opposite):
-    """The floor of the hall is beyond that of the gallery, nothing is beyond the wall."""
-    wall, gallery = ((-60.0, 2.5, -9.0), (60.0, 3.0, 9.0)), ((-60.0, -2.2, -1.6), (60.0, 2.5, -1.5))
-    boxes = [wall, gallery, *opposite]
-    hall = [cast(rays(-45.0, 45.0, 64), 0.2 * number, boxes, 4.6, height_m=7.0) for number in range(5)]
-    assert guess_mounting(points @ turn(*angles).T for points in hall) == UPRIGHT
-
-
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -30, 0)])
-def test_a_facade_beside_a_flying_sensor_is_no_ground(angles):
+@cache
+def scene(name: str) -> list[FloatArray]:
+    """Scans that show no ground, or the ground where it should be."""
+    gallery = [((-60.0, 2.5, -9.0), (60.0, 3.0, 9.0)), ((-60.0, -2.2, -1.6), (60.0, 2.5, -1.5))]
+    opposite = ((-3.0, -16.1, -4.0), (3.0, -16.0, 3.0))
+    match name:
+        case "street":
+            return street()
+        case "corridor":  # two metres wide and 2.6 high
+            walls = [((-40.0, 1.0, -2.0), (40.0, 1.2, 2.0)), ((-40.0, -1.2, -2.0), (40.0, -1.0, 2.0))]
+            return drive_past(rays(-15.0, 15.0), 0.2, walls, ceiling_m=0.9)
+        case "dome that sees the ceiling and not the floor":
+            walls = [((-6.0, 4.0, -2.0), (6.0, 4.2, 9.0)), ((-6.0, -3.2, -2.0), (6.0, -3.0, 9.0))]
+            walls += [((6.0, -4.0, -2.0), (6.2, 5.0, 9.0)), ((-6.2, -4.0, -2.0), (-6.0, 5.0, 9.0))]
+            return drive_past(rays(-7.0, 52.0), 0.1, walls, ceiling_m=1.2)
+        case "gallery":  # the floor of the hall is beyond that of the gallery, nothing is beyond the wall
+            return drive_past(rays(-45.0, 45.0, 64), 0.2, gallery, ceiling_m=4.6, height_m=7.0)
+        case "gallery with a wall opposite":
+            return drive_past(rays(-45.0, 45.0, 64), 0.2, [*gallery, opposite], ceiling_m=4.6, height_m=7.0)
     facade = ((-20.0, 2.5, -7.0), (20.0, 12.0, 12.0))
-    flight = [cast(rays(-15.0, 15.0, 16), 0.2 * number, [facade], height_m=7.0) for number in range(5)]
-    assert guess_mounting(points @ turn(*angles).T for points in flight) == UPRIGHT
+    return drive_past(rays(-15.0, 15.0, 16), 0.2, [facade], height_m=7.0)
+
+
+LEFT_ALONE = {
+    "street": [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120), (0, 55, 0)],
+    "corridor": [(0, 0, 0), (180, 0, 0), (25, 0, 0)],
+    "dome that sees the ceiling and not the floor": [(0, 0, 0), (25, 0, 0), (0, 90, 0), (180, 0, 0)],
+    "gallery": [(0, 0, 0), (25, 0, 0), (0, -30, 0)],
+    "gallery with a wall opposite": [(0, 0, 0), (25, 0, 0), (0, -30, 0)],
+    "flight along a facade": [(0, 0, 0), (25, 0, 0), (0, -30, 0)],
+}
+
+
+@pytest.mark.parametrize(("name", "angles"), [(name, angles) for name in LEFT_ALONE for angles in LEFT_ALONE[name]])
+def test_walls_and_ceilings_are_no_ground_and_a_tilt_is_left_alone(name, angles):
+    assert guess_mounting(points @ turn(*angles).T for points in scene(name)) == UPRIGHT
 
 
 def test_what_only_some_scans_show_is_a_warning_and_no_more():
     R, grass = turn(*QUARTERS["left"]), np.random.default_rng(0).normal(0.0, 5.0, (4000, 3))
-    guess = guess_mounting([street(1)[0] @ R.T, street(2)[1] @ R.T, grass, grass, grass])
+    guess = guess_mounting([street()[0] @ R.T, street()[1] @ R.T, grass, grass, grass])
     assert guess.mounting == "upright"
     assert guess.warning is not None
     assert "--set reader.mounting=left" in guess.warning
@@ -241,7 +238,7 @@ def test_scans_without_surfaces_show_nothing(points):
 
 def test_recordings_are_opened_upright(tmp_path: Path):
     R = turn(*QUARTERS["left"])
-    for number, points in enumerate(street(17)):
+    for number, points in enumerate(cast(rays(), 0.8 * number, BOXES) for number in range(17)):
         np.save(tmp_path / f"{number:06d}.npy", points @ R.T)
     T = make_transform(R.T, np.zeros(3))
     write_tum(tmp_path / "ground_truth.tum", Trajectory(0.1 * np.arange(17.0), np.tile(T, (17, 1, 1))))
@@ -260,7 +257,7 @@ def test_recordings_are_opened_upright(tmp_path: Path):
 @pytest.mark.parametrize("angles", [(90, 0, 0), (0, 90, 0), (45, 0, 0), (30, 40, 110)])
 def test_the_axis_that_a_sensor_spins_about_is_found(angles):
     R = turn(*angles)
-    found = image_axes(street(1)[0] @ R.T)
+    found = image_axes(street()[0] @ R.T)
     np.testing.assert_allclose(np.abs(found[2] @ R), [0.0, 0.0, 1.0], atol=0.01)
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
 

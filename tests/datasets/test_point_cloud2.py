@@ -7,7 +7,13 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
-STAMP_NS = 1_700_000_000_250_000_000
+from .conftest import STAMP_NS, point_table
+
+
+def assert_same(cloud, sweep):
+    np.testing.assert_array_equal(cloud.points, sweep.points)
+    np.testing.assert_array_equal(cloud.rings, sweep.rings)
+    np.testing.assert_array_equal(cloud.times, sweep.times)
 
 
 def test_padded_rows_and_big_endian(driver, make_sweep, ros2_kit):
@@ -15,9 +21,7 @@ def test_padded_rows_and_big_endian(driver, make_sweep, ros2_kit):
     swapped = sweep.records.astype(sweep.records.dtype.newbyteorder(">"))
     message = ros2_kit.cloud(swapped, STAMP_NS, row_padding=13, is_bigendian=True)
     cloud = decode_point_cloud2(message)
-    np.testing.assert_array_equal(cloud.points, sweep.points)
-    np.testing.assert_array_equal(cloud.rings, sweep.rings)
-    np.testing.assert_array_equal(cloud.times, sweep.times)
+    assert_same(cloud, sweep)
     assert cloud.times.dtype.isnative
     assert cloud.rings.dtype.isnative
 
@@ -27,9 +31,7 @@ def test_the_result_does_not_hold_on_to_the_message(make_sweep, ros2_kit):
     message = ros2_kit.cloud(sweep.records, STAMP_NS)
     cloud = decode_point_cloud2(message)
     message.data[:] = 0
-    np.testing.assert_array_equal(cloud.points, sweep.points)
-    np.testing.assert_array_equal(cloud.times, sweep.times)
-    np.testing.assert_array_equal(cloud.rings, sweep.rings)
+    assert_same(cloud, sweep)
 
 
 def test_coordinates_alone_are_enough(ros2_kit, rng):
@@ -63,8 +65,7 @@ def test_an_unknown_datatype_matters_only_where_it_is_read(ros2_kit, make_sweep)
 
 
 def test_rings_stored_as_floats(ros2_kit):
-    records = np.zeros((1, 3), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "f4")])
-    records["ring"] = [5.0, np.nan, 31.0]
+    records = point_table(np.ones((3, 3)), ring=np.array([5.0, np.nan, 31.0]))[None]
     np.testing.assert_array_equal(decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS)).rings, [5, np.nan, 31])
 
 
@@ -108,10 +109,8 @@ def test_livox_custom_message(bag_kit, rng, count, frame_id):
 
 
 def test_livox_custom_message_cut_anywhere(bag_kit, rng):
-    message = bag_kit.livox(
-        rng.normal(size=(5, 3)), np.arange(5), np.zeros(5), STAMP_NS, STAMP_NS, package="livox_ros_driver"
-    )
-    raw = bag_kit.serialize(message)
+    points = rng.normal(size=(5, 3))
+    raw = bag_kit.serialize(bag_kit.livox(points, np.arange(5), np.zeros(5), STAMP_NS, STAMP_NS, "livox_ros_driver"))
     for length in range(4, len(raw) - 1):
         with pytest.raises(InputError, match="Livox CustomMsg"):
             decode_custom_message(raw[:length], bag_kit.ros2)

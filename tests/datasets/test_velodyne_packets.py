@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 
 pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
@@ -123,29 +125,20 @@ def test_a_part_of_a_capture(capture):
 
 
 def scan_message(kit, sent, stamp_ns):
-    header = kit.header(stamp_ns)
-    stamps = [round(1e9 * (times[0])) + round(STAMP_S * 1e9) for _, times, _, _ in sent]
-    time = lambda ns: kit.new("builtin_interfaces/Time", sec=ns // 10**9, nanosec=ns % 10**9)  # noqa: E731
-    return kit.new(
-        "velodyne_msgs/VelodyneScan",
-        header=header,
-        packets=[
-            kit.new("velodyne_msgs/VelodynePacket", stamp=time(ns), data=np.frombuffer(data, np.uint8))
-            for (data, *_), ns in zip(sent, stamps, strict=True)
-        ],
-    )
+    found = []
+    for data, times, _, _ in sent:
+        ns = round(1e9 * times[0]) + round(STAMP_S * 1e9)
+        stamp = kit.new("builtin_interfaces/Time", sec=ns // 10**9, nanosec=ns % 10**9)
+        found.append(kit.new("velodyne_msgs/VelodynePacket", stamp=stamp, data=np.frombuffer(data, np.uint8)))
+    return kit.new("velodyne_msgs/VelodyneScan", header=kit.header(stamp_ns), packets=found)
 
 
 @pytest.fixture
 def velodyne_kit(bag_kit):
-    from rosbags.typesys import get_types_from_msg
-
     time = "builtin_interfaces/Time" if bag_kit.ros2 else "time"
-    for name, text in {
-        "VelodynePacket": f"{time} stamp\nuint8[1206] data\n",
-        "VelodyneScan": "std_msgs/Header header\nVelodynePacket[] packets\n",
-    }.items():
-        bag_kit.store.register(get_types_from_msg(text, f"velodyne_msgs/msg/{name}"))
+    packet_text, scan_text = f"{time} stamp\nuint8[1206] data\n", "std_msgs/Header header\nVelodynePacket[] packets\n"
+    bag_kit.store.register(get_types_from_msg(packet_text, "velodyne_msgs/msg/VelodynePacket"))
+    bag_kit.store.register(get_types_from_msg(scan_text, "velodyne_msgs/msg/VelodyneScan"))
     return bag_kit
 
 
@@ -186,8 +179,6 @@ def test_an_empty_or_damaged_message_costs_no_other(velodyne_kit):
     nonsense = [(b"\x11" * 1206, *rest) for _, *rest in sent[:3]]
     parts = ([], nonsense, sent[half:])
     messages = [(ns, scan_message(velodyne_kit, part, ns)) for ns, part in zip(stamps_ns, parts, strict=True)]
-    from lidarslam.datasets.faults import Faults
-
     faults = Faults()
     scans = list(open_recording(velodyne_kit.write({"/packets": messages})).scans(faults=faults))
     assert [len(scan) > 0 for scan in scans] == [False, True]

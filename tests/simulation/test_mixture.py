@@ -41,12 +41,7 @@ class Numbered:
 
 @pytest.mark.parametrize(
     ("chosen", "expected"),
-    [
-        ((), [10, 11, 12, 13]),
-        ((1, 99), [11, 12, 13]),
-        ((0, None, 3), [10, 13]),
-        ((2, 1), []),
-    ],
+    [((), [10, 11, 12, 13]), ((1, 99), [11, 12, 13]), ((0, None, 3), [10, 13]), ((2, 1), [])],
 )
 def test_an_excerpt_is_a_recording_of_its_own(chosen, expected):
     whole = Numbered(20)

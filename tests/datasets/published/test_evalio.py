@@ -39,6 +39,11 @@ def _imu_messages(kit: Any, samples: int) -> tuple[list[tuple[int, Any]], np.nda
     return [(ns, kit.imu(ns, "imu", row[:3], row[3:])) for ns, row in zip(stamps, content, strict=True)], content
 
 
+def _one_scan(kit: Any, sweep: Any, lidar: str, imu: str) -> dict[str, list[tuple[int, Any]]]:
+    """A cloud and three samples of an IMU."""
+    return {lidar: [(START_NS, kit.cloud(sweep.records, START_NS))], imu: _imu_messages(kit, 3)[0]}
+
+
 def _quaternion(T: np.ndarray) -> str:
     return " ".join(f"{value:.9f}" for value in Rotation.from_matrix(T[:3, :3]).as_quat())
 
@@ -117,9 +122,8 @@ def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) 
     sweep.records["x"][~np.isfinite(sweep.records["x"])] = 0.0  # the driver marks no return by zeros
     for axis in "yz":
         sweep.records[axis][sweep.records["x"] == 0.0] = 0.0
-    imu, _ = _imu_messages(kit, 5)
-    clouds = [(START_NS, kit.cloud(sweep.records, START_NS))]
-    kit.write({"/os_cloud_node/points": clouds, "/os_cloud_node/imu": imu}, name="2021-07-01-10-40-50_0-stairs")
+    messages = _one_scan(kit, sweep, "/os_cloud_node/points", "/os_cloud_node/imu")
+    kit.write(messages, name="2021-07-01-10-40-50_0-stairs")
     T = exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0])
     values = ",".join([*map(repr, T[:3, 3].tolist()), *_quaternion(T).split()])
     (folder / "gt-nc-stairs.csv").write_text(f"#sec,nsec,x,y,z,qx,qy,qz,qw\n1640000000,500000000,{values}\n")
@@ -140,9 +144,7 @@ def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) 
 def test_enwide_has_true_positions_alone(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
     folder, kit = make_sequence("enwide/field_d")
     sweep = make_sweep("ouster", START_NS, height=16, width=50)
-    clouds = [(START_NS, kit.cloud(sweep.records, START_NS))]
-    imu, _ = _imu_messages(kit, 3)
-    kit.write({"/ouster/points": clouds, "/ouster/imu": imu}, name="2023-08-09-19-25-45-field_d")
+    kit.write(_one_scan(kit, sweep, "/ouster/points", "/ouster/imu"), name="2023-08-09-19-25-45-field_d")
     (folder / "gt-field_d.csv").write_text("".join(f"{1640000000 + k}.0 {k} 0 0 0 0 0 1\n" for k in range(3)))
     recording = open_recording(folder)
     (scan,) = recording.scans()
@@ -185,21 +187,17 @@ def test_oxford_spires(evalio_data: Path, make_bag_kit: Callable[[str], Any], ma
 
     assert choose_reader(folder) == "evalio"
     recording = open_recording(folder)
-    (scan,) = recording.scans()
-    assert len(scan) == len(sweep.points)
+    assert [len(scan) for scan in recording.scans()] == [len(sweep.points)]
     assert recording.ground_truth.length_m == pytest.approx(1.0, abs=1e-3)  # evalio drops the first pose
     assert len(recording.imu) == 5
 
 
-def test_what_is_not_downloaded_names_the_command(evalio_data: Path) -> None:
+def test_what_is_not_downloaded_names_the_command(evalio_data: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is not downloaded: evalio dl hilti_2022/basement_2$"):
         open_recording(Path("evalio:hilti_2022/basement_2"))
     (evalio_data / "hilti_2022" / "basement_2").mkdir(parents=True)
     with pytest.raises(InputError, match=r"exp14_basement_2.bag is missing.*; evalio dl hilti_2022/basement_2$"):
         open_recording(Path("evalio:hilti_2022/basement_2"))
-
-
-def test_the_command_names_a_folder_of_its_own(evalio_data: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"evalio -D {tmp_path} dl hilti_2022/basement_2$"):
         open_recording(tmp_path / "hilti_2022" / "basement_2")
 
