@@ -15,6 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.tasks import Tasks, Where, open_tasks
 
 # What tasks run is imported by their processes: functions of the standard library and of this program.
+in_processes = pytest.mark.parametrize("tasks", ["ray"], indirect=True)
 SQUARES = [0.0, 1.0, 4.0, 9.0, 16.0]
 
 
@@ -82,18 +83,16 @@ def test_an_error_of_a_task_is_that_of_the_user(tasks: Tasks) -> None:
         list(tasks.run(fail_at_three, [1.0, 2.0, 3.0, 4.0]))
 
 
+@in_processes
 def test_each_process_has_its_share_of_the_cores(tasks: Tasks) -> None:
-    if tasks.slots == 1:
-        pytest.skip("in this process")
     share = os.environ.get("OMP_NUM_THREADS") or str(max(1, len(os.sched_getaffinity(0)) // 2))
     assert list(tasks.run(environment, ["OMP_NUM_THREADS", "NUMBA_NUM_THREADS"])) == [share, share]
     assert list(tasks.run(environment, ["RAY_USAGE_STATS_ENABLED"])) == ["0"]
 
 
+@in_processes
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks: Tasks, tmp_path: Path) -> None:
-    if tasks.slots == 1:
-        pytest.skip("the task itself is interrupted")
     files = [str(tmp_path / name) for name in ("one", "two", "never begun")]
 
     def interrupt() -> None:

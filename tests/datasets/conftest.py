@@ -16,6 +16,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from lidarslam.datasets.registry import READERS
+
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
 LATENCY_NS = 37_000_123  # from the stamp of the header to the recording
@@ -287,6 +289,13 @@ def bag_kit(request: pytest.FixtureRequest, tmp_path: Path) -> BagKit:
 def ros2_kit(tmp_path: Path) -> BagKit:
     """A ROS 2 bag in MCAP, where the kind does not matter."""
     return BagKit("mcap", tmp_path)
+
+
+@pytest.fixture
+def uncorrected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """KITTI's scans as they lie on disk."""
+    for name in ("kitti-odometry", "kitti-raw"):
+        monkeypatch.setitem(READERS, name, READERS[name]._replace(elevation_deg=0.0))
 
 
 @pytest.fixture

@@ -9,17 +9,11 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.registry import READERS, choose_reader, open_recording
+from lidarslam.datasets.registry import choose_reader, open_recording
 
 # The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.
 AXES = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 T_CAM_LIDAR = AXES @ exp([0.01, -0.02, 0.015, 0.1, -0.05, -0.3])
-
-
-@pytest.fixture
-def uncorrected(monkeypatch):
-    """Scans as they lie on disk."""
-    monkeypatch.setitem(READERS, "kitti-odometry", READERS["kitti-odometry"]._replace(elevation_deg=0.0))
 
 
 def _truth(count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.registry import READERS, choose_reader, open_recording
+from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
 
@@ -20,12 +20,6 @@ T_CAM_LIDAR = make_transform([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 T_RECT_CAM = exp([0.004, -0.007, 0.01, 0.0, 0.0, 0.0])
 SPEED, TURN = 8.0, 0.2  # of the simulated car: m/s, rad/s
 MID_S, JITTER_S = 0.1037, 0.004
-
-
-@pytest.fixture
-def uncorrected(monkeypatch):
-    """Scans as they lie on disk."""
-    monkeypatch.setitem(READERS, "kitti-raw", READERS["kitti-raw"]._replace(elevation_deg=0.0))
 
 
 def _stamp_lines(seconds: np.ndarray) -> str:

@@ -259,12 +259,7 @@ def test_a_stamp_file_comes_first(tmp_path, rng, name, above):
     [
         (["a1", "a2", "a3"], "0.5\n0.75\n", [0.5, 0.75, 1.0], "2 stamps for 3 scans; those of the last 1 continue"),
         (["a1", "a2", "a3"], "0.5\n1.5\n2.5\n3.5\n", [0.5, 1.5, 2.5], "4 stamps for 3 scans; the first are taken."),
-        (
-            ["000001", "000003"],
-            "0.0\n0.1\n0.25\n0.35\n0.45\n",
-            [0.1, 0.35],
-            "5 stamps for 2 scans; each takes the line",
-        ),
+        (["000001", "000003"], "0.0\n0.1\n0.25\n0.35\n0.45\n", [0.1, 0.35], "5 stamps for 2 scans; each takes"),
     ],
     ids=["too few", "too many", "numbered scans"],
 )

@@ -1,11 +1,12 @@
-"""What is named in place of a recording, and what the error says about it."""
+"""What is named in place of a recording, or needs a library that is missing, and what the error says about it."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.registry import choose_reader, open_recording
 
 SYNC = "2011_09_26_drive_0005_sync"
@@ -107,3 +108,21 @@ def test_an_empty_bag(tmp_path: Path, suffix: str) -> None:
     write(tmp_path / f"drive{suffix}", content=b"")
     with pytest.raises(InputError, match="is empty, 0 bytes; copy the bag again"):
         open_recording(tmp_path / f"drive{suffix}")
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "remedy"),
+    [
+        ("drive.pcap", "velodyne_decoder", r"pip install 'lidarslam\[velodyne\]'"),
+        ("drive.osf", "ouster", "pip install --no-deps ouster-sdk"),
+    ],
+)
+def test_packets_without_the_library_that_decodes_them_say_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, remedy: str
+) -> None:
+    for loaded in [loaded for loaded in sys.modules if loaded.partition(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, module, None)
+    write(tmp_path / name, content=b"packets")
+    with pytest.raises(ConfigError, match=rf"{module} is not installed, which packets of an? \w+ need; {remedy}"):
+        open_recording(tmp_path / name)

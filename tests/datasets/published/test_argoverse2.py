@@ -60,23 +60,20 @@ def log(tmp_path: Path, rng: np.random.Generator) -> SimpleNamespace:
     return SimpleNamespace(folder=folder, clouds=clouds)
 
 
-def test_sweeps_are_in_the_frame_of_the_upper_lidar(log: SimpleNamespace) -> None:
+def test_sweeps_and_truth_are_in_the_frame_of_the_upper_lidar(log: SimpleNamespace) -> None:
     assert choose_reader(log.folder) == "argoverse-2"
     recording = open_recording(log.folder)
     assert (recording.name, len(recording)) == ("argoverse2_02678d04", 4)
-    for index, scan in enumerate(recording.scans()):
-        assert scan.stamp == pytest.approx((START_NS + index * PERIOD_NS) * 1e-9)
-        expected = transform_points(inverse(T_EGO_LIDAR), log.clouds[index].astype(np.float64))
+    stamps = (START_NS + np.arange(4) * PERIOD_NS) * 1e-9
+    for scan, stamp, cloud in zip(recording.scans(), stamps, log.clouds, strict=True):
+        assert scan.stamp == pytest.approx(stamp)
+        expected = transform_points(inverse(T_EGO_LIDAR), cloud.astype(np.float64))
         np.testing.assert_allclose(scan.points, expected, atol=1e-9)
         np.testing.assert_array_equal(scan.rings, np.arange(50) % 64)
         np.testing.assert_array_equal(scan.intensities, np.arange(50))
         assert scan.time_offsets is None
-
-
-def test_the_truth_is_of_the_same_frame(log: SimpleNamespace) -> None:
-    truth = open_recording(log.folder).ground_truth
+    truth = recording.ground_truth
     assert len(truth) == 45
-    stamps = (START_NS + np.arange(4) * PERIOD_NS) * 1e-9
     np.testing.assert_allclose(truth.at(stamps), _T_city_ego(np.arange(4)) @ T_EGO_LIDAR, atol=1e-6)
 
 

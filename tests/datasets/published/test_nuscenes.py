@@ -65,7 +65,7 @@ def nuscenes(tmp_path: Path, rng: np.random.Generator) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize("sequence", ["scene-0061", "61", "0061"])
-def test_samples_and_sweeps_of_a_scene(nuscenes: SimpleNamespace, sequence: str) -> None:
+def test_samples_and_sweeps_of_a_scene_and_the_truth_of_its_lidar(nuscenes: SimpleNamespace, sequence: str) -> None:
     assert choose_reader(nuscenes.root) == "nuscenes"
     recording = open_recording(nuscenes.root, ReaderConfig(sequence=sequence))
     assert (recording.name, len(recording)) == ("nuscenes_scene-0061", 6)
@@ -76,12 +76,8 @@ def test_samples_and_sweeps_of_a_scene(nuscenes: SimpleNamespace, sequence: str)
         np.testing.assert_array_equal(scan.intensities, cloud[:, 3])
         assert scan.time_offsets is None
         assert scan.stamp == pytest.approx((START_US + 61 * 10**9 + index * PERIOD_US) * 1e-6)
-
-
-def test_the_truth_is_of_the_lidar(nuscenes: SimpleNamespace) -> None:
-    truth = open_recording(nuscenes.root, ReaderConfig(sequence="61")).ground_truth
     expected = [_T_world_ego(index) @ T_EGO_LIDAR for index in range(6)]
-    np.testing.assert_allclose(truth.T_world_lidar, expected, atol=1e-9)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, expected, atol=1e-9)
 
 
 def test_the_scene_has_to_be_chosen(nuscenes: SimpleNamespace) -> None:
