@@ -53,7 +53,7 @@ def point_table(points: np.ndarray, **columns: np.ndarray) -> np.ndarray:
     return table
 
 
-def _layout(point_step, **fields):
+def _layout(point_step: int, **fields: tuple[str, int]) -> np.dtype:
     """A record type from `name=(type, offset)`."""
     kinds, offsets = zip(*fields.values(), strict=True)
     return np.dtype({"names": list(fields), "formats": kinds, "offsets": offsets, "itemsize": point_step})

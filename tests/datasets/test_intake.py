@@ -135,7 +135,7 @@ def test_a_driver_that_hangs_repeats_a_scan_which_counts_once(rng):
     assert said.endswith("the first: at 0.200000000")
 
 
-def spinning(times_sign=1.0, mirror=1.0):
+def spinning(times_sign: float = 1.0, mirror: float = 1.0) -> Scan:
     """A sweep of a VLP-16 in a round room, clockwise as seen from above, with the ground 1 m below the sensor."""
     azimuths, elevations = -np.deg2rad(np.arange(0.0, 360.0, 0.2)), np.deg2rad(np.arange(-15.0, 16.0, 2.0))
     azimuth, elevation = (grid.ravel() for grid in np.meshgrid(azimuths, elevations, indexing="ij"))
@@ -146,7 +146,7 @@ def spinning(times_sign=1.0, mirror=1.0):
     return Scan(points, 1.0, time_offsets=offsets, rings=np.tile(np.arange(16, dtype=np.int32), len(azimuths)))
 
 
-def strokes():
+def strokes() -> Scan:
     """Of a scanning mirror, which are no turn."""
     scan = spinning(mirror=-1.0)
     bent = scan.points + [0.0, 0.0, 2.0] * np.sin(9.0 * np.arctan2(scan.points[:, 1], scan.points[:, 0]))[:, None]

@@ -5,8 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.datasets.point_table import raw_cloud, read_colours, read_intensities
+from lidarslam.datasets.point_table import read_colours, read_intensities
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
@@ -137,11 +136,3 @@ def test_folders(tmp_path, suffix):
         assert scan.colours is None
     else:
         np.testing.assert_array_equal(scan.colours, RGB)
-
-
-def test_ply_of_cloud_compare(tmp_path):
-    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-    header += "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty float scalar_Intensity\n"
-    (tmp_path / "a.ply").write_text(header + "end_header\n1 2 3 10 20 30 0.5\n")
-    cloud = raw_cloud(read_ply(tmp_path / "a.ply"))
-    assert (cloud.intensities.tolist(), cloud.colours.tolist()) == ([0.5], [[10, 20, 30]])

@@ -1,16 +1,18 @@
 """Every driver's cloud comes out of its bytes as it went in."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.point_table import PointField
+from lidarslam.datasets.point_table import PointField, RawCloud
 from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
 from .conftest import STAMP_NS, point_table
 
 
-def assert_same(cloud, sweep):
+def assert_same(cloud: RawCloud, sweep: SimpleNamespace) -> None:
     np.testing.assert_array_equal(cloud.points, sweep.points)
     np.testing.assert_array_equal(cloud.rings, sweep.rings)
     np.testing.assert_array_equal(cloud.times, sweep.times)

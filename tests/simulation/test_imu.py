@@ -43,7 +43,7 @@ def integrate(imu, T_world_imu, velocity):
     [("handheld", "tilted"), ("tracked-harsh", "upright"), ("drone", "upside-down"), ("car", "tilted")],
 )
 def test_exact_samples_integrate_to_the_true_poses(carrier, mount, yard):
-    """Through the lever arm and the turned mounting, for 15 s."""
+    """Through the lever arm and the turned mounting, for 15 s; without gravity upwards at rest they would run away."""
     simulated = simulation(yard, carrier, mount)
     imu = simulated.imu
     assert len(imu) == 15 * 200 + 1
@@ -52,14 +52,6 @@ def test_exact_samples_integrate_to_the_true_poses(carrier, mount, yard):
     assert rotation_angle(inverse(true[-1]) @ found[-1]) < 1e-3
     assert np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.05
     assert np.linalg.norm(true[-1, :3, 3] - true[0, :3, 3]) > 2.0
-
-
-def test_at_rest_gravity_points_up(yard):
-    simulated = simulation(yard, mount="upright")
-    at_rest = simulated.imu.stamps < 0.3  # every lap begins with a rest of a second, less the smoothing
-    R_world_imu = (simulated.T_world_lidar_at(np.zeros(1)) @ simulated.imu.T_lidar_imu)[0, :3, :3]
-    in_world = simulated.imu.accelerations[at_rest] @ R_world_imu.T
-    np.testing.assert_allclose(in_world, np.broadcast_to([0.0, 0.0, GRAVITY], in_world.shape), atol=1e-4)
 
 
 @pytest.mark.parametrize("carrier", ["car-fast", "given"])

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import exp, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import choose_reader, open_recording
 
@@ -16,7 +17,7 @@ T_POSE_LIDAR = T_POSE_CAM @ inverse(T_LIDAR_CAM)
 FIRST = 3  # frames before have no pose, as the car stood still
 
 
-def T_world_lidar(time):
+def T_world_lidar(time: ArrayLike) -> FloatArray:
     """A car on a circle to the left, far from the origin of the world."""
     return exp([0.0, 0.0, 0.0, 800.0, 3900.0, 116.0]) @ exp(np.multiply.outer(time, [0.0, 0.0, TURN, SPEED, 0.0, 0.0]))
 
@@ -25,12 +26,12 @@ def row(T):
     return " ".join(f"{value:.10f}" for value in T[:3].ravel())
 
 
-def put_back(points, times):
+def put_back(points: FloatArray, times: FloatArray) -> FloatArray:
     """Points (N, 3) of the LiDAR in the world, each from the pose at its own time (N,)."""
     return transform_points(T_world_lidar(times), points[:, None])[:, 0]
 
 
-def _sweep(stamp):
+def _sweep(stamp: float) -> tuple[FloatArray, FloatArray]:
     """What a laser measures that turns clockwise from the rear, and where that is in the world."""
     azimuth = np.linspace(np.pi, -np.pi, 721)[:-1] - 1e-4
     points = np.column_stack([10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth), np.linspace(-2.0, 2.0, 720)])

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import exp, inverse
+from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import choose_reader, open_recording
@@ -12,8 +13,6 @@ from lidarslam.datasets.registry import choose_reader, open_recording
 FIRST_NS = 1_561_000_444_390_857_630
 PERIOD_NS = 99_778_780
 EAST, NORTH, SPEED, TURN = 353_067.5, 4_026_008.25, 9.0, 0.3  # UTM metres, m/s, rad/s
-
-
 POSE_TIMES = -0.05 + 0.01 * np.arange(60)  # seconds from the first scan on
 
 # On the roof, 1.7 m before the rear axle, facing backwards.
@@ -21,7 +20,7 @@ T_BASE_LIDAR = exp([0.0, 0.0, np.deg2rad(179.6654), 0.0, 0.0, 0.0])
 T_BASE_LIDAR[:3, 3] = [1.7042, -0.021, 1.8047]
 
 
-def T_utm_base(time):
+def T_utm_base(time: ArrayLike) -> FloatArray:
     """A car on a circle to the left."""
     return exp([0.0, 0.0, 0.0, EAST, NORTH, 25.5]) @ exp(np.multiply.outer(time, [0.0, 0.0, TURN, SPEED, 0.0, 0.0]))
 
