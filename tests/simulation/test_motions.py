@@ -32,18 +32,16 @@ def motion(request, yard):
 
 
 @pytest.fixture(scope="module")
-def poses(motion):
-    """Times and poses of a lap and a bit more."""
-    times = np.arange(0.0, motion.duration_s + 5.0, STEP_S)
-    return times, motion.pose_at(times)
+def T(motion):
+    """Poses of a lap and a bit more."""
+    return motion.pose_at(np.arange(0.0, motion.duration_s + 5.0, STEP_S))
 
 
 def yaw_of(T):
     return np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
 
 
-def test_limits_are_physical(motion, poses):
-    _, T = poses
+def test_limits_are_physical(motion, T):
     acceleration = np.gradient(np.gradient(T[:, :3, 3], STEP_S, axis=0), STEP_S, axis=0)
     along, across, up, rate, angular = LIMITS[motion.name]
     assert is_rigid(T)
@@ -66,8 +64,7 @@ def test_laps_come_round_exactly(motion):
     assert np.linalg.norm(quarter[0, :3, 3] - quarter[1, :3, 3]) < sway
 
 
-def test_stays_within_the_free_side(motion, poses, yard):
-    _, T = poses
+def test_stays_within_the_free_side(motion, T, yard):
     a = yard.route.waypoints[:, :2]
     legs = np.roll(a, -1, axis=0) - a
     offsets = T[::20, None, :2, 3] - a
@@ -76,8 +73,7 @@ def test_stays_within_the_free_side(motion, poses, yard):
     assert away.max() < yard.route.free_side_m - CARRIERS[motion.name].half_width_m + 0.15
 
 
-def test_follows_the_ground(motion, poses, yard):
-    _, T = poses
+def test_follows_the_ground(motion, T, yard):
     above = T[::20, 2, 3] - yard.ground_at(T[::20, :2, 3])
     if CARRIERS[motion.name].banks:
         assert 1.4 < above.min() < above.max() < 2.6
