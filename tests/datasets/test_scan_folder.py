@@ -274,10 +274,10 @@ def test_stamps_of_another_number_than_the_scans_are_a_warning(tmp_path, rng, na
 
 def test_stamp_file_formats(tmp_path):
     numbers = "1311868164.36\n1311868164460000000\n1311868164560000\n"
-    (tmp_path / "times.txt").write_text(f"# stamps\n{numbers}\n2011-07-28 15:49:24.660000000")
+    (tmp_path / "times.txt").write_text(f"# stamps\n{numbers}\n2011-07-28 15:49:24.6600000000000000000000")
     expected = [1311868164.36, 1311868164.46, 1311868164.56, np.nan, 1311868164.66]
     np.testing.assert_allclose(read_stamps(tmp_path / "times.txt"), expected, rtol=0.0, atol=3e-7)
-    for wrong in ("0.1 0.2", "nan", "inf", "soon", "2011-99-28 15:49:24.66"):
+    for wrong in ("0.1 0.2", "nan", "inf", "soon", "2011-99-28 15:49:24.66", "9999-07-28 15:49:24.66"):
         (tmp_path / "times.txt").write_text(f"0.0\n{wrong}\n")
         with pytest.raises(InputError, match="at line 2"):
             read_stamps(tmp_path / "times.txt")

@@ -20,7 +20,8 @@ from lidarslam.datasets.faults import Faults
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
 # Larger numbers, thousands of years, are not in seconds, and float64 would lose their nanoseconds.
 _LATEST_S = 1e11
-_DATE = re.compile(r"(\d{4}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2}(?:\.\d*)?)Z?", re.ASCII)
+# In other centuries NumPy's nanoseconds wrap around.
+_DATE = re.compile(r"((?:19|20)\d{2}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2})(\.\d*)?Z?", re.ASCII)
 _SECONDS_NAME = re.compile(r"\d+\.\d+")
 _INTEGER_NAME = re.compile(r"\d{12,19}")
 _SECONDS_NANOSECONDS_NAME = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})")
@@ -57,7 +58,8 @@ def read_stamps(path: Path) -> FloatArray:
 
 def _parse_stamp(text: str) -> float:
     if match := _DATE.fullmatch(text):
-        return float(np.datetime64(f"{match[1]}T{match[2]}", "ns").astype(np.int64)) * 1e-9
+        nanoseconds = (match[3] or "")[:10]
+        return float(np.datetime64(f"{match[1]}T{match[2]}{nanoseconds}", "ns").astype(np.int64)) * 1e-9
     seconds = _clock_seconds(int(text)) if text.isdecimal() else None
     if seconds is None:
         seconds = float(text)
