@@ -271,9 +271,10 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     source, out = tmp_path / "room", tmp_path / "run"
     source.mkdir()
     points: FloatArray = room_scans[0].points  # type: ignore[attr-defined]
-    np.save(source / "000000.npy", points)
-    for index in range(1, 3_000):
-        os.link(source / "000000.npy", source / f"{index:06d}.npy")
+    for index in range(2):  # a scan with the points of the one before would be left out
+        np.save(source / f"{index:06d}.npy", points[index:])
+    for index in range(2, 3_000):
+        os.link(source / f"{index % 2:06d}.npy", source / f"{index:06d}.npy")
     often = ["--set", "checkpoints.every_scans=5"]
     command = [sys.executable, "-m", "lidarslam", "run", str(source), "--out", str(out), *FAST, *often]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -288,7 +289,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
     summary = summary_of(out)
     assert 0 < summary["scans"] < 3_000
-    assert summary["warnings"][0].startswith(f"stopped after {summary['scans']} scans")
+    assert any(line.startswith(f"stopped after {summary['scans']} scans") for line in summary["warnings"])
     assert len(read_tum(out / "trajectory.tum")) == summary["scans"]
 
 
