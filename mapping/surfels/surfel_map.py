@@ -23,7 +23,7 @@ from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 # only when its points differ so much in height across the rings.
 _LEAST_HEIGHT_M = 0.05
 # The plane that one ring draws as the sensor advances is tilted by the errors of its attitude, and confirms them. It
-# counts up to this distance, in widths (standard deviation) of its points, at which 0.1 degrees tilt it by 0.2.
+# counts up to this distance along it, in widths (standard deviation) of its points: 0.1 degrees tilt it by 0.2 there.
 _RING_WIDTHS = 114.0
 _FEWEST_POINTS = 6
 # The plane of a surfel is as uncertain as if this many of its points counted as one: neighbours share their errors.
@@ -70,7 +70,7 @@ def match_planes(
             distance = math.sqrt(x * x + y * y + z * z)
             along = x * p[3] + y * p[4] + z * p[5]
             faced, behind = is_steep(-along, distance), is_steep(along, distance)
-            faced = faced and (p[12] < 0.0 or distance < _RING_WIDTHS * p[10])
+            faced = faced and (p[12] < 0.0 or distance * distance - along * along < (_RING_WIDTHS * p[10]) ** 2)
             if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
                 spread = p[9] * math.sqrt(p[13] / (p[13] - 3.0))  # three points make the plane
