@@ -18,7 +18,7 @@ test: install
 
 # Those that take more than a few seconds.
 test-long: install
-	@echo "running the long tests: about 7 minutes on two cores"
+	@echo "running the long tests: some 12 minutes on two cores"
 	$(PYTEST) -m "long and not slow"
 
 # All of them, the slow ones on recordings where they are at hand.
