@@ -69,8 +69,8 @@ def match_planes(
             x, y, z = points[n, 0] - sensor[0], points[n, 1] - sensor[1], points[n, 2] - sensor[2]
             distance = math.sqrt(x * x + y * y + z * z)
             along = x * p[3] + y * p[4] + z * p[5]
-            faced, behind = is_steep(-along, distance), is_steep(along, distance)
-            faced = faced and (p[12] < 0.0 or distance * distance - along * along < (_RING_WIDTHS * p[10]) ** 2)
+            is_near = p[12] < 0.0 or distance * distance - along * along < (_RING_WIDTHS * p[10]) ** 2
+            faced, behind = is_near and is_steep(-along, distance), is_steep(along, distance)
             if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
                 spread = p[9] * math.sqrt(p[13] / (p[13] - 3.0))  # three points make the plane
