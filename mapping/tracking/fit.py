@@ -46,7 +46,7 @@ class Fit:
     # noise of their normals; None where that noise is unknown, or there are none.
     evidence: float | None = None
     weakest: tuple[float, float, float] | None = None  # that direction, unit, in the world
-    unsupported: tuple[float, float, float] | None = None  # direction of too little support, unit, in the world
+    unsupported: tuple[float, float, float] | None = None  # direction of the least support if that is too low
 
     @classmethod
     def of(

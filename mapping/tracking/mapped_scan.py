@@ -65,9 +65,10 @@ class Attempt:
 
     @cached_property
     def unconstrained(self) -> tuple[str, ...]:
-        """Names of the LiDAR frame's axes that nothing, or no more than the noise of normals, constrains.
+        """Names of the LiDAR frame's axes along which the registration is unconstrained.
 
-        Where few of the points that constrain a direction fit, or a rival fits as well, that axis, too.
+        Nothing, or no more than the noise of normals, constrains them; fewer than half of the points that do fit; or
+        another pose along them fits nearly as well.
         """
         names = set() if self.registration is None else set(self.registration.degeneracy.names)
         weakest = None if self.fit.is_constrained else self.fit.weakest

@@ -20,7 +20,7 @@ from lidarslam.datasets.faults import Faults
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
 # Larger numbers, thousands of years, are not in seconds, and float64 would lose their nanoseconds.
 _LATEST_S = 1e11
-# In other centuries NumPy's nanoseconds wrap around.
+# Nanoseconds since 1970 overflow 64 bits in the years 1677 and 2262.
 _DATE = re.compile(r"((?:19|20)\d{2}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2})(\.\d*)?Z?", re.ASCII)
 _SECONDS_NAME = re.compile(r"\d+\.\d+")
 _INTEGER_NAME = re.compile(r"\d{12,19}")
