@@ -23,7 +23,7 @@ from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 # only when its points differ so much in height across the rings.
 _LEAST_HEIGHT_M = 0.05
 # A plane swept by a single ring as the sensor moves is tilted by attitude errors between scans, which it then confirms.
-# It counts up to this distance along the plane, in standard deviations of its points' width: 0.1 deg tilt it by 0.2 rad.
+# It counts up to this distance along the plane, in standard deviations of its width: 0.1 degrees tilt it by 0.2 rad.
 _RING_WIDTHS = 114.0
 _FEWEST_POINTS = 6
 # The plane of a surfel is as uncertain as if this many of its points counted as one: neighbours share their errors.
