@@ -22,9 +22,8 @@ _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
 _LATEST_S = 1e11
 # Nanoseconds since 1970 overflow 64 bits in the years 1677 and 2262.
 _DATE = re.compile(r"((?:19|20)\d{2}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2})(\.\d*)?Z?", re.ASCII)
-_SECONDS_NAME = re.compile(r"\d+\.\d+")
-_INTEGER_NAME = re.compile(r"\d{12,19}")
-_SECONDS_NANOSECONDS_NAME = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})")
+_SECONDS_NAME = re.compile(r"(.*\D)?(\d+)([._])(\d+)")
+_INTEGER_NAME = re.compile(r"(?:.*\D)?(\d{12,19})")
 T = TypeVar("T")
 # A stamp this far ahead of the one before may be an outlier; this many scans, with it, decide.
 _DOUBTFUL_STEP_S, _LOOKED_AT = 1.0, 6
@@ -80,21 +79,35 @@ def stamps_from_names(stems: Sequence[str]) -> FloatArray | None:
     """Stamps (N,) in seconds that the file names themselves are, or None when any name is none.
 
     Understood are seconds with decimals (1311868164.36), integer clock readings in milli-, micro- or nanoseconds
-    (1311868164360000000), and seconds and nanoseconds with an underscore between (cloud_1583836591_182590976).
+    (1311868164360000000), and seconds and nanoseconds with an underscore or a point between
+    (cloud_1583836591_182590976); text before readings of a clock since 1970 is left out.
     """
-    stamps = np.array([_stamp_from_name(stem) for stem in stems], dtype=np.float64)
+    parts = [_SECONDS_NAME.fullmatch(stem) for stem in stems]
+    in_ns = _count_nanoseconds([match[3] + match[4] for match in parts if match])
+    stamps = np.array([_stamp_from_name(stem, in_ns) for stem in stems], dtype=np.float64)
     return None if np.isnan(stamps).any() else stamps
 
 
-def _stamp_from_name(stem: str) -> float:
-    if _SECONDS_NAME.fullmatch(stem):
-        return seconds if (seconds := float(stem)) < _LATEST_S else np.nan
-    if _INTEGER_NAME.fullmatch(stem):
-        return _clock_seconds(int(stem)) or np.nan
-    match = _SECONDS_NANOSECONDS_NAME.fullmatch(stem)
-    if match and _EPOCH_1990_S <= int(match[1]) < _EPOCH_2100_S:
-        return int(match[1]) + int(match[2]) * 1e-9
-    return np.nan
+def _count_nanoseconds(fractions: Sequence[str]) -> bool:
+    """Whether the digits behind seconds are counts of nanoseconds, rather than decimals.
+
+    Decimals have as many digits in every name, or do not end in zeros, which are left out; behind an underscore they
+    are not left out.
+    """
+    widths = {len(fraction) for fraction in fractions}
+    ends = any(fraction[0] == "_" or (fraction[-1] == "0" and len(fraction) > 2) for fraction in fractions)
+    return len(widths) > 1 and max(widths) <= 10 and ends
+
+
+def _stamp_from_name(stem: str, in_ns: bool) -> float:
+    match = _SECONDS_NAME.fullmatch(stem)
+    if match and (match[3] == "." or len(match[4]) <= 9):
+        seconds = int(match[2]) + 1e-9 * int(match[4]) if in_ns else float(f"{match[2]}.{match[4]}")
+        is_clock = _EPOCH_1990_S <= seconds < _EPOCH_2100_S
+        if is_clock or (seconds < _LATEST_S and match[3] == "." and not match[1]):
+            return seconds
+    match = _INTEGER_NAME.fullmatch(stem)
+    return (_clock_seconds(int(match[1])) if match else None) or np.nan
 
 
 def increasing_rows(stamps: FloatArray) -> FloatArray:
