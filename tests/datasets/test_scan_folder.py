@@ -213,6 +213,10 @@ def test_names_are_sorted_as_people_count(tmp_path, rng):
         (["1311868164360000000.bin", "1311868164460000000.bin"], [1311868164.36, 1311868164.46]),
         (["1311868164360000.npy", "1311868164460000.npy"], [1311868164.36, 1311868164.46]),
         (["cloud_1583836591_82590976.pcd", "cloud_1583836591_182590976.pcd"], [1583836591.082591, 1583836591.182591]),
+        (["1583836591.90000000.pcd", "1583836591.190000000.pcd"], [1583836591.09, 1583836591.19]),
+        (["1583836591_082590.pcd", "1583836591_182590.pcd"], [1583836591.08259, 1583836591.18259]),
+        (["1_1583836591182590976.pcd", "2_1583836591282590976.pcd"], [1583836591.182591, 1583836591.282591]),
+        (["scan_1583836591.25.pcd", "scan_1583836591.3.pcd"], [1583836591.25, 1583836591.3]),
     ],
 )
 def test_stamps_from_names(tmp_path, rng, names, stamps):
@@ -223,7 +227,9 @@ def test_stamps_from_names(tmp_path, rng, names, stamps):
     assert "The stamps are the file names." in recording.describe().notes
 
 
-@pytest.mark.parametrize("stems", [["000000", "000001"], ["20240131120000", "20240131120001"], ["a1.5", "a2.5"]])
+@pytest.mark.parametrize(
+    "stems", [["000000", "000001"], ["20240131120000", "20240131120001"], ["a1.5", "a2.5"], ["a_1_5", "a_1_6"]]
+)
 def test_names_that_are_no_stamps(stems):
     assert stamps_from_names(stems) is None
 
@@ -327,6 +333,20 @@ def test_bin_with_other_numbers_of_columns(tmp_path, rng):
         (tmp_path / "0.bin").write_bytes(content)
         with pytest.raises(InputError, match=told):
             open_recording(tmp_path)
+
+
+@pytest.mark.parametrize(("columns", "kind"), [(5, "f4"), (6, "f4"), (8, "f4"), (3, "f8"), (4, "f8")])
+def test_bin_of_another_layout_is_refused_by_its_values(tmp_path, columns, kind):
+    """Sizes fit: 480 points of six numbers are 960 of three. A room whose points are in the order of one turn."""
+    azimuth = np.linspace(-np.pi, np.pi, 480)
+    rings = np.arange(480) % 16
+    further = np.column_stack([np.full(480, 90.0), np.linspace(0.0, 0.1, 480), rings, *np.zeros((2, 480))])
+    table = np.column_stack([8.3 * np.cos(azimuth), 6.1 * np.sin(azimuth), np.full(480, -1.7), further])
+    table[:, :columns].astype(kind).tofile(tmp_path / "0.bin")
+    with pytest.raises(InputError, match=f"{columns} numbers of float{'32' if kind == 'f4' else '64'}"):
+        open_recording(tmp_path)
+    table[:, :3].astype("f4").tofile(tmp_path / "0.bin")  # by its size it may be 360 points of four, too
+    assert _sizes(open_recording(tmp_path)) == [480]
 
 
 def test_organised_and_plain_npy(tmp_path, rng):

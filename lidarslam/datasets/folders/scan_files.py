@@ -3,6 +3,7 @@
 import re
 import stat
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import cast
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import read_array
+from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.recording import KITTI_FIELDS
 
 # No sweep is larger; reading more would fill the memory.
@@ -25,6 +27,10 @@ TableReader = Callable[[Path], NDArray[np.void]]
 # Fields of the float32 numbers of a .bin point, by their number; in the order of preference.
 _BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
 _MOST_RINGS = 256
+# Numbers of values per point that are compared, bytes of a file that they are compared in, and the fewest numbers; how
+# many times as often values have to repeat after another number of them, or as float64, for the file to be of that.
+_COLUMNS, _COMPARED_BYTES, _FEWEST_NUMBERS = range(3, 9), 1 << 20, 1000
+_MORE_OFTEN = {"float32": 3.0, "float64": 1.5}
 _WIDEST_ARRAY = 16
 # Bytes; no format has larger points.
 _WIDEST_POINT = 1 << 16
@@ -132,19 +138,44 @@ def _bin_columns(files: Sequence[Path]) -> int:
     """The number of values per point, by the sizes of most files, since the file itself does not state it.
 
     Four fit almost always where they are right; five, as nuScenes has them, only count where the fifth number is a
-    small integer in every point.
+    small integer in every point. InputError where the values repeat after another number of them.
     """
     sizes = np.array([path.stat().st_size if path.exists() else 0 for path in files])
     fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in _BIN_FIELDS}
     if fits[5] and not _fifth_is_ring(files[int(np.argmax(sizes * (sizes % 20 == 0)))]):
         fits[5] = 0
-    columns = max(fits, key=lambda columns: fits[columns])
+    repeats = _repeats(files[int(np.argmax(sizes))])
+    columns = max(fits, key=lambda columns: (fits[columns], repeats["float32", columns]))
     if not fits[columns]:
         raise InputError(
             f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 bytes, or of 20 bytes"
             f" with a ring, got {sizes[0]} bytes, which fit none; copy it again, or convert the scans to .npy or .ply"
         )
+    known = repeats["float32", columns]
+    if better := {way: share for way, share in repeats.items() if share > _MORE_OFTEN[way[0]] * known}:
+        kind, other = max(better, key=lambda way: better[way])
+        raise InputError(
+            f"{files[0].parent}: expected .bin scans with float32 points of x, y, z, intensity; by their values they"
+            f" hold {other} numbers of {kind} for each point: convert the scans to .npy or .ply"
+        )
     return columns
+
+
+def _repeats(path: Path) -> dict[tuple[str, int], float]:
+    """How often a number is about the same as that so many further on, by their type: most often in the next point."""
+    data = np.frombuffer(b"", np.uint8)
+    with suppress(InputError):  # it is counted when it is its turn
+        data = np.frombuffer(read_bytes(path)[:_COMPARED_BYTES], np.uint8)
+    numbers = {kind: data[: len(data) // 8 * 8].view(kind).astype(np.float64) for kind in _MORE_OFTEN}
+    return {(kind, columns): _share_alike(numbers[kind], columns) for kind in _MORE_OFTEN for columns in _COLUMNS}
+
+
+def _share_alike(numbers: FloatArray, distance: int) -> float:
+    if len(numbers) < _FEWEST_NUMBERS:
+        return 0.0
+    one, other = numbers[:-distance], numbers[distance:]
+    with np.errstate(invalid="ignore", over="ignore"):  # of another type they may be any numbers
+        return float(np.mean(np.abs(one - other) <= 0.5 * np.maximum(np.abs(one), np.abs(other))))
 
 
 def _fifth_is_ring(path: Path) -> bool:
