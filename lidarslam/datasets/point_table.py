@@ -10,12 +10,13 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 
-# In the order of preference; compared without regard to case. CloudCompare writes scalar_Intensity.
+# In the order of preference; compared without regard to case, and to the prefix of CloudCompare's scalar_Intensity.
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "stamps", "offset_time", "time_offset", "time_stamp")
 _RINGS = ("ring", "channel", "line", "laser_id", "laser", "ring_id", "beam_id", "beam")
 _INTENSITIES = (
-    "intensity", "intensities", "scalar_intensity", "reflectivity", "reflectance", "remission", "remissions", "i",
+    "intensity", "intensities", "reflectivity", "reflectance", "remission", "remissions", "i",
 )  # fmt: skip
+_PREFIX = "scalar_"
 _COLOUR_CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))
 # One number with the bytes 0xAARRGGBB, often kept as a float32 with the same bits.
 _PACKED_COLOURS = ("rgb", "rgba")
@@ -94,19 +95,20 @@ def find_time_field(names: Sequence[str], wanted: str | None = None) -> str | No
 
 
 def _first(names: Sequence[str], wanted: Sequence[str]) -> str | None:
-    present = {name.lower(): name for name in reversed(names)}
+    present = {name.lower().removeprefix(_PREFIX): name for name in reversed(names)}
     return next((present[name] for name in wanted if name in present), None)
 
 
 def coordinates(table: NDArray[np.void]) -> FloatArray:
     """The fields x, y and z of a table (...) as (N, 3) float64; ValueError where one is missing or no number."""
-    names = scalar_fields(table)
-    if not {"x", "y", "z"} <= set(names):
-        raise ValueError(f"expected the point fields x, y and z, each one number, got {', '.join(names)}")
+    present = {name.lower(): name for name in reversed(scalar_fields(table))}
+    if not {"x", "y", "z"} <= set(present):
+        names = ", ".join(scalar_fields(table))
+        raise ValueError(f"expected the point fields x, y and z, each one number, got {names}")
     points = np.empty((*table.shape, 3))
     with np.errstate(invalid="ignore", over="ignore"):  # damaged bytes may be signalling NaN
         for column, name in enumerate("xyz"):
-            points[..., column] = table[name]
+            points[..., column] = table[present[name]]
     return points.reshape(-1, 3)
 
 

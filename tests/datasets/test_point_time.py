@@ -216,18 +216,32 @@ def test_another_clock_starts_at_the_earliest_point():
     assert offsets[0] == pytest.approx(0.1, abs=3e-7)
 
 
-@pytest.mark.parametrize("names", [*([name] for name in TIME_FIELDS), ["T"], ["t", "timestamp"], ["t", "range"]])
+@pytest.mark.parametrize("names", [*([name] for name in TIME_FIELDS), ["T"], ["t", "timestamp"], ["t", "range"], ["scalar_Time"]])
 def test_time_fields_are_found(names):
     table = np.zeros(3, [(name, "f4") for name in ("x", "y", "z", *reversed(names))])
     assert raw_cloud(table).time_field == names[0]
     assert raw_cloud(table, "z").time_field == "z"
 
 
-@pytest.mark.parametrize("name", ["ring", "channel", "line", "laser_id", "range"])
+@pytest.mark.parametrize("name", ["ring", "channel", "line", "laser_id", "range", "scalar_ring"])
 def test_ring_fields_are_found(name):
     cloud = raw_cloud(np.zeros(3, [(name, "f4") for name in ("x", "y", "z", name)]))
     assert (cloud.rings is None) == (name == "range")
     assert cloud.time_field is None
+
+
+def test_coordinates_are_found_by_names_in_upper_case():
+    cloud = raw_cloud(np.array([(1.0, 2.0, 3.0)], [(name, "f4") for name in "XYZ"]))
+    assert cloud.points.tolist() == [[1.0, 2.0, 3.0]]
+
+
+@pytest.mark.parametrize("reference", ["auto", "none"])
+def test_a_field_of_an_unknown_name_that_may_be_the_time_is_said(reference):
+    cloud = raw_cloud(np.zeros(3, [(name, "f4") for name in ("x", "y", "z", "ring", "relative_time")]))
+    model, warning = learn_point_time([(cloud, STAMP)], reference=reference)
+    assert model is None
+    assert (warning is None) == (reference == "none")
+    assert warning is None or "reader.time_field=relative_time" in warning
 
 
 @pytest.mark.filterwarnings("error")

@@ -134,6 +134,8 @@ def learn_point_time(
         found = LearnedTime()
         if cloud.time_field is not None and values is not None:
             found = infer_point_time(cloud.time_field, values, stamp, unit, reference, period_s, defined_unit)
+        elif reference not in ("none", "azimuth"):
+            found = LearnedTime(None, _unknown_field(cloud))
         learned = found if found.model is not None or learned == LearnedTime() else learned
         failures += found.model is None
         is_clear = stamp is None or abs(stamp) > 2 * CLOCK_LIMIT_S
@@ -144,6 +146,12 @@ def learn_point_time(
     else:
         logger.info("time of a point: field %r in %s, %s", model.field, model.unit, model.reference)
     return learned
+
+
+def _unknown_field(cloud: RawCloud) -> str | None:
+    name = next((field.name for field in cloud.fields if "time" in field.name.lower()), None)
+    may_be = f"{name!r} may be one, which --set reader.time_field={name} reads"
+    return None if name is None else f"The points have no time field of a known name; {may_be}"
 
 
 def infer_point_time(
