@@ -216,7 +216,9 @@ def test_another_clock_starts_at_the_earliest_point():
     assert offsets[0] == pytest.approx(0.1, abs=3e-7)
 
 
-@pytest.mark.parametrize("names", [*([name] for name in TIME_FIELDS), ["T"], ["t", "timestamp"], ["t", "range"], ["scalar_Time"]])
+@pytest.mark.parametrize(
+    "names", [*([name] for name in TIME_FIELDS), ["T"], ["t", "timestamp"], ["t", "range"], ["scalar_Time"]]
+)
 def test_time_fields_are_found(names):
     table = np.zeros(3, [(name, "f4") for name in ("x", "y", "z", *reversed(names))])
     assert raw_cloud(table).time_field == names[0]

@@ -25,6 +25,8 @@ from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stam
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 # Pairs of consecutive scans that are compared at their seams, spread over the recording.
 _PAIRS = 40
+# Scans that are farther apart may be stamped in another unit.
+_LOWEST_RATE_HZ = 0.1
 
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
@@ -76,6 +78,11 @@ def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, lis
     if replaced > left:
         warnings.append(
             f"{count(replaced - left, 'stamp')} of {path.name} interpolated: repeated, backwards or far ahead."
+        )
+    if (rate_hz := scan_rate(mended)) is not None and rate_hz < _LOWEST_RATE_HZ:
+        warnings.append(
+            f"The stamps of {path.name} are {1.0 / rate_hz:,.6g} s apart, as no LiDAR's are: expected are seconds, or"
+            " milli-, micro- or nanoseconds since 1970."
         )
     return mended, warnings
 
