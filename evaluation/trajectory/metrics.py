@@ -27,6 +27,8 @@ _UNRELATED_SHARE = 0.15
 _NEGLIGIBLE_M = 0.05
 # Ratio of the spreads of one drive in two units, of which metres and millimetres are the likeliest.
 _OTHER_UNIT = 20.0
+# Orientations of one sensor differ by less, unless tracking was lost, when the positions differ, too.
+_OTHER_FRAME_DEG = 45.0
 
 
 @dataclass(frozen=True)
@@ -193,12 +195,12 @@ def disagreement(metrics: TrajectoryMetrics) -> str | None:
     """Warning that the two trajectories are not of one drive, so that their errors mean nothing; None if they agree.
 
     They agree while the ATE is a small part of the reference's spread, the root mean square distance of its positions
-    from their mean.
+    from their mean, and the orientations differ by far less than a right angle.
     """
     spread_m, own_spread_m = _spread_m(metrics.association.reference), _spread_m(metrics.association.estimate)
     error_m = metrics.errors.ate_rmse_m
     if error_m <= max(_UNRELATED_SHARE * spread_m, _NEGLIGIBLE_M):
-        return None
+        return _other_frame(metrics.errors.ate_rotation_rmse_deg)
     message = (
         f"the trajectory does not follow its reference: the ATE is {error_m:.3g} m, the spread of the reference"
         f" {spread_m:.3g} m; it is {metrics.association.estimate.length_m:.3g} m long, the reference"
@@ -207,6 +209,15 @@ def disagreement(metrics: TrajectoryMetrics) -> str | None:
     if min(spread_m, own_spread_m) > 0.0 and max(spread_m / own_spread_m, own_spread_m / spread_m) > _OTHER_UNIT:
         return f"{message}; are both in metres?"
     return f"{message}; it drifts, tracking was lost, or the reference belongs to another recording or sensor"
+
+
+def _other_frame(angle_deg: float) -> str | None:
+    if angle_deg < _OTHER_FRAME_DEG:
+        return None
+    return (
+        f"the positions follow the reference, but the orientations differ by {angle_deg:.3g} deg: the reference is of"
+        " another frame than the LiDAR's, such as a camera's, or its quaternions begin with qw, which ends TUM's"
+    )
 
 
 def _spread_m(trajectory: Trajectory) -> float:

@@ -8,6 +8,7 @@ import pytest
 from evo.core.metrics import APE, RPE, PoseRelation
 from evo.core.trajectory import PoseTrajectory3D
 from kiss_icp.metrics import sequence_error
+from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses
@@ -187,3 +188,15 @@ def test_of_two_drives(bend: FloatArray, rng: np.random.Generator, kind: str) ->
     assert said is not None
     assert "does not follow its reference" in said
     assert words in said
+
+
+def test_quaternions_in_another_order_and_orientations_of_a_camera(random_drive) -> None:
+    reference = random_drive(3)
+    quaternions = Rotation.from_matrix(reference.T_world_lidar[:, :3, :3]).as_quat()
+    forward, other = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), reference.T_world_lidar.copy()
+    for R in (Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix(), other[:, :3, :3] @ forward.T):
+        other[:, :3, :3] = R
+        said = disagreement(evaluate_trajectory(reference, Trajectory(reference.stamps, other)))
+        assert said is not None
+        assert "begin with qw" in said
+    assert disagreement(evaluate_trajectory(reference, reference)) is None
