@@ -70,8 +70,9 @@ class Reader(NamedTuple):
 
 def _is_rosbag(source: Path) -> bool:
     if source.is_dir():
-        files = (entry for entry in source.iterdir() if entry.suffix in _BAG_SUFFIXES and entry.is_file())
-        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or any(files)
+        named = (entry for entry in source.iterdir() if entry.suffix in _BAG_SUFFIXES and entry.name[0] != ".")
+        is_bag = any(entry.is_file() for entry in named)
+        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or is_bag
     return source.suffix in (".bag", *_BAG_SUFFIXES) or source.name.endswith(".bag.active")
 
 
@@ -236,6 +237,8 @@ def absent(source: Path) -> str:
         return f"{source}: is an address; download the recording and name the file"
     if (missing_data_set := evalio.absent(source)) is not None:
         return missing_data_set
+    if source.is_symlink():
+        return f"{source}: is a link to {source.readlink()}, which is not there"
     parent = source.parent
     while not parent.is_dir() and parent != parent.parent:
         parent = parent.parent

@@ -4,6 +4,7 @@ import bz2
 import itertools
 import shutil
 from bz2 import BZ2Decompressor
+from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -126,6 +127,7 @@ def test_a_folder_without_usable_metadata_is_its_file(write_drive, kind, content
     (folder / "metadata.yaml").unlink()
     if content is not None:
         (folder / "metadata.yaml").write_bytes(content)
+    (folder / f"._{file.name}").write_bytes(b"-")  # macOS keeps attributes there
     recording = open_recording(folder)
     assert_first_scans(recording, points, 6)
     assert "metadata.yaml is missing or damaged, so drive" in recording.warnings[0]
@@ -351,8 +353,24 @@ def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_wh
         open_recording(folder if is_whole else file)
 
 
-def test_an_mcap_of_another_name_is_told(write_drive, tmp_path):
-    file, _, _ = write_drive("mcap")
-    renamed = shutil.copy(file, tmp_path / "drive.bag")
-    with pytest.raises(InputError, match=r"is an MCAP file, by its first bytes; name it drive\.mcap"):
+@pytest.mark.parametrize(("kind", "other"), [("mcap", "bag"), ("bag", "mcap")])
+def test_a_bag_of_another_name_is_told(write_drive, tmp_path, kind, other):
+    file, _, _ = write_drive(kind)
+    renamed = shutil.copy(file, tmp_path / f"renamed.{other}")
+    with pytest.raises(InputError, match=rf"by its first bytes; name it renamed\.{kind}"):
         open_recording(renamed)
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_messages_that_were_left_in_the_log_of_a_database_are_told(write_drive, is_whole):
+    """A recorder that was killed leaves them there; there may be no others."""
+    file, folder, points = write_drive("db3")
+    Path(f"{file}-wal").write_bytes(b"-")
+    recording = open_recording(folder if is_whole else file)
+    assert_first_scans(recording, points, 6)
+    assert "PRAGMA wal_checkpoint" in recording.warnings[0]
+    (folder / "metadata.yaml").unlink()
+    execute(file, "DELETE FROM messages")
+    Path(f"{file}-wal").write_bytes(b"-")
+    with pytest.raises(InputError, match="PRAGMA wal_checkpoint"):
+        open_recording(folder if is_whole else file)

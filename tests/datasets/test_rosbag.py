@@ -233,6 +233,15 @@ def test_bag_of_raw_packets(ros2_kit):
         open_recording(ros2_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_packets))
 
 
+def test_clouds_of_ros1_in_a_bag_of_ros2(ros2_kit):
+    def add_clouds(writer):
+        connection = writer.add_connection("/points", "sensor_msgs/PointCloud2", msgdef="uint8 a", rihs01="0")
+        writer.write(connection, STAMP_NS, b"\0\1\0\0\0")
+
+    with pytest.raises(InputError, match=r"those of ROS 1.*give the one it was converted from"):
+        open_recording(ros2_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_clouds))
+
+
 def test_empty_bag(bag_kit):
     with pytest.raises(InputError, match="the bag is empty"):
         open_recording(bag_kit.write({}))

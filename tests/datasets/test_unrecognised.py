@@ -99,6 +99,8 @@ def test_a_name_that_is_misspelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     said = refused(tmp_path / "recording" / "office")
     assert f"there is no {tmp_path / 'recording'}; did you mean {tmp_path / 'recordings'}?" in said
     assert "is an address; download" in refused(Path("https://example.org/a.bag"))
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    assert refused(tmp_path / "link").endswith(f"link to {tmp_path / 'gone'}, which is not there")
     monkeypatch.chdir(tmp_path)
     assert refused(Path("record")).startswith("record: no such file or folder; did you mean recordings?")
 

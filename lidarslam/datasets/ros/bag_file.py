@@ -114,8 +114,9 @@ class BagFile:
     """
 
     def __init__(self, path: Path) -> None:
+        log = _left_in_log(path)
         if path.is_file() and not path.stat().st_size:
-            raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
+            raise InputError(log or f"{path}: is empty, 0 bytes; copy the bag again")
         self.path = path
         self.ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
         self._has_index = True
@@ -125,6 +126,9 @@ class BagFile:
             counts = self._read_index()
         except InputError as error:
             counts = self._read_without_index(error)
+        if log is not None and not counts.total():
+            raise InputError(log)
+        self.damage = "; ".join(filter(None, (self.damage, log))) or None
         self.topics: tuple[Topic, ...] = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
 
     def _read_index(self) -> Counter[tuple[str, str]]:
@@ -140,7 +144,7 @@ class BagFile:
     def _read_without_index(self, error: InputError) -> Counter[tuple[str, str]]:
         """Read without a folder's metadata, then without the file's index too; the error remains if both fail."""
         if self.path.is_dir():
-            files = [entry for entry in self.path.iterdir() if entry.suffix in _STORAGE_SUFFIXES and entry.is_file()]
+            files = _storage_files(self.path)
             if len(files) != 1:  # the order of several is in the metadata alone
                 raise error
             self.damage = f"{self.path}: its metadata.yaml is missing or damaged, so {files[0].name} was read by itself"
@@ -230,7 +234,8 @@ class BagFile:
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
-            (require_tables if self.ros2 else _require_rosbag1)(self.path)
+            _require_kind(self.path, self.ros2)
+            require_tables(self.path)
             reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
         try:
@@ -257,7 +262,7 @@ class BagFile:
             whole = min(self.path.glob("*.zstd"), default=None)
             if whole is not None:  # decompressed, it is a file that is read as far as possible
                 return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
-            files = sorted(str(file) for suffix in _STORAGE_SUFFIXES for file in self.path.glob(f"*{suffix}"))
+            files = _storage_files(self.path)
             such_as = f", such as {files[0]}" if files else ""
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files{such_as}"
         command = _REPAIR.get(self._suffix())
@@ -266,10 +271,29 @@ class BagFile:
         return f"try `{command.format(self.path)}`, or copy the bag again"
 
 
-def _require_rosbag1(path: Path) -> None:
+def _storage_files(folder: Path) -> list[Path]:
+    """The databases and MCAP files of a folder; those that begin with a point are no bags, as macOS makes them."""
+    named = (entry for entry in folder.iterdir() if entry.suffix in _STORAGE_SUFFIXES and entry.name[0] != ".")
+    return sorted(entry for entry in named if entry.is_file())
+
+
+def _left_in_log(path: Path) -> str | None:
+    """A sentence where messages are left in a database's log of changes, as after a crash: rosbags reads none."""
+    logs = path.glob("*.db3-wal") if path.is_dir() else [path.with_name(f"{path.name}-wal")]
+    log = next((log for log in logs if log.is_file() and log.stat().st_size), None)
+    if log is None:
+        return None
+    merge = f"sqlite3 {str(log).removesuffix('-wal')} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+    return f"{log}: may hold messages that are not yet in the bag, as after a crash; `{merge}` adds them"
+
+
+def _require_kind(path: Path, ros2: bool) -> None:
+    if path.is_dir():
+        return
+    magic, kind, suffix = (_ROSBAG1_MAGIC, "a rosbag1", ".bag") if ros2 else (MCAP_MAGIC, "an MCAP", ".mcap")
     with path.open("rb") as file:
-        if file.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
-            raise InputError(f"{path}: is an MCAP file, by its first bytes; name it {path.with_suffix('.mcap').name}")
+        if file.read(len(magic)) == magic:
+            raise InputError(f"{path}: is {kind} file, by its first bytes; name it {path.with_suffix(suffix).name}")
 
 
 def _last(messages: Iterable[BagMessage]) -> BagMessage | None:

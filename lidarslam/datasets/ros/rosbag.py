@@ -229,6 +229,8 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
             f" {others[0].name} holds raw packets of a sensor whose packets are not decoded: play it through the"
             " sensor's driver and record the point clouds."
         )
+    elif any(topic.message_type.replace("/", "/msg/") in CLOUD_TYPES for topic in topics):
+        hint = " Its messages are those of ROS 1, which are read from a .bag alone: give the one it was converted from."
     raise InputError(
         f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages.{hint} Its topics:"
         f" {_listing(topics)}"
