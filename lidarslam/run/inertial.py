@@ -30,6 +30,8 @@ _INSTEAD = "choose --odometry learned, which needs none"
 _ROTATION = "--set odometry.imu_rotation_deg=[R,P,Y]"
 # Largest number of scans to find a rotation in, and the interval of the attempts.
 _MOST_SCANS, _EVERY = 600, 10
+# IMUs measure many times in a sweep.
+_LEAST_RATE_HZ = 10.0
 # Largest number of scans for the comparison of clock and rotation.
 _COMPARED_SCANS = 60
 
@@ -64,7 +66,7 @@ def open_inertial(
 
     for note in samples.notes:
         warn(note)
-    if (wrong := no_gravity(samples)) is not None:
+    if (wrong := no_gravity(samples) or _other_clock(samples, recording)) is not None:
         raise InputError(f"{recording.name}: {wrong}; correct the IMU's data, or {_INSTEAD}")
     T_lidar_imu = samples.T_lidar_imu
     if (T_recorded_imu := config.odometry.T_recorded_imu) is not None:
@@ -76,6 +78,17 @@ def open_inertial(
         T_lidar_imu, lever_sigma_m = _found(poses, recording.name, samples), UNKNOWN_LEVER_M
     logger.info("comparing the IMU with the first scans")
     return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn), lever_sigma_m)
+
+
+def _other_clock(samples: ImuSamples, recording: Recording) -> str | None:
+    """Why the samples belong to no scan, or to too few; None where they may belong to all."""
+    info, (first, last) = recording.describe(), samples.stamps[[0, -1]]
+    if (rate_hz := samples.rate_hz) is not None and rate_hz < _LEAST_RATE_HZ:
+        return f"the IMU has a sample every {1.0 / rate_hz:.3g} s, too few for a sweep: check the unit of its stamps"
+    if first <= info.last_stamp and last >= info.first_stamp:
+        return None
+    scans = f"{info.first_stamp:.3f} to {info.last_stamp:.3f} s"
+    return f"the IMU's samples are from {first:.3f} to {last:.3f} s, on another clock than the scans, from {scans}"
 
 
 def make_imu_stream(config: Config, warn: Callable[[str], None]) -> "ImuStream | None":

@@ -144,6 +144,19 @@ def test_a_late_clock_is_corrected(longer: Path, tmp_path: Path) -> None:
     assert rotation_error_deg(tmp_path / "run", longer) < 0.15
 
 
+@pytest.mark.parametrize(
+    ("flaw", "words"),
+    [
+        (lambda rows: rows + np.eye(7)[0] * 1.7e9, "on another clock than the scans"),
+        (lambda rows: rows * [1e3, 1, 1, 1, 1, 1, 1], "check the unit of its stamps"),
+    ],
+)
+def test_samples_of_another_time_are_refused_in_one_line(
+    recording: Path, tmp_path: Path, flaw: Any, words: str
+) -> None:
+    assert words in refused(*run(flawed(recording, tmp_path / "other", flaw), tmp_path / "run"))
+
+
 def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Path) -> None:
     reversed_ = flawed(longer, tmp_path / "reversed", lambda rows: rows * [1, -1, -1, -1, 1, 1, 1])
     said = refused(*run(reversed_, tmp_path / "run"))
