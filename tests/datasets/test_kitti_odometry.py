@@ -95,6 +95,14 @@ def test_the_correction_raises_every_point(sequence):
     assert any("0.205" in note for note in recording.describe().notes)
 
 
+def test_points_of_another_layout_are_refused_by_their_values(sequence):
+    azimuth = np.linspace(-np.pi, np.pi, 500)
+    room = np.column_stack([8.3 * np.cos(azimuth), 6.1 * np.sin(azimuth), np.full(500, -1.7), np.full(500, 0.5)])
+    room.tofile(min(sequence.rglob("*.bin")))
+    with pytest.raises(InputError, match="4 numbers of float64 for each point"):
+        open_recording(sequence)
+
+
 @pytest.mark.parametrize(("chosen", "rows"), [((1, 100, 2), [1, 3, 5]), ((2, 4), [2, 3]), ((9,), [])])
 def test_scans_follow_range(sequence, chosen, rows):
     assert [round(scan.stamp / 0.1037) for scan in open_recording(sequence).scans(*chosen)] == rows

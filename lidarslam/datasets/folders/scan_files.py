@@ -70,6 +70,8 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
                 f"{path}: expected a name that is the scan's number, such as 000004{suffix}, at most"
                 f" {_MOST_SCANS - 1:,}; rename it or move it away"
             )
+    if suffix == ".bin":
+        _require_layout(files[0])
     numbers = np.array([int(path.stem) for path in files], dtype=np.intp)
     if (np.diff(numbers) == 0).any():
         twice = int(np.argmin(np.diff(numbers)))
@@ -151,14 +153,20 @@ def _bin_columns(files: Sequence[Path]) -> int:
             f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 bytes, or of 20 bytes"
             f" with a ring, got {sizes[0]} bytes, which fit none; copy it again, or convert the scans to .npy or .ply"
         )
+    _require_layout(files[int(np.argmax(sizes))], columns)
+    return columns
+
+
+def _require_layout(path: Path, columns: int = len(KITTI_FIELDS)) -> None:
+    """InputError where the values of a .bin scan repeat after another number of them than its columns."""
+    repeats = _repeats(path)
     known = repeats["float32", columns]
     if better := {way: share for way, share in repeats.items() if share > _MORE_OFTEN[way[0]] * known}:
         kind, other = max(better, key=lambda way: better[way])
         raise InputError(
-            f"{files[0].parent}: expected .bin scans with float32 points of x, y, z, intensity; by their values they"
-            f" hold {other} numbers of {kind} for each point: convert the scans to .npy or .ply"
+            f"{path}: expected a .bin scan with float32 points of x, y, z, intensity; by its values it holds {other}"
+            f" numbers of {kind} for each point: convert the scans to .npy or .ply"
         )
-    return columns
 
 
 def _repeats(path: Path) -> dict[tuple[str, int], float]:
@@ -166,7 +174,8 @@ def _repeats(path: Path) -> dict[tuple[str, int], float]:
     data = np.frombuffer(b"", np.uint8)
     with suppress(InputError):  # it is counted when it is its turn
         data = np.frombuffer(read_bytes(path)[:_COMPARED_BYTES], np.uint8)
-    numbers = {kind: data[: len(data) // 8 * 8].view(kind).astype(np.float64) for kind in _MORE_OFTEN}
+    with np.errstate(invalid="ignore"):  # of another type they may be any numbers
+        numbers = {kind: data[: len(data) // 8 * 8].view(kind).astype(np.float64) for kind in _MORE_OFTEN}
     return {(kind, columns): _share_alike(numbers[kind], columns) for kind in _MORE_OFTEN for columns in _COLUMNS}
 
 
@@ -174,7 +183,7 @@ def _share_alike(numbers: FloatArray, distance: int) -> float:
     if len(numbers) < _FEWEST_NUMBERS:
         return 0.0
     one, other = numbers[:-distance], numbers[distance:]
-    with np.errstate(invalid="ignore", over="ignore"):  # of another type they may be any numbers
+    with np.errstate(invalid="ignore", over="ignore"):
         return float(np.mean(np.abs(one - other) <= 0.5 * np.maximum(np.abs(one), np.abs(other))))
 
 
