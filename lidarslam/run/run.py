@@ -408,4 +408,5 @@ def _why_none(log: ScanLog, faults: Faults, error: InputError | None) -> Iterato
     yield from faults.warnings()
     if len(log):
         invalid = count(int(log.table["points_dropped"].sum()), "invalid point")
-        yield f"{count(len(log), 'scan')} without a valid point, {invalid} (NaN, at the origin, too far)"
+        expected = "NaN, at the origin, or beyond 10 km: expected are metres from the LiDAR, not from a map's origin"
+        yield f"{count(len(log), 'scan')} without a valid point, {invalid} ({expected})"
