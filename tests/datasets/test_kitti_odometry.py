@@ -99,7 +99,7 @@ def test_points_of_another_layout_are_refused_by_their_values(sequence):
     azimuth = np.linspace(-np.pi, np.pi, 500)
     room = np.column_stack([8.3 * np.cos(azimuth), 6.1 * np.sin(azimuth), np.full(500, -1.7), np.full(500, 0.5)])
     room.tofile(min(sequence.rglob("*.bin")))
-    with pytest.raises(InputError, match="4 numbers of float64 for each point"):
+    with pytest.raises(InputError, match="by its values they have 32 bytes"):
         open_recording(sequence)
 
 

@@ -344,7 +344,7 @@ def test_bin_of_another_layout_is_refused_by_its_values(tmp_path, columns, kind)
     further = np.column_stack([np.full(480, 90.0), np.linspace(0.0, 0.1, 480), rings, *np.zeros((2, 480))])
     table = np.column_stack([8.3 * np.cos(azimuth), 6.1 * np.sin(azimuth), np.full(480, -1.7), further])
     table[:, :columns].astype(kind).tofile(tmp_path / "0.bin")
-    with pytest.raises(InputError, match=f"{columns} numbers of float{'32' if kind == 'f4' else '64'}"):
+    with pytest.raises(InputError, match=f"by its values they have {columns * int(kind[1])} bytes"):
         open_recording(tmp_path)
     table[:, :3].astype("f4").tofile(tmp_path / "0.bin")  # by its size it may be 360 points of four, too
     assert _sizes(open_recording(tmp_path)) == [480]

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import read_array
-from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.recording import KITTI_FIELDS
 
 # No sweep is larger; reading more would fill the memory.
@@ -27,10 +26,10 @@ TableReader = Callable[[Path], NDArray[np.void]]
 # Fields of the float32 numbers of a .bin point, by their number; in the order of preference.
 _BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
 _MOST_RINGS = 256
-# Numbers of values per point that are compared, bytes of a file that they are compared in, and the fewest numbers; how
-# many times as often values have to repeat after another number of them, or as float64, for the file to be of that.
-_COLUMNS, _COMPARED_BYTES, _FEWEST_NUMBERS = range(3, 9), 1 << 20, 1000
-_MORE_OFTEN = {"float32": 3.0, "float64": 1.5}
+# Numbers of values per point that are tried, by their type, and bytes of a file in which they are; the shares of
+# successive points with one sign of x, and of y, from which on a number is right, and below which it may be wrong.
+_TRIED, _TRIED_BYTES = {"<f4": range(3, 9), "<f8": range(3, 6)}, 1 << 20
+_AGREES, _DIFFERS, _FEWEST_COMPARED = 0.9, 0.75, 400
 _WIDEST_ARRAY = 16
 # Bytes; no format has larger points.
 _WIDEST_POINT = 1 << 16
@@ -140,14 +139,14 @@ def _bin_columns(files: Sequence[Path]) -> int:
     """The number of values per point, by the sizes of most files, since the file itself does not state it.
 
     Four fit almost always where they are right; five, as nuScenes has them, only count where the fifth number is a
-    small integer in every point. InputError where the values repeat after another number of them.
+    small integer in every point. InputError where the values show another layout.
     """
     sizes = np.array([path.stat().st_size if path.exists() else 0 for path in files])
     fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in _BIN_FIELDS}
     if fits[5] and not _fifth_is_ring(files[int(np.argmax(sizes * (sizes % 20 == 0)))]):
         fits[5] = 0
-    repeats = _repeats(files[int(np.argmax(sizes))])
-    columns = max(fits, key=lambda columns: (fits[columns], repeats["float32", columns]))
+    agreement = _agreement(files[int(np.argmax(sizes))])
+    columns = max(fits, key=lambda columns: (fits[columns], agreement["<f4", columns] > _AGREES))
     if not fits[columns]:
         raise InputError(
             f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 bytes, or of 20 bytes"
@@ -158,38 +157,43 @@ def _bin_columns(files: Sequence[Path]) -> int:
 
 
 def _require_layout(path: Path, columns: int = len(KITTI_FIELDS)) -> None:
-    """InputError where the values of a .bin scan repeat after another number of them than its columns."""
-    repeats = _repeats(path)
-    known = repeats["float32", columns]
-    if better := {way: share for way, share in repeats.items() if share > _MORE_OFTEN[way[0]] * known}:
-        kind, other = max(better, key=lambda way: better[way])
+    """InputError where a .bin scan has another number of values per point, or another type."""
+    agreement = _agreement(path)
+    kind, other = max(agreement, key=lambda tried: agreement[tried])
+    if 0.0 < agreement["<f4", columns] < _DIFFERS and agreement[kind, other] > _AGREES:
+        size = other * np.dtype(kind).itemsize
         raise InputError(
-            f"{path}: expected a .bin scan with float32 points of x, y, z, intensity; by its values it holds {other}"
-            f" numbers of {kind} for each point: convert the scans to .npy or .ply"
+            f"{path}: expected points of x, y, z, intensity as float32; by its values they have {size} bytes, as of"
+            " further fields, or of float64: convert the scans to .npy or .ply"
         )
 
 
-def _repeats(path: Path) -> dict[tuple[str, int], float]:
-    """How often a number is about the same as that so many further on, by their type: most often in the next point."""
-    data = np.frombuffer(b"", np.uint8)
+def _agreement(path: Path) -> dict[tuple[str, int], float]:
+    """How often the signs of successive points agree, in the worse of x and y, by type and number of values.
+
+    Lasers point in one direction, whatever their elevations and ranges. 0 where too few points tell.
+    """
+    data = b""
     with suppress(InputError):  # it is counted when it is its turn
-        data = np.frombuffer(read_bytes(path)[:_COMPARED_BYTES], np.uint8)
+        data = read_bytes(path)[:_TRIED_BYTES]
+    return {(kind, columns): _agreeing(data, kind, columns) for kind, tried in _TRIED.items() for columns in tried}
+
+
+def _agreeing(data: bytes, kind: str, columns: int) -> float:
+    size = columns * np.dtype(kind).itemsize
+    rows = np.frombuffer(data[: len(data) // size * size], kind).reshape(-1, columns)
     with np.errstate(invalid="ignore"):  # of another type they may be any numbers
-        numbers = {kind: data[: len(data) // 8 * 8].view(kind).astype(np.float64) for kind in _MORE_OFTEN}
-    return {(kind, columns): _share_alike(numbers[kind], columns) for kind in _MORE_OFTEN for columns in _COLUMNS}
-
-
-def _share_alike(numbers: FloatArray, distance: int) -> float:
-    if len(numbers) < _FEWEST_NUMBERS:
+        products = np.sign(rows[1:, :2]) * np.sign(rows[:-1, :2])
+    compared = np.count_nonzero(np.abs(products) == 1.0, axis=0)
+    if compared.min() < _FEWEST_COMPARED:
         return 0.0
-    one, other = numbers[:-distance], numbers[distance:]
-    with np.errstate(invalid="ignore", over="ignore"):
-        return float(np.mean(np.abs(one - other) <= 0.5 * np.maximum(np.abs(one), np.abs(other))))
+    return float((np.count_nonzero(products == 1.0, axis=0) / compared).min())
 
 
 def _fifth_is_ring(path: Path) -> bool:
     fifth = read_bin(path, 5)[:, 4]
-    return bool(len(fifth) and ((fifth >= 0) & (fifth < _MOST_RINGS) & (fifth == np.floor(fifth))).all())
+    with np.errstate(invalid="ignore"):  # of another type they may be any numbers
+        return bool(len(fifth) and ((fifth >= 0) & (fifth < _MOST_RINGS) & (fifth == np.floor(fifth))).all())
 
 
 def read_npy(path: Path) -> NDArray[np.void]:
