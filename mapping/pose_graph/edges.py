@@ -6,8 +6,6 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.state import TRANSFORM, Shape
@@ -123,6 +121,9 @@ def squared_error(edge: RelativePose, poses: Sequence[FloatArray]) -> float:
 
 def first_connected(count: int, pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
     """For each of `count` nodes the first one of its connected component, given the pairs that are joined."""
+    from scipy.sparse import coo_array  # takes a while to load
+    from scipy.sparse.csgraph import connected_components
+
     ends = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, labels = connected_components(adjacency, directed=False)
