@@ -79,7 +79,10 @@ class KeyframeSelector(Stateful):
         points = points[:: max(1, len(points) // _COMPARED_POINTS)]
         if not len(points) or not len(self._cells):
             return 1.0
-        return float(np.isin(point_keys(transform_points(T_keyframe_lidar, points), self._cell_m), self._cells).mean())
+        cells = point_keys(transform_points(T_keyframe_lidar, points), self._cell_m)
+        # The keyframe's are sorted: several times as fast as `np.isin`, which sorts both.
+        next_cells = self._cells.take(np.searchsorted(self._cells, cells), mode="clip")
+        return float((next_cells == cells).mean())
 
 
 class SubmapStore(BlockFile):
