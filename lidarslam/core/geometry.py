@@ -27,8 +27,9 @@ def make_transform(R: ArrayLike, t: ArrayLike) -> FloatArray:
 
 def inverse(T: FloatArray) -> FloatArray:
     """Invert rigid transforms (..., 4, 4): `inverse(T_a_b)` is `T_b_a`."""
-    R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
-    return make_transform(R_inv, -(R_inv @ T[..., :3, 3:4])[..., 0])
+    R_inv, T_inv = T[..., :3, :3].swapaxes(-1, -2), np.zeros(T.shape)
+    T_inv[..., :3, :3], T_inv[..., :3, 3:], T_inv[..., 3, 3] = R_inv, -(R_inv @ T[..., :3, 3:]), 1.0
+    return T_inv
 
 
 def transform_points(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:

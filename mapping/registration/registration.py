@@ -6,6 +6,7 @@ end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -232,11 +233,13 @@ class _Solution:
         pose = MeasuredPose.minimum(T_world_lidar, H[:6, :6] - gain @ H[6:, :6], g[:6] - gain @ g[6:])
         return replace(pose, information=_INFORMATION_SHARE * pose.information)
 
-    @property
+    @cached_property
     def _observed(self) -> FloatArray:
         """(12, 12) projector onto the directions that are not degenerate."""
         scale, D = lever_scale(self.system.lever_m), self.system.degeneracy.directions
-        return np.asarray(np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale)), dtype=np.float64)
+        observed = np.zeros((12, 12))  # several times as fast as `np.kron`
+        observed[:6, :6] = observed[6:, 6:] = np.eye(6) - (D / scale).T @ (D * scale)
+        return observed
 
 
 def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
