@@ -30,8 +30,6 @@ _VELOCITY_INFLATION = 2.0
 _UNEVEN = 1.0 / 8.0
 # Smoothing of the odometry's normalised squared error, and its gate: chi square, six degrees of freedom, 1 in 10,000.
 _ODOMETRY_SMOOTHING, _GATE = 0.2, 27.9
-# Factor on the odometry's own standard deviations beyond which a smoothed motion contradicts it.
-_SMOOTHED_CAUTION = 3.0
 # Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
 _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
 # An odometry conflicts with a registration where their translations differ by more than this squared Mahalanobis
@@ -81,7 +79,7 @@ class Prior:
         """Whether a motion (4, 4) is within the odometry's own uncertainty; true where it has none."""
         if self.covariance is None or self.T_prev_curr is None:
             return True
-        return _squared_error(self, T_prev_curr, _SMOOTHED_CAUTION**2 * self.covariance) < _GATE
+        return _squared_error(self, T_prev_curr, self.covariance) < _GATE
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,12 +28,13 @@ from lidarslam.mapping.tracking.start_poses import (
 )
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
-# Factors by which the quality of a result with any acceleration, and of one from elsewhere, must be better.
-_BETTER, _CLEARLY_BETTER = 1.05, 1.1
+# Factors by which the quality of a result with any acceleration, of one from elsewhere, and of one that contradicts the
+# odometry must be better.
+_BETTER, _CLEARLY_BETTER, _MUCH_BETTER = 1.05, 1.1, 1.3
 # A scan constrains its weakest direction poorly below this support or evidence: a fifth of the scans on stairs, in
-# offices, streets and crowds none. There an odometry counts with at most this many times its own standard deviations,
-# after motions of fewer cells than this: after longer ones it may itself be off by a step.
-_WEAK_SUPPORT, _WEAK_EVIDENCE, WEAK_CAUTION, _WEAK_CELLS = 0.65, 40.0, 2.0, 2.0
+# offices, streets and crowds none. There an odometry counts with this many times its own standard deviations, after
+# motions of fewer cells than this: after longer ones it may itself be off by a step.
+_WEAK_SUPPORT, _WEAK_EVIDENCE, WEAK_CAUTION, _WEAK_CELLS = 0.65, 40.0, 1.0, 6.0
 # Where even less constrains it, as in a corridor, only the prediction does: evidence in units of the least.
 _LEAST_CONSTRAINT = 2.0
 # Changes of the yaw rate tried on a scan that fits poorly, rad/s: from full speed one way to full speed the other.
@@ -92,7 +93,7 @@ class NearSearch:
         return self.state.predict(self.matcher.scan, prior, self.matcher.last, self.matcher.config, process_noise)
 
     def held_by_odometry(self, near: Attempt) -> Attempt:
-        """Where the scan constrains a direction poorly: held closer to the odometry's motion.
+        """Where the scan constrains a direction poorly, or is lost: held closer to the odometry's motion.
 
         Errors of an odometry are correlated in time, but so are those of the few surfaces that constrain the scan.
         """
@@ -101,11 +102,12 @@ class NearSearch:
             return near
         moved_m = float(np.linalg.norm(prior.T_prev_curr[:3, 3]))
         is_weak = (fit.support or 0.0) < _WEAK_SUPPORT or (fit.evidence or 0.0) < _WEAK_EVIDENCE
-        is_weak &= fit.constraint >= _LEAST_CONSTRAINT
+        is_weak &= fit.constraint >= _LEAST_CONSTRAINT or near.status is Status.LOST
         if not is_weak or moved_m > _WEAK_CELLS * self.matcher.scan.cell_m:
             return near
         held = self.matcher.register(self._predict(replace(prior, caution=WEAK_CAUTION)), coarse_first=False)
-        return replace(held, prediction=near.prediction) if _BETTER * held.quality > near.quality else near
+        factor = _MUCH_BETTER if self.contradicts(near) else _BETTER
+        return replace(held, prediction=near.prediction) if factor * held.quality > near.quality else near
 
     def with_any_acceleration(self, near: Attempt) -> Attempt:
         """Where the scan fits poorly: from several yaw rates, patiently, with any acceleration.
