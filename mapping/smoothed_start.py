@@ -92,10 +92,10 @@ def smoothed_start(
         taken.append(scan)
         needed |= not ordered.has_rings or mapped.status is not Status.OK
         if inertial is not None and len(taken) == TRIED:
-            if taken[1].stamp - taken[0].stamp > _LONG_S:
-                ordered, needed = _likeliest(taken, unlimited, inertial, _quality), True
-            elif not all(one.fit is None or one.fit.is_constrained for one in ordered.results):
-                ordered, needed, least = _likeliest(taken, unlimited, inertial, _constraint), True, _LEAST_CONSTRAINT
+            is_long = taken[1].stamp - taken[0].stamp > _LONG_S
+            if is_long or not all(one.fit is None or one.fit.is_constrained for one in ordered.results):
+                ordered = _likeliest(taken, unlimited, inertial, _quality if is_long else _constraint)
+                needed, least = True, _LEAST_CONSTRAINT
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not (needed or ordered.is_bent)):
             break
     forwards = ordered.results
