@@ -57,9 +57,10 @@ _LEAST_WAY_M = 0.2
 # a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
-# Least contradicting pairs of a stretch. A single one counts where another confirms it and it has so many votes, or, in
+# Least contradicting pairs of a stretch. A single one counts where it has so many votes and another confirms it, or, in
 # runs of fewer tested pairs, where it has more or the pose has less than a share of them. In the sparse scans of a
-# Mid-360, chance makes one of 9.9 to 12.1 votes, with a quarter of them at the pose; slips leave next to none.
+# Mid-360, chance makes one of 8.1 votes, with a tenth of them at the pose, and of 9.9 to 12.1, with a quarter; slips
+# leave next to none.
 _LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE = 2, 4, 10.0
 _MANY_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 14.0, 0.2
 
@@ -387,11 +388,11 @@ def _counts(pair: Contradiction, known: Sequence[Contradiction]) -> bool:
 
     That is a pair with the same first scan that peaks at the same shift, though not as clearly.
     """
+    if pair.votes < _LEAST_VOTES_OF_ONE:
+        return False
     is_clear = pair.votes > _MANY_VOTES_OF_ONE or pair.votes_at_pose < _LARGEST_SHARE_OF_ONE * pair.votes
     if len(known) < _FEW_PAIRS and is_clear:
         return True
-    if pair.votes < _LEAST_VOTES_OF_ONE:
-        return False
     others = (other for other in known if other is not pair and other.first == pair.first)
     return any(abs(other.shift_m - pair.shift_m) < (_TOLERANCE_BINS + 0.5) * BIN_M for other in others)
 
