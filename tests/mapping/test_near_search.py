@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
@@ -116,3 +116,14 @@ def test_the_odometrys_motion_is_tried_where_the_prediction_is_uncertain(at_shel
 def test_the_odometrys_motion_is_not_taken_where_it_fits_no_better(at_shelves):
     right = registered(at_shelves, HERE, (0.04, 0.04, 0.25))
     assert from_odometry(at_shelves, right, LOWER) is right
+
+
+@pytest.mark.parametrize(("moved_m", "height_m"), [(0.2, 0.0), (0.5, -2.0 * SHELVES_M)])
+def test_where_few_points_constrain_the_height_the_odometry_decides_after_short_motions(at_shelves, moved_m, height_m):
+    moved = make_transform(np.eye(3), [moved_m, 0.0, 0.0])
+    matcher = replace(at_shelves, last=replace(at_shelves.last, T_world_lidar=inverse(moved)))
+    near = registered(matcher, make_transform(np.eye(3), [0.0, 0.0, -2.0 * SHELVES_M]), (0.04, 0.04, 0.25))
+    assert near.status is Status.OK
+    prior = Prior(moved, covariance=np.diag([0.01] * 3 + [0.005] * 3) ** 2)
+    held = NearSearch(matcher, TrackingState(), prior, near.prediction).held_by_odometry(near)
+    assert held.T_world_lidar[2, 3] == pytest.approx(height_m, abs=0.01)

@@ -221,7 +221,7 @@ def test_a_smoothed_motion_is_held_and_another_one_is_not():
 
 def test_a_motion_is_allowed_within_a_few_of_the_odometrys_deviations():
     covariance = np.diag([1e-6] * 3 + [0.01**2] * 3)
-    far = MOVED @ ahead(0.3)
+    far = MOVED @ ahead(0.06)
     assert Prior(MOVED, covariance=covariance).allows(MOVED @ ahead(0.05))
     assert not Prior(MOVED, covariance=covariance).allows(far)
     assert Prior(MOVED).allows(far)

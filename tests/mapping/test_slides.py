@@ -137,7 +137,9 @@ def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, vote
     assert [one.shift_m for one in found] == [shift_m] * stretches
 
 
-@pytest.mark.parametrize(("votes", "votes_at_pose", "stretches"), [(10.0, 0.5, 1), (10.0, 2.5, 0), (15.0, 7.0, 1)])
+@pytest.mark.parametrize(
+    ("votes", "votes_at_pose", "stretches"), [(9.0, 0.5, 0), (10.0, 0.5, 1), (10.0, 2.5, 0), (15.0, 7.0, 1)]
+)
 def test_the_only_pair_of_a_short_run_counts_where_it_is_clear(votes, votes_at_pose, stretches):
     standing = np.tile(np.eye(4), (11, 1, 1))
     assert len(find_contradictions([pair(0, 10, 0.4, votes, votes_at_pose)], standing)) == stretches
