@@ -71,14 +71,14 @@ def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: P
     assert error_m(real_data / "sim_stairs", tmp_path / "run", "--step", str(step)) < 0.3
 
 
-@pytest.mark.parametrize("start", [0, 20, 40, 80])
-def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, start: int) -> None:
+@pytest.mark.parametrize(("start", "step"), [(0, 1), (20, 1), (40, 1), (80, 1), (0, 5)])
+def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, start: int, step: int) -> None:
     """Hardly any surface constrains the first velocity, 2.2 m/s; the run is right, and reports that."""
     out = tmp_path / "run"
-    options = "--odometry", "learned+imu", "--start", str(start), "--stop", str(start + 40)
-    ended = lidarslam("run", real_data / "sim_corridor_yard", "--out", out, *options)
+    options = "--odometry", "learned+imu", "--start", str(start), "--stop", str(start + 40 * step)
+    ended = lidarslam("run", real_data / "sim_corridor_yard", "--out", out, *options, "--step", str(step))
     assert ended.exit_code == 3, ended.output
-    assert json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.02
+    assert json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.03
 
 
 def test_a_crowd_that_is_followed_is_reported(real_data: Path, tmp_path: Path) -> None:
