@@ -30,7 +30,7 @@ _INSTEAD = "choose --odometry learned, which needs none"
 _ROTATION = "--set odometry.imu_rotation_deg=[R,P,Y]"
 # Largest number of scans to find a rotation in, and the interval of the attempts.
 _MOST_SCANS, _EVERY = 600, 10
-# Lower are those of stamps in another unit; that of the poses in KITTI is 10 Hz.
+# Lower rates are those of stamps in another unit; KITTI's GPS/IMU has 10 Hz.
 _LEAST_RATE_HZ = 2.0
 # Largest number of scans for the comparison of clock and rotation.
 _COMPARED_SCANS = 60
@@ -81,7 +81,7 @@ def open_inertial(
 
 
 def _other_clock(samples: ImuSamples, recording: Recording) -> str | None:
-    """Why the samples belong to no scan, or to too few; None where they may belong to all."""
+    """Why the stamps of the samples do not match those of the scans; None where they do."""
     info, (first, last) = recording.describe(), samples.stamps[[0, -1]]
     if (rate_hz := samples.rate_hz) is not None and rate_hz < _LEAST_RATE_HZ:
         return f"the IMU has a sample every {1.0 / rate_hz:.3g} s, too few for a sweep: check the unit of its stamps"

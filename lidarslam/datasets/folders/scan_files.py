@@ -70,7 +70,7 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
                 f" {_MOST_SCANS - 1:,}; rename it or move it away"
             )
     if suffix == ".bin":
-        _require_layout(files[0])
+        _require_layout(files[0], _agreement(files[0]))
     numbers = np.array([int(path.stem) for path in files], dtype=np.intp)
     if (np.diff(numbers) == 0).any():
         twice = int(np.argmin(np.diff(numbers)))
@@ -145,36 +145,36 @@ def _bin_columns(files: Sequence[Path]) -> int:
     fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in _BIN_FIELDS}
     if fits[5] and not _fifth_is_ring(files[int(np.argmax(sizes * (sizes % 20 == 0)))]):
         fits[5] = 0
-    agreement = _agreement(files[int(np.argmax(sizes))])
+    largest = files[int(np.argmax(sizes))]
+    agreement = _agreement(largest)
     columns = max(fits, key=lambda columns: (fits[columns], agreement["<f4", columns] > _AGREES))
     if not fits[columns]:
         raise InputError(
             f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 bytes, or of 20 bytes"
             f" with a ring, got {sizes[0]} bytes, which fit none; copy it again, or convert the scans to .npy or .ply"
         )
-    _require_layout(files[int(np.argmax(sizes))], columns)
+    _require_layout(largest, agreement, columns)
     return columns
 
 
-def _require_layout(path: Path, columns: int = len(KITTI_FIELDS)) -> None:
-    """InputError where a .bin scan has another number of values per point, or another type."""
-    agreement = _agreement(path)
+def _require_layout(path: Path, agreement: dict[tuple[str, int], float], columns: int = len(KITTI_FIELDS)) -> None:
+    """InputError where the agreement shows another number of values per point of a .bin scan, or another type."""
     kind, other = max(agreement, key=lambda tried: agreement[tried])
     if 0.0 < agreement["<f4", columns] < _DIFFERS and agreement[kind, other] > _AGREES:
         size = other * np.dtype(kind).itemsize
         raise InputError(
-            f"{path}: expected points of x, y, z, intensity as float32; by its values they have {size} bytes, as of"
-            " further fields, or of float64: convert the scans to .npy or .ply"
+            f"{path}: expected points of x, y, z, intensity as float32; by its values they have {size} bytes, as with"
+            " further fields or float64; convert the scans to .npy or .ply"
         )
 
 
 def _agreement(path: Path) -> dict[tuple[str, int], float]:
-    """How often the signs of successive points agree, in the worse of x and y, by type and number of values.
+    """Share of successive points with one sign, in the worse of x and y, by type and number of values per point.
 
-    Lasers point in one direction, whatever their elevations and ranges. 0 where too few points tell.
+    Successive points have nearly one azimuth, whatever their elevations and ranges. 0 with too few points.
     """
     data = b""
-    with suppress(InputError):  # it is counted when it is its turn
+    with suppress(InputError):  # counted when the scan is read
         data = read_bytes(path)[:_TRIED_BYTES]
     return {(kind, columns): _agreeing(data, kind, columns) for kind, tried in _TRIED.items() for columns in tried}
 

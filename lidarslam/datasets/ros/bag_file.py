@@ -272,13 +272,13 @@ class BagFile:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """The databases and MCAP files of a folder; those that begin with a point are no bags, as macOS makes them."""
+    """The databases and MCAP files of a folder, without hidden ones such as macOS's `._` files."""
     named = (entry for entry in folder.iterdir() if entry.suffix in _STORAGE_SUFFIXES and entry.name[0] != ".")
     return sorted(entry for entry in named if entry.is_file())
 
 
 def _left_in_log(path: Path) -> str | None:
-    """A sentence where messages are left in a database's log of changes, as after a crash: rosbags reads none."""
+    """Warning of messages left in a database's write-ahead log, as after a crash, which rosbags does not read."""
     logs = path.glob("*.db3-wal") if path.is_dir() else [path.with_name(f"{path.name}-wal")]
     log = next((log for log in logs if log.is_file() and log.stat().st_size), None)
     if log is None:

@@ -150,8 +150,9 @@ def learn_point_time(
 
 def _unknown_field(cloud: RawCloud) -> str | None:
     name = next((field.name for field in cloud.fields if "time" in field.name.lower()), None)
-    may_be = f"{name!r} may be one, which --set reader.time_field={name} reads"
-    return None if name is None else f"The points have no time field of a known name; {may_be}"
+    if name is None:
+        return None
+    return f"The points have no time field of a known name; if {name!r} is one, --set reader.time_field={name}"
 
 
 def infer_point_time(
