@@ -178,6 +178,13 @@ class OdometryNoise:
             return None
         return _squared_error(prior, T_prev_curr, prior.motion_covariance(config)) <= _GATE * self.variance
 
+    def likelihood(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> float:
+        """Of a registered motion (4, 4) by a proven odometry, relative to the odometry's own; one without that."""
+        if not self.is_proven(prior):
+            return 1.0
+        squared = _squared_error(prior, T_prev_curr, prior.motion_covariance(config)) / self.variance
+        return float(np.exp(-0.5 * squared))
+
     def conflict(self, prior: Prior, T_prev_curr: FloatArray, interval_s: float) -> str | None:
         """The axis along which the odometry's translation differs most from a registered motion's (4, 4).
 

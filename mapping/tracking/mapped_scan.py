@@ -10,7 +10,7 @@ from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.motion.deskew import body_velocity
-from lidarslam.mapping.motion.prediction import LOST_MOTION, MeasuredPose, MotionState, Prediction
+from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -162,10 +162,10 @@ class MappedScan:
         return 0.0 if self.fit is None else self.fit.quality
 
     @classmethod
-    def lost(cls, prediction: Prediction, reason: str, fit: Fit | None = None, fading: float = 1.0) -> "MappedScan":
-        """A scan that stays at its prediction, out of the map; its velocity fades by a factor."""
+    def lost(cls, prediction: Prediction, reason: str, fit: Fit | None = None) -> "MappedScan":
+        """A scan that stays at its prediction, out of the map."""
         T_world_lidar = prediction.T_world_lidar
-        state = MotionState(prediction.stamp, T_world_lidar, fading * prediction.velocity, LOST_MOTION)
+        state = MotionState(prediction.stamp, T_world_lidar, prediction.velocity, prediction.covariance)
         return cls(state, T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)
 
 

@@ -50,6 +50,8 @@ _OPEN_CELLS, _OPEN_SIGMAS, _MOST_DISPLACED = 3.0, 3.0, 8
 _MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells.
 _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
+# Factor on the odometry's own standard deviations in the likelihood of these.
+_LIKELIHOOD_CAUTION = 2.0
 # Distance of another optimum, cells.
 _APART_CELLS = 1.0
 
@@ -88,6 +90,12 @@ class NearSearch:
         motion = inverse(self.matcher.last.T_world_lidar) @ attempt.T_world_lidar
         prior = replace(self.prior, caution=caution)
         return self.state.odometry_noise.agrees(prior, motion, self.matcher.config) is False
+
+    def continued(self, prediction: Prediction) -> Prediction:
+        """Where a scan without a registration is: by a proven odometry at its own covariance, else as predicted."""
+        if not self.state.is_measured or self.prior.inertial is not None:
+            return prediction
+        return self._predict(replace(self.prior, caution=WEAK_CAUTION))
 
     def _predict(self, prior: Prior, process_noise: ProcessNoise | None = None) -> Prediction:
         return self.state.predict(self.matcher.scan, prior, self.matcher.last, self.matcher.config, process_noise)
@@ -211,7 +219,8 @@ class NearSearch:
     def along_weakest(self, near: Attempt) -> Attempt:
         """Where the scan fits poorly: a few cells away along its weakest direction.
 
-        Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks the same.
+        Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks the same. The
+        likelihood of their motions by the odometry counts, too.
         """
         if near.status is Status.OK or near.fit.weakest is None or not near.fit.is_constrained:
             return near
@@ -222,7 +231,15 @@ class NearSearch:
             start = replace(near.prediction, T_world_lidar=near.T_world_lidar)
             start = start.displaced(cells * cell_m * np.array(near.fit.weakest))
             others.append(self.matcher.attempt(near.prediction, start, coarse_first=False))
-        return _clearly_best(near, (other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m))
+        others = [other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m]
+        best = max(others, key=self._likely_quality, default=near)
+        return best if self._likely_quality(best) > _CLEARLY_BETTER * self._likely_quality(near) else near
+
+    def _likely_quality(self, attempt: Attempt) -> float:
+        """The quality of an attempt, times the likelihood of its motion by a proven odometry."""
+        motion = inverse(self.matcher.last.T_world_lidar) @ attempt.T_world_lidar
+        prior = replace(self.prior, caution=_LIKELIHOOD_CAUTION)
+        return attempt.quality * self.state.odometry_noise.likelihood(prior, motion, self.matcher.config)
 
     @property
     def _is_open(self) -> bool:

@@ -54,12 +54,12 @@ class Tracker(Stateful):
         is_measured = self.tracking.is_measured and self.tracking.odometry_noise.is_proven(prior)
         state = self.tracking = replace(self.tracking, is_measured=is_measured)
         matcher = ScanMatcher(scan, last, local_map, self._config, self._budget)
+        nearby = NearSearch(matcher, state, prior, prediction)
         if state.is_lost and self.is_searching:  # which has all the time of a lost scan
             found = self._found(matcher, prediction)
             self._in_vain = found is None and not self.is_searching
-            return found or matcher.none(prediction)
+            return found or matcher.none(nearby.continued(prediction))
         uncertain, unconfirmed = state.is_uncertain(scan.stamp - last.stamp), state.is_unconfirmed
-        nearby = NearSearch(matcher, state, prior, prediction)
         best: Attempt | None
         best = near = nearby.at_prediction() if uncertain else nearby.best()
         if near.status is Status.LOST or ((uncertain or unconfirmed) and not near.is_reliable):
@@ -72,7 +72,7 @@ class Tracker(Stateful):
         # After a relocalisation an improbable motion contradicts that.
         is_improbable = near.has_jumped or nearby.contradicts(near, prior.caution)
         if best is None or (best is near and unconfirmed and is_improbable):
-            return replace(near, status=Status.LOST)
+            return replace(near, status=Status.LOST, prediction=nearby.continued(near.prediction))
         return best
 
     def accept(
@@ -127,9 +127,14 @@ class Tracker(Stateful):
         )
 
     def lose(self, prediction: Prediction, reason: str, fit: Fit | None = None) -> MappedScan:
-        """A scan that was not registered stays at its prediction; without a fit, it has too few points."""
+        """A scan that was not registered stays at its prediction; without a fit, it has too few points.
+
+        That of a proven odometry keeps its covariance; any other may be far off.
+        """
         self.tracking = self.tracking.lost(has_points=fit is not None)
-        return MappedScan.lost(prediction, reason, fit, FADING)
+        if not self.tracking.is_measured:
+            prediction = replace(prediction, velocity=FADING * prediction.velocity, covariance=LOST_MOTION)
+        return MappedScan.lost(prediction, reason, fit)
 
     @property
     def gives_up(self) -> bool:

@@ -10,13 +10,15 @@ from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.motion.prediction import MotionState, Prediction, Prior
+from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, OdometryNoise, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.budget import Budget
+from lidarslam.mapping.tracking.fit import NO_FIT
 from lidarslam.mapping.tracking.mapped_scan import Attempt, judge
 from lidarslam.mapping.tracking.near_search import NearSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
+from lidarslam.mapping.tracking.tracker import Tracker
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 CELL_M, FINS_M, SHELVES_M = 0.05, 0.6, 0.2
@@ -127,3 +129,23 @@ def test_where_few_points_constrain_the_height_the_odometry_decides_after_short_
     prior = Prior(moved, covariance=np.diag([0.01] * 3 + [0.005] * 3) ** 2)
     held = NearSearch(matcher, TrackingState(), prior, near.prediction).held_by_odometry(near)
     assert held.T_world_lidar[2, 3] == pytest.approx(height_m, abs=0.01)
+
+
+# Of an odometry that was consistent so far, here at rest.
+PROVEN = replace(TrackingState(), is_measured=True, odometry_noise=OdometryNoise(agreed=20))
+AT_REST = Prior(HERE, covariance=np.diag([0.01] * 3 + [0.02] * 3) ** 2)
+
+
+def test_a_proven_odometry_continues_the_pose_of_a_lost_scan_with_its_own_covariance(at_shelves):
+    predicted = registered(at_shelves, LOWER, (0.04, 0.04, 0.25)).prediction
+    tracker = Tracker(MappingConfig())
+    for state in (TrackingState(), PROVEN):
+        tracker.tracking = state
+        continued = NearSearch(at_shelves, state, AT_REST, predicted).continued(predicted)
+        lost = tracker.lose(continued, "few points fit", NO_FIT).state
+        if state is PROVEN:
+            np.testing.assert_allclose(lost.T_world_lidar, HERE, atol=0.005)
+            assert np.sqrt(np.diag(lost.covariance)[3:6].max()) < 0.03
+        else:
+            np.testing.assert_array_equal(lost.T_world_lidar, LOWER)
+            np.testing.assert_array_equal(lost.covariance, LOST_MOTION)

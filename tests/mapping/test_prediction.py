@@ -226,3 +226,10 @@ def test_a_motion_is_allowed_within_a_few_of_the_odometrys_deviations():
     assert not Prior(MOVED, covariance=covariance).allows(far)
     assert Prior(MOVED).allows(far)
     assert Prior().allows(far)
+
+
+def test_the_likelihood_of_a_motion_falls_with_its_distance_from_a_proven_odometrys():
+    prior = Prior(MOVED, covariance=np.diag([1e-6] * 3 + [0.01**2] * 3), caution=2.0)
+    noise = OdometryNoise(variance=4.0, agreed=20)
+    assert noise.likelihood(prior, MOVED @ ahead(0.04), CONFIG) == pytest.approx(np.exp(-0.5))
+    assert OdometryNoise().likelihood(prior, MOVED @ ahead(0.04), CONFIG) == 1.0, "not proven"
