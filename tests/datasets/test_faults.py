@@ -49,7 +49,7 @@ def test_unreadable_scans_are_left_out_where_they_are_counted_and_raised_elsewhe
 def test_a_recording_is_described_by_its_first_readable_scan():
     info = Odd([1, 3, 4, 6]).describe()
     assert (info.first.stamp, info.scans, info.last_stamp) == (4.0, 4, 6.0)
-    assert info.notes == ("2 scans were left out: they could not be read; the first: 1 is damaged",)
+    assert info.notes == ("2 scans were left out: not readable; the first: 1 is damaged",)
     with pytest.raises(InputError, match="1 is damaged"):
         Odd([1, 3]).describe()
     with pytest.raises(InputError, match="drive: holds no scan"):

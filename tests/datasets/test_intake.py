@@ -79,7 +79,7 @@ def test_times_of_no_sweep_are_told(rng, span_s):
 def test_times_shifted_away_from_the_stamp_are_told(rng, shift_s, told):
     points = rng.uniform(-8.0, 8.0, (1000, 3))
     _, faults = seen(points, time_offsets=np.linspace(0.0, 0.1, 1000) + shift_s)
-    assert ["stamped outside its sweep" in said and told in said for said in faults.warnings()] == [True] * bool(told)
+    assert ["stamped outside the sweep" in said and told in said for said in faults.warnings()] == [True] * bool(told)
 
 
 def test_points_without_a_time_are_counted(rng):
@@ -93,7 +93,7 @@ def test_points_without_a_time_are_counted(rng):
 
 
 def test_all_points_at_one_place_are_told():
-    assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scan has all its points at one place")
+    assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scan has all points at one place")
 
 
 class Recorded:

@@ -1,17 +1,25 @@
 """Point clouds of a rosbag: rosbag1, rosbag2 (SQLite or MCAP), as PointCloud2, Livox CustomMsg or packets."""
 
+import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.packets.packet_recording import require
+from lidarslam.datasets.packets.ouster import (
+    OusterRecording,
+    find_metadata,
+    frames_of_packets,
+    imu_packets,
+    read_sensor,
+)
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
@@ -26,10 +34,10 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
-from lidarslam.datasets.ros.ouster_bag import OusterBag
-from lidarslam.datasets.stored_recording import CloudRecording, truth_beside
+from lidarslam.datasets.stored_recording import CloudRecording, require, truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
+_STRING_TYPE = "std_msgs/msg/String"
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
 # As a share of one topic's messages, the most of all others together if these are no recordings: occasional maps.
@@ -201,6 +209,52 @@ class BagRecording(CloudRecording):
             if number % apart == 1:
                 yield pair
                 pair = []
+
+
+class OusterBag(OusterRecording):
+    """The packets of an Ouster in one `lidar_packets` topic, as ouster_ros records them.
+
+    The sensor's metadata is in a topic or next to the bag.
+    """
+
+    reader = "rosbag"
+
+    def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
+        super().__init__(source, config)
+        self._bag = bag
+        self._topic = topic
+        self.topic, self.topics = topic.name, bag.topics
+        self.warnings = () if bag.damage is None else (bag.damage,)
+
+    @cached_property
+    def sensor(self) -> Any:
+        """See `OusterRecording`."""
+        if (text := next(self._contents("metadata", _STRING_TYPE), None)) is not None:
+            return read_sensor(text.decode(errors="replace"))
+        if (beside := find_metadata(self._source)) is not None:
+            return read_sensor(beside.read_text(encoding="utf-8", errors="replace"))
+        raise InputError(
+            f"{self._source}: {self.topic} holds packets of an Ouster, which need the sensor's metadata; put it"
+            f" beside the bag as {self.name}.json"
+        )
+
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
+        contents = self._contents(self._topic.name.rpartition("/")[2], self._topic.message_type)
+        return islice(frames_of_packets(self.sensor, contents), wanted.start, wanted.stop, wanted.step)
+
+    def _packets_of_imu(self) -> Iterator[Any]:
+        return imu_packets(self.sensor, self._contents("imu_packets", self._topic.message_type))
+
+    def _contents(self, name: str, message_type: str) -> Iterator[bytes]:
+        """The content of the messages of a topic other than that of the packets: a single string or array of bytes."""
+        beside = f"{self._topic.name.rpartition('/')[0]}/{name}"
+        topic = next((t for t in self._bag.topics if (t.name, t.message_type) == (beside, message_type)), None)
+        for message in self._bag.messages(topic) if topic is not None else ():
+            start = 8 if self._bag.ros2 else 4
+            order = ">" if self._bag.ros2 and message.raw[1:2] == b"\x00" else "<"
+            if len(message.raw) >= start:
+                (length,) = struct.unpack_from(order + "I", message.raw, start - 4)
+                yield message.raw[start : start + length].rstrip(b"\0" if message_type == _STRING_TYPE else b"")
 
 
 def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
