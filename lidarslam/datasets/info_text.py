@@ -95,7 +95,15 @@ def format_info(source: Path, info: RecordingInfo) -> str:
 def _text(rows: Sequence[tuple[str, str]], topics: Sequence[Topic], chosen: str | None) -> str:
     width = max(len(name) for name, _ in rows) + 2
     lines = [f"{name:<{width}}{one_line(text)}" for name, text in rows]
-    return "\n".join([*lines, *_topic_lines(topics, chosen)])
+    if topics:
+        named = [(one_line(topic.name), one_line(topic.message_type)) for topic in topics]
+        names, types = (max(map(len, column)) for column in zip(*named, strict=True))
+        lines += ["", "topics"]
+        lines += [
+            f"  {'*' if topic.name == chosen else ' '} {name:<{names}}  {kind:<{types}}  {topic.messages:>8,}"
+            for topic, (name, kind) in zip(topics, named, strict=True)
+        ]
+    return "\n".join(lines)
 
 
 def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
@@ -156,14 +164,3 @@ def _imu(imu: ImuSummary) -> str:
     rate = "" if imu.rate_hz is None else f" at {imu.rate_hz:.0f} Hz"
     extrinsic = "extrinsic known" if imu.has_extrinsic else "extrinsic unknown"
     return f"{imu.name}, {count(imu.samples, 'sample')}{rate}, {extrinsic}"
-
-
-def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:
-    if not topics:
-        return
-    yield from ("", "topics")
-    names = max(len(one_line(topic.name)) for topic in topics)
-    types = max(len(one_line(topic.message_type)) for topic in topics)
-    for topic in topics:
-        mark = "*" if topic.name == chosen else " "
-        yield f"  {mark} {one_line(topic.name):<{names}}  {one_line(topic.message_type):<{types}}  {topic.messages:>8,}"

@@ -224,10 +224,11 @@ def absent(source: Path) -> str:
     with suppress(OSError):
         names = [entry.name for entry in islice(parent.iterdir(), _MOST_ENTRIES)]
     missing = source.relative_to(parent).parts[0] if parent != Path() else source.parts[0]
-    similar = get_close_matches(missing, names, n=3)
-    hint = f"; did you mean {', '.join(str(parent / name) for name in similar)}?" if similar else ""
-    within = f", there is no {parent / missing}" if parent / missing != source else ""
-    return f"{source}: no such file or folder{within}{hint}"
+    similar = ", ".join(str(parent / name) for name in get_close_matches(missing, names, n=3))
+    hint = f"; did you mean {similar}?" if similar else ""
+    return (
+        f"{source}: no such file or folder" + f", there is no {parent / missing}" * (parent / missing != source) + hint
+    )
 
 
 def result_of_program(source: Path) -> str | None:

@@ -129,14 +129,6 @@ def test_a_folder_without_usable_metadata_is_its_file(write_drive, kind, content
         open_recording(folder)
 
 
-def test_a_part_of_a_bag_says_that_there_are_others(write_drive):
-    file, folder, _ = write_drive("mcap")
-    assert open_recording(file).warnings == ()
-    (folder / "drive_1.mcap").write_bytes(b"-")
-    (warning,) = open_recording(file).warnings
-    assert warning == f"This file is one of 2 parts of the bag {folder}; name the folder for all."
-
-
 def test_a_bag_without_index_is_read_up_to_a_damaged_chunk(write_drive):
     file, _, _ = write_drive("mcap", count=2)
     data = file.read_bytes()

@@ -261,8 +261,3 @@ def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, n
     for points in (b"element vertex 120", b"element vertex 0"):
         lie = header.replace(b"element vertex 120", points) + b"end_header\n" + body
         assert_refused(tmp_path / name, lie, r"1,000,000,000,000 other elements .* truncated")
-
-
-def test_an_empty_scan_is_none_of_them(tmp_path, table):
-    (tmp_path / "a.ply").write_bytes(encode("ascii.ply", table[:0]) + b"\n")
-    assert len(next(open_recording(tmp_path).scans())) == 0

@@ -12,7 +12,7 @@ from lidarslam.datasets import info_text
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.info_text import describe_as_json
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.recording import ImuSummary, RecordingInfo, SeveralTopicsError, Topic
+from lidarslam.datasets.recording import ImuSummary, RecordingInfo, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 KEYS = {
@@ -81,15 +81,6 @@ def test_what_is_not_there_is_null(bag: Path, monkeypatch: pytest.MonkeyPatch) -
     nothing = {key for key in KEYS if content[key] is None}
     assert nothing == {"topic", "rate_hz", "point_time", "ground_truth", "imu"}
     assert content["first_scan"] == {"points": 1, "dropped_points": 0, **HAS}
-
-
-def test_topics_to_choose_from(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    other = Topic("/rear", CLOUDS.message_type, 2)
-    content = described(bag, monkeypatch, SeveralTopicsError("several", [CLOUDS, other], [CLOUDS, other]))
-    assert set(content) == KEYS
-    assert (content["reader"], content["scans"], content["topic_choices"]) == ("rosbag", None, ["/points", "/rear"])
-    assert [topic["name"] for topic in content["topics"]] == ["/points", "/rear"]
-    assert content["notes"] == ["Choose one of them with --topic, such as --topic /points"]
 
 
 def test_the_keys_are_documented() -> None:

@@ -38,7 +38,6 @@ from lidarslam.datasets.stored_recording import CloudRecording, require, truth_b
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _STRING_TYPE = "std_msgs/msg/String"
-_PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
 # As a share of one topic's messages, the most of all others together if these are no recordings: occasional maps.
 _NEGLIGIBLE = 0.05
@@ -104,7 +103,7 @@ class BagRecording(CloudRecording):
         """Other topics, a lost index, headers without stamps, and faults of the points' times."""
         others = _others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (others, self._bag.damage, unset, _one_part(self._source), *self._timing.warnings)
+        found = (others, self._bag.damage, unset, *self._timing.warnings)
         return tuple(warning for warning in found if warning is not None)
 
     @cached_property
@@ -140,8 +139,7 @@ class BagRecording(CloudRecording):
             damages.append(damage)
             faults.note(_DAMAGED, damage)
 
-        for message in self._bag.messages(self._topic, note):
-            count += 1
+        for count, message in enumerate(self._bag.messages(self._topic, note), 1):  # noqa: B007 - the last one counts
             yield message
         if not count:
             lists = f"{self._source}: its index lists {len(self)} messages of {self._topic.name}, it holds none;"
@@ -276,18 +274,12 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
         raise SeveralTopicsError(message, clouds, topics)
     if not any(topic.messages for topic in topics):
         raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
-    others = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
     hint = ""
-    if others:
-        hint = (
-            f" {others[0].name} holds raw packets of a sensor whose packets are not decoded: play it through the"
-            " sensor's driver and record the point clouds."
-        )
-    elif any(topic.message_type.replace("/", "/msg/") in CLOUD_TYPES for topic in topics):
+    if any(topic.message_type.replace("/", "/msg/") in CLOUD_TYPES for topic in topics):
         hint = " Its messages are those of ROS 1, which are read from a .bag alone: give the one it was converted from."
     raise InputError(
-        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages.{hint} Its topics:"
-        f" {_listing(topics)}"
+        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages; packets of other"
+        f" sensors are not decoded.{hint} Its topics: {_listing(topics)}"
     )
 
 
@@ -301,15 +293,6 @@ def _others_left_out(topics: Sequence[Topic], chosen: Topic) -> str | None:
 def _has_packets(topic: Topic) -> bool:
     is_lidar = "lidar" in topic.name.rpartition("/")[2]  # packets of the IMU have the same type
     return topic.message_type == VELODYNE_SCAN_TYPE or (topic.message_type in OUSTER_PACKET_TYPES and is_lidar)
-
-
-def _one_part(source: Path) -> str | None:
-    """A sentence where a file is one of several of a rosbag2."""
-    folder = source.absolute().parent
-    if source.is_dir() or not (folder / "metadata.yaml").is_file():
-        return None
-    parts = len(list(folder.glob(f"*{source.suffix}")))
-    return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
 
 
 def _listing(topics: Sequence[Topic]) -> str:
