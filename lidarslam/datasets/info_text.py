@@ -20,13 +20,9 @@ from lidarslam.datasets.registry import choose_reader, open_recording
 # Between these a stamp is a date; else it counts from some start.
 _EPOCH_FROM_S, _EPOCH_UNTIL_S = 5e8, 5e9
 _KEYS = (
-    "source", "reader", "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan",
-    "point_time", "ground_truth", "imu",
+    "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan", "point_time",
+    "ground_truth", "imu",
 )  # fmt: skip
-_NOTHING_KNOWN: dict[str, Any] = {
-    **dict.fromkeys(_KEYS),
-    **{key: [] for key in ("fields", "notes", "topics", "topic_choices")},
-}
 _CHOOSE = "Choose one of them with --topic, such as --topic {}"
 
 
@@ -45,7 +41,8 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
 
 def describe_as_json(source: Path, config: ReaderConfig) -> str:
     """The same as JSON with the keys of docs/command_line.md, all of them always; null for unknown values."""
-    content = {**_NOTHING_KNOWN, "source": str(source), "reader": choose_reader(source, config.name)}
+    content: dict[str, Any] = {"source": str(source), "reader": choose_reader(source, config.name)}
+    content |= {**dict.fromkeys(_KEYS), "fields": [], "notes": [], "topics": [], "topic_choices": []}
     try:
         content |= _content(open_recording(source, config).describe())
     except SeveralTopicsError as error:

@@ -26,7 +26,6 @@ from lidarslam.datasets.stored_recording import STORAGE_SUFFIXES, storage_files
 
 logger = logging.getLogger(__name__)
 
-_PACKET_SUFFIXES = (".pcap", ".pcapng", ".osf")
 _LISTED = 5
 # Depth of the search for recordings, and the largest number of entries of a folder.
 _DEPTH, _MOST_ENTRIES = 3, 1000
@@ -59,71 +58,67 @@ def _bag_of_folder(folder: Path) -> Path:
     return folder / f"{folder.resolve().name}.bag"
 
 
+def _has(*patterns: str) -> Callable[[Path], bool]:
+    """Whether a folder has a path of one of these patterns; those that end in a slash are folders."""
+    return lambda source: any(any(source.glob(pattern)) for pattern in patterns)
+
+
 def _is_kitti_360(source: Path) -> bool:
     is_drive = source.resolve().parent.name == "data_3d_raw" and (source / "velodyne_points").is_dir()
     return is_drive or (source / "data_3d_raw").is_dir()
 
 
+_HERE = "lidarslam.datasets"
 READERS: dict[str, Reader] = {
     "evalio": Reader(
-        "lidarslam.datasets.published.evalio",
+        f"{_HERE}.published.evalio",
         "data sets of evalio: evalio:DATASET/SEQUENCE, or that folder of its data (lidarslam datasets)",
         is_of_evalio,
     ),
     "kitti-odometry": Reader(
-        "lidarslam.datasets.published.kitti_odometry",
+        f"{_HERE}.published.kitti_odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
-        lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
+        _has("sequences/", "velodyne/"),
         takes_sequence=True,
         elevation_deg=KITTI_DEG,
     ),
     "kitti-360": Reader(
-        "lidarslam.datasets.published.kitti_360",
+        f"{_HERE}.published.kitti_360",
         "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
         _is_kitti_360,
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        "lidarslam.datasets.published.kitti_raw",
+        f"{_HERE}.published.kitti_raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
-        lambda source: (source / "velodyne_points" / "data").is_dir(),
+        _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
     ),
     "nuscenes": Reader(
-        "lidarslam.datasets.published.nuscenes",
+        f"{_HERE}.published.nuscenes",
         "nuScenes: the root with v1.0-* (with --sequence)",
-        lambda source: any(source.glob("v1.0-*/scene.json")),
-        takes_sequence=True,
+        _has("v1.0-*/scene.json"),
+        True,
     ),
     "argoverse-2": Reader(
-        "lidarslam.datasets.published.argoverse2",
-        "Argoverse 2: the folder of a log",
-        lambda source: any((source / "sensors" / "lidar").glob("*.feather")),
+        f"{_HERE}.published.argoverse2", "Argoverse 2: the folder of a log", _has("sensors/lidar/*.feather")
     ),
     "apollo": Reader(
-        "lidarslam.datasets.published.apollo",
+        f"{_HERE}.published.apollo",
         "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
-        lambda source: any(source.glob("poses/gt_poses.txt")) or any(source.glob("*/poses/gt_poses.txt")),
+        _has("poses/gt_poses.txt", "*/poses/gt_poses.txt"),
         takes_sequence=True,
     ),
-    "mulran": Reader(
-        "lidarslam.datasets.published.mulran",
-        "MulRan: a sequence with a folder Ouster",
-        lambda source: (source / "Ouster").is_dir(),
-    ),
-    "nclt": Reader(
-        "lidarslam.datasets.published.nclt",
-        "NCLT: a session with a folder velodyne_sync",
-        lambda source: (source / "velodyne_sync").is_dir(),
-    ),
-    "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "mulran": Reader(f"{_HERE}.published.mulran", "MulRan: a sequence with a folder Ouster", _has("Ouster/")),
+    "nclt": Reader(f"{_HERE}.published.nclt", "NCLT: a session with a folder velodyne_sync", _has("velodyne_sync/")),
+    "rosbag": Reader(f"{_HERE}.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "packets": Reader(
-        "lidarslam.datasets.packets.velodyne",
+        f"{_HERE}.packets.velodyne",
         ".pcap of a Velodyne, or of an Ouster with its metadata .json beside it; Ouster's .osf",
-        lambda source: source.suffix.lower() in _PACKET_SUFFIXES,
+        lambda source: source.suffix.lower() in (".pcap", ".pcapng", ".osf"),
     ),
     "scan-folder": Reader(
-        "lidarslam.datasets.folders.scan_folder",
+        f"{_HERE}.folders.scan_folder",
         "a folder of .bin, .pcd, .ply or .npy scans",
         lambda source: source.is_dir() and any(e.suffix.lower() in SCAN_SUFFIXES for e in source.iterdir()),
     ),

@@ -12,7 +12,7 @@ from lidarslam.datasets import info_text
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.info_text import describe_as_json
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.recording import ImuSummary, RecordingInfo, Topic
+from lidarslam.datasets.recording import ImuSummary, RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 KEYS = {
@@ -77,10 +77,11 @@ def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_not_there_is_null(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = RecordingInfo("scan-folder", 1, Scan.from_raw(np.ones((1, 3)), 5.0), 5.0, None, None)
     content = described(bag, monkeypatch, info)
-    assert set(content) == KEYS
     nothing = {key for key in KEYS if content[key] is None}
     assert nothing == {"topic", "rate_hz", "point_time", "ground_truth", "imu"}
-    assert content["first_scan"] == {"points": 1, "dropped_points": 0, **HAS}
+    several = described(bag, monkeypatch, SeveralTopicsError("several", [CLOUDS, CLOUDS], [CLOUDS, CLOUDS]))
+    assert set(several) == set(content) == KEYS
+    assert (several["reader"], several["scans"], several["topic_choices"]) == ("rosbag", None, ["/points"] * 2)
 
 
 def test_the_keys_are_documented() -> None:

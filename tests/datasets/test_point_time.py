@@ -214,10 +214,11 @@ def test_time_fields_are_found(names):
 
 
 @pytest.mark.parametrize("name", ["ring", "channel", "line", "laser_id", "range", "scalar_ring"])
-def test_ring_fields_are_found(name):
-    cloud = raw_cloud(np.zeros(3, [(name, "f4") for name in ("x", "y", "z", name)]))
+def test_ring_fields_are_found_and_coordinates_in_upper_case(name):
+    cloud = raw_cloud(np.ones(3, [(name, "f4") for name in ("X", "Y", "Z", name)]))
     assert (cloud.rings is None) == (name == "range")
     assert cloud.time_field is None
+    assert cloud.points.tolist() == [[1.0, 1.0, 1.0]] * 3
 
 
 @pytest.mark.parametrize("reference", ["auto", "none"])

@@ -34,7 +34,7 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
-from lidarslam.datasets.stored_recording import CloudRecording, require, truth_beside
+from lidarslam.datasets.stored_recording import CloudRecording, require, storage_files, truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _STRING_TYPE = "std_msgs/msg/String"
@@ -103,7 +103,7 @@ class BagRecording(CloudRecording):
         """Other topics, a lost index, headers without stamps, and faults of the points' times."""
         others = _others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (others, self._bag.damage, unset, *self._timing.warnings)
+        found = (others, self._bag.damage, unset, _one_part(self._source), *self._timing.warnings)
         return tuple(warning for warning in found if warning is not None)
 
     @cached_property
@@ -293,6 +293,13 @@ def _others_left_out(topics: Sequence[Topic], chosen: Topic) -> str | None:
 def _has_packets(topic: Topic) -> bool:
     is_lidar = "lidar" in topic.name.rpartition("/")[2]  # packets of the IMU have the same type
     return topic.message_type == VELODYNE_SCAN_TYPE or (topic.message_type in OUSTER_PACKET_TYPES and is_lidar)
+
+
+def _one_part(source: Path) -> str | None:
+    """A sentence where a file is one of several of a rosbag2."""
+    folder = source.absolute().parent
+    parts = storage_files(folder) if source.is_file() and (folder / "metadata.yaml").is_file() else []
+    return f"This file is one of {len(parts)} parts of the bag {folder}; name the folder." if len(parts) > 1 else None
 
 
 def _listing(topics: Sequence[Topic]) -> str:
