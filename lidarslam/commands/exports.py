@@ -160,10 +160,10 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, overwrite: boo
     RUN is a run directory. The grid is map.yaml and map.pgm; obstacles are points between two heights above the local
     ground.
     """
-    from lidarslam.exports.grid import export_grid, require_yaml
+    from lidarslam.exports.grid import SUFFIXES, export_grid
     from lidarslam.exports.source import require_new
 
-    require_yaml(out)
+    _require_suffix(out, SUFFIXES)
     for file in (out, out.with_suffix(".pgm")):
         require_new(file, overwrite)
     for line in export_grid(run, out, resolution_m, heights):
@@ -201,7 +201,7 @@ def export_geo(run: Path, out: Path, overwrite: bool) -> None:
     RUN is a run directory of a KITTI raw drive, or of a bag with sensor_msgs/NavSatFix. The trajectory is aligned with
     the GNSS track as a rigid body; its shape stays.
     """
-    from lidarslam.exports.geo import export_geo, georeference
+    from lidarslam.exports.geo import export_geo
 
-    for line in export_geo(georeference(run), out, overwrite):
+    for line in export_geo(run, out, overwrite):
         say(line)

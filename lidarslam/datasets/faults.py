@@ -1,32 +1,21 @@
 """Faults of a recording's scans, counted while they are read."""
 
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 from lidarslam.core.errors import InputError
 
-T = TypeVar("T")
-
-NO_POINT_TIME = "scans have no usable times of their points and are taken as measured at one instant"
-_UNREADABLE = "scans were left out: they could not be read"
-# Of the kinds, for a single scan.
-_SINGULAR = (
-    ("scans of more than 1,048,576 points were", "scan of more than 1,048,576 points was"),
-    ("scans were", "scan was"),
-    ("scans are", "scan is"),
-    ("scans have", "scan has"),
-    ("scans look", "scan looks"),
-    ("scans turn", "scan turns"),
-    ("places in the bag were", "place in the bag was"),
-    ("they co", "it co"),
-    ("it come", "it comes"),
-    ("their stamps were", "its stamp was"),
-    ("their stamps are", "its stamp is"),
-    ("and are taken", "and is taken"),
-    ("and carry", "and carries"),
-    ("their points", "its points"),
-    ("outside their sweeps", "outside its sweep"),
-)
+NO_POINT_TIME = "scans have no usable times of points and are taken as measured at one instant"
+_UNREADABLE = "scans were left out: not readable"
+# Of the words of a kind before its colon, for a single scan.
+_SINGULAR = {
+    "scans": "scan",
+    "places": "place",
+    "were": "was",
+    "are": "is",
+    "have": "has",
+    "look": "looks",
+    "turn": "turns",
+}
 
 
 @dataclass
@@ -57,7 +46,7 @@ class Faults:
 
 
 def _counted(number: int, kind: str) -> str:
+    said, colon, why = kind.partition(":")
     if number == 1:
-        for several, one in _SINGULAR:
-            kind = kind.replace(several, one)
-    return f"{number:,} {kind}"
+        said = " ".join(_SINGULAR.get(word, word) for word in said.split(" "))
+    return f"{number:,} {said}{colon}{why}"

@@ -147,8 +147,6 @@ def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
 
 def _append(storage: Any, remote: str, place: Path, size: int | None, before: int) -> int:
     with place.open("ab") as file:
-        if file.tell() and file.tell() != size:
-            logger.warning("%s: continued after %.0f MB", remote, file.tell() / 1e6)
         # Over http, several requests want a server that reads from the middle of a file.
         streamed = {"block_size": 0} if not file.tell() and hasattr(storage, "client_kwargs") else {}
         with storage.open(remote, "rb", **streamed) as source:

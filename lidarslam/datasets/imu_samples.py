@@ -43,10 +43,12 @@ def usable_samples(
     rows = finite_rows[np.unique(stamps[finite_rows], return_index=True)[1]]
     if not len(rows):
         return None
-    kinds = {"with a number that is not finite": len(stamps), "with the stamp of another": len(finite_rows)}
-    for (kind, before), after in zip(kinds.items(), (len(finite_rows), len(rows)), strict=True):
-        if before > after:
-            notes = (*notes, f"{count(before - after, 'IMU sample')} {kind} left out.")
+    for kind, left_out in (
+        ("with a number that is not finite", len(stamps) - len(finite_rows)),
+        ("with the stamp of another", len(finite_rows) - len(rows)),
+    ):
+        if left_out:
+            notes = (*notes, f"{count(left_out, 'IMU sample')} {kind} left out.")
     force = accelerations[rows]
     size = float(np.median(np.linalg.norm(force, axis=1)))
     if _IN_G[0] < size < _IN_G[1]:
@@ -57,7 +59,8 @@ def usable_samples(
     kept = ~(_saturated(angular_velocities[rows], _LEAST_RANGES[0]) | _saturated(force, _LEAST_RANGES[1]))
     if (saturated := len(kept) - int(kept.sum())) > 0:
         notes = (*notes, f"{count(saturated, 'IMU sample')} out of the sensor's range left out.")
-    missing = _missing(stamps[rows])
+    steps = np.diff(stamps[rows])
+    missing = 1.0 - len(steps) * float(np.median(steps)) / float(steps.sum()) if len(steps) > 1 else 0.0
     if missing > _MISSING:
         notes = (*notes, f"{100.0 * missing:.0f} % of the IMU's samples are missing.")
     return ImuSamples(stamps[rows][kept], angular_velocities[rows][kept], force[kept], T_lidar_imu, notes)
@@ -71,12 +74,6 @@ def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
     runs = np.lib.stride_tricks.sliding_window_view(np.pad(at_limit, ((_REPEATED - 1,) * 2, (0, 0))), _REPEATED, axis=0)
     whole = np.asarray(runs.all(axis=-1))
     return np.asarray(np.any([whole[n : n + len(vectors)] for n in range(_REPEATED)], axis=(0, 2)))
-
-
-def _missing(stamps: FloatArray) -> float:
-    if len(stamps) < 3:
-        return 0.0
-    return 1.0 - (len(stamps) - 1) * float(np.median(np.diff(stamps))) / float(stamps[-1] - stamps[0])
 
 
 def summarise(name: str, samples: ImuSamples | None) -> ImuSummary | None:

@@ -20,13 +20,9 @@ from lidarslam.datasets.registry import choose_reader, open_recording
 # Between these a stamp is a date; else it counts from some start.
 _EPOCH_FROM_S, _EPOCH_UNTIL_S = 5e8, 5e9
 _KEYS = (
-    "source", "reader", "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan",
-    "point_time", "ground_truth", "imu",
+    "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan", "point_time",
+    "ground_truth", "imu",
 )  # fmt: skip
-_NOTHING_KNOWN: dict[str, Any] = {
-    **dict.fromkeys(_KEYS),
-    **{key: [] for key in ("fields", "notes", "topics", "topic_choices")},
-}
 _CHOOSE = "Choose one of them with --topic, such as --topic {}"
 
 
@@ -45,7 +41,8 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
 
 def describe_as_json(source: Path, config: ReaderConfig) -> str:
     """The same as JSON with the keys of docs/command_line.md, all of them always; null for unknown values."""
-    content = {**_NOTHING_KNOWN, "source": str(source), "reader": choose_reader(source, config.name)}
+    content: dict[str, Any] = {"source": str(source), "reader": choose_reader(source, config.name)}
+    content |= {**dict.fromkeys(_KEYS), "fields": [], "notes": [], "topics": [], "topic_choices": []}
     try:
         content |= _content(open_recording(source, config).describe())
     except SeveralTopicsError as error:
@@ -95,7 +92,15 @@ def format_info(source: Path, info: RecordingInfo) -> str:
 def _text(rows: Sequence[tuple[str, str]], topics: Sequence[Topic], chosen: str | None) -> str:
     width = max(len(name) for name, _ in rows) + 2
     lines = [f"{name:<{width}}{one_line(text)}" for name, text in rows]
-    return "\n".join([*lines, *_topic_lines(topics, chosen)])
+    if topics:
+        named = [(one_line(topic.name), one_line(topic.message_type)) for topic in topics]
+        names, types = (max(map(len, column)) for column in zip(*named, strict=True))
+        lines += ["", "topics"]
+        lines += [
+            f"  {'*' if topic.name == chosen else ' '} {name:<{names}}  {kind:<{types}}  {topic.messages:>8,}"
+            for topic, (name, kind) in zip(topics, named, strict=True)
+        ]
+    return "\n".join(lines)
 
 
 def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
@@ -156,14 +161,3 @@ def _imu(imu: ImuSummary) -> str:
     rate = "" if imu.rate_hz is None else f" at {imu.rate_hz:.0f} Hz"
     extrinsic = "extrinsic known" if imu.has_extrinsic else "extrinsic unknown"
     return f"{imu.name}, {count(imu.samples, 'sample')}{rate}, {extrinsic}"
-
-
-def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:
-    if not topics:
-        return
-    yield from ("", "topics")
-    names = max(len(one_line(topic.name)) for topic in topics)
-    types = max(len(one_line(topic.message_type)) for topic in topics)
-    for topic in topics:
-        mark = "*" if topic.name == chosen else " "
-        yield f"  {mark} {one_line(topic.name):<{names}}  {one_line(topic.message_type):<{types}}  {topic.messages:>8,}"

@@ -41,9 +41,9 @@ _THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most 
 _TOO_FAST = (
     "scans are stamped within a millisecond of the one before, which no LiDAR does: check the unit of the stamps"
 )
-_NOT_METRES = "scans look like centimetres or millimetres, where metres are expected: convert the points"
+_NOT_METRES = "scans look like centimetres or millimetres instead of metres: convert the points"
 _AT_ONCE = (
-    "scans have times of their points that span less than a millisecond: motion during a sweep is not compensated; if"
+    "scans have times of points that span less than a millisecond: motion during a sweep is not compensated; if"
     " the sensor turns, the times are wrong or in another unit (reader.time_unit, reader.time_reference=azimuth)"
 )
 _COUNTER_CLOCKWISE = (
@@ -51,12 +51,12 @@ _COUNTER_CLOCKWISE = (
     " mirrored, and so is the map, or the times of their points run backwards (reader.time_scale=-1)"
 )
 _OUTSIDE_SWEEP = (
-    "scans are stamped outside their sweeps, and poses belong to the stamps: check whether the times of the points are"
-    " shifted or on another clock"
+    "scans are stamped outside the sweep: poses belong to the stamps; check whether the times of the points are shifted"
+    " or on another clock"
 )
-_UNTIMED = "scans have points without a time, which were given one between those of their neighbours"
+_UNTIMED = "scans have points without a time, interpolated between the neighbours"
 _REPEATED = "scans were left out: they have the points of the scan before, as from a driver that hangs"
-_ONE_PLACE = "scans have all their points at one place and carry no geometry"
+_ONE_PLACE = "scans have all points at one place, without geometry"
 
 
 def choose_scans(recording: Recording, source: Path, start: int, stop: int | None, step: int) -> range:

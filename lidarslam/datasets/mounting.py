@@ -104,7 +104,7 @@ def mounting_with_up(up: FloatArray) -> Mounting:
 
 def written(mounting: Mounting) -> str:
     """As the value of `--set reader.mounting=`."""
-    return mounting if isinstance(mounting, str) else "[" + ",".join(f"{angle:g}" for angle in mounting) + "]"
+    return mounting if isinstance(mounting, str) else f"[{','.join(f'{angle:g}' for angle in mounting)}]"
 
 
 def correct_elevation(points: NDArray[np.floating], angle_deg: float) -> FloatArray:

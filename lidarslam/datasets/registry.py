@@ -22,12 +22,10 @@ from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import STORAGE_SUFFIXES, storage_files
 
 logger = logging.getLogger(__name__)
 
-# Of rosbag2; a recorder that was killed leaves such a file without its metadata.yaml.
-_BAG_SUFFIXES = (".db3", ".mcap")
-_PACKET_SUFFIXES = (".pcap", ".pcapng", ".osf")
 _LISTED = 5
 # Depth of the search for recordings, and the largest number of entries of a folder.
 _DEPTH, _MOST_ENTRIES = 3, 1000
@@ -37,25 +35,6 @@ _SOURCE = re.compile(r"^  source: (.+?)(?: +#.*)?$", re.MULTILINE)
 
 # Readers of recordings of many folders; scans and bags may be anywhere.
 _LAYOUTS = ("kitti-odometry", "kitti-raw")
-_CONVERT = "convert each scan to .ply, .pcd or .npy"
-_KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
-    ((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), "images", "name the folder with the LiDAR's scans"),
-    ((".mp4", ".avi", ".mkv", ".mov"), "video", "name the recording of the LiDAR"),
-    (
-        (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar", ".zst"),
-        "packed",
-        "unpack it and name the result",
-    ),
-    ((".las", ".laz", ".e57"), "survey formats, which are not read as scans", _CONVERT),
-    ((".csv", ".xyz", ".pts", ".asc"), "points as text, which are not read as scans", _CONVERT),
-    ((".tum", ".g2o"), "poses, not scans", "name the recording; lidarslam evaluate compares trajectories"),
-    ((".rrd",), "a Rerun recording", "lidarslam view shows it"),
-    (
-        (".txt",),
-        "text",
-        "name the folder or the bag with the scans; scans as text have to be converted to .ply or .npy",
-    ),
-)
 
 
 class Reader(NamedTuple):
@@ -70,10 +49,8 @@ class Reader(NamedTuple):
 
 def _is_rosbag(source: Path) -> bool:
     if source.is_dir():
-        named = (entry for entry in source.iterdir() if entry.suffix in _BAG_SUFFIXES and entry.name[0] != ".")
-        is_bag = any(entry.is_file() for entry in named)
-        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or is_bag
-    return source.suffix in (".bag", *_BAG_SUFFIXES) or source.name.endswith(".bag.active")
+        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or bool(storage_files(source))
+    return source.suffix in (".bag", *STORAGE_SUFFIXES) or source.name.endswith(".bag.active")
 
 
 def _bag_of_folder(folder: Path) -> Path:
@@ -81,73 +58,69 @@ def _bag_of_folder(folder: Path) -> Path:
     return folder / f"{folder.resolve().name}.bag"
 
 
+def _has(*patterns: str) -> Callable[[Path], bool]:
+    """Whether a folder has a path of one of these patterns; those that end in a slash are folders."""
+    return lambda source: any(any(source.glob(pattern)) for pattern in patterns)
+
+
 def _is_kitti_360(source: Path) -> bool:
     is_drive = source.resolve().parent.name == "data_3d_raw" and (source / "velodyne_points").is_dir()
     return is_drive or (source / "data_3d_raw").is_dir()
 
 
+_HERE = "lidarslam.datasets"
 READERS: dict[str, Reader] = {
     "evalio": Reader(
-        "lidarslam.datasets.published.evalio",
+        f"{_HERE}.published.evalio",
         "data sets of evalio: evalio:DATASET/SEQUENCE, or that folder of its data (lidarslam datasets)",
         is_of_evalio,
     ),
     "kitti-odometry": Reader(
-        "lidarslam.datasets.published.kitti_odometry",
+        f"{_HERE}.published.kitti_odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
-        lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
+        _has("sequences/", "velodyne/"),
         takes_sequence=True,
         elevation_deg=KITTI_DEG,
     ),
     "kitti-360": Reader(
-        "lidarslam.datasets.published.kitti_360",
+        f"{_HERE}.published.kitti_360",
         "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
         _is_kitti_360,
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        "lidarslam.datasets.published.kitti_raw",
+        f"{_HERE}.published.kitti_raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
-        lambda source: (source / "velodyne_points" / "data").is_dir(),
+        _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
     ),
     "nuscenes": Reader(
-        "lidarslam.datasets.published.nuscenes",
+        f"{_HERE}.published.nuscenes",
         "nuScenes: the root with v1.0-* (with --sequence)",
-        lambda source: any(source.glob("v1.0-*/scene.json")),
-        takes_sequence=True,
+        _has("v1.0-*/scene.json"),
+        True,
     ),
     "argoverse-2": Reader(
-        "lidarslam.datasets.published.argoverse2",
-        "Argoverse 2: the folder of a log",
-        lambda source: any((source / "sensors" / "lidar").glob("*.feather")),
+        f"{_HERE}.published.argoverse2", "Argoverse 2: the folder of a log", _has("sensors/lidar/*.feather")
     ),
     "apollo": Reader(
-        "lidarslam.datasets.published.apollo",
+        f"{_HERE}.published.apollo",
         "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
-        lambda source: any(source.glob("poses/gt_poses.txt")) or any(source.glob("*/poses/gt_poses.txt")),
+        _has("poses/gt_poses.txt", "*/poses/gt_poses.txt"),
         takes_sequence=True,
     ),
-    "mulran": Reader(
-        "lidarslam.datasets.published.mulran",
-        "MulRan: a sequence with a folder Ouster",
-        lambda source: (source / "Ouster").is_dir(),
-    ),
-    "nclt": Reader(
-        "lidarslam.datasets.published.nclt",
-        "NCLT: a session with a folder velodyne_sync",
-        lambda source: (source / "velodyne_sync").is_dir(),
-    ),
-    "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "mulran": Reader(f"{_HERE}.published.mulran", "MulRan: a sequence with a folder Ouster", _has("Ouster/")),
+    "nclt": Reader(f"{_HERE}.published.nclt", "NCLT: a session with a folder velodyne_sync", _has("velodyne_sync/")),
+    "rosbag": Reader(f"{_HERE}.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "packets": Reader(
-        "lidarslam.datasets.packets.velodyne",
+        f"{_HERE}.packets.velodyne",
         ".pcap of a Velodyne, or of an Ouster with its metadata .json beside it; Ouster's .osf",
-        lambda source: source.suffix.lower() in _PACKET_SUFFIXES,
+        lambda source: source.suffix.lower() in (".pcap", ".pcapng", ".osf"),
     ),
     "scan-folder": Reader(
-        "lidarslam.datasets.folders.scan_folder",
+        f"{_HERE}.folders.scan_folder",
         "a folder of .bin, .pcd, .ply or .npy scans",
-        lambda source: source.is_dir() and any(entry.suffix.lower() in SCAN_SUFFIXES for entry in source.iterdir()),
+        lambda source: source.is_dir() and any(e.suffix.lower() in SCAN_SUFFIXES for e in source.iterdir()),
     ),
 }
 
@@ -183,9 +156,9 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     if (other := _unrecognised(source)) is not None:
         raise InputError(other)
     raise InputError(
-        f"{source}: not a recording that any reader recognises; expected a bag (.bag, .db3, .mcap, or the folder of a"
-        " rosbag2), a folder of .bin, .pcd, .ply or .npy scans, packets (.pcap, .osf), KITTI, or a data set of"
-        " `lidarslam datasets`"
+        f"{source}: {_kind(source)}not a recording that any reader recognises; expected a bag (.bag, .db3, .mcap, or"
+        " the folder of a rosbag2), a folder of .bin, .pcd, .ply or .npy scans (unpack archives, convert text),"
+        " packets (.pcap, .osf), KITTI, or a data set of `lidarslam datasets`"
     )
 
 
@@ -246,32 +219,26 @@ def absent(source: Path) -> str:
     with suppress(OSError):
         names = [entry.name for entry in islice(parent.iterdir(), _MOST_ENTRIES)]
     missing = source.relative_to(parent).parts[0] if parent != Path() else source.parts[0]
-    similar = get_close_matches(missing, names, n=3)
-    hint = f"; did you mean {', '.join(str(parent / name) for name in similar)}?" if similar else ""
-    within = f", there is no {parent / missing}" if parent / missing != source else ""
-    return f"{source}: no such file or folder{within}{hint}"
+    similar = ", ".join(str(parent / name) for name in get_close_matches(missing, names, n=3))
+    hint = f"; did you mean {similar}?" if similar else ""
+    return (
+        f"{source}: no such file or folder" + f", there is no {parent / missing}" * (parent / missing != source) + hint
+    )
 
 
 def result_of_program(source: Path) -> str | None:
     """The kind of a path that the program has written itself, from a recording; None of any other."""
     folder = source if source.is_dir() else source.parent
     if source.is_dir() and (folder / "comparison.json").is_file():
-        return (
-            f"{source}: is a comparison, not a recording; open {folder / 'report.html'}, or name the recording that"
-            " was compared"
-        )
+        return f"{source}: is a comparison, not a recording; open {folder / 'report.html'}"
     head = ""
     with suppress(OSError, UnicodeDecodeError), (folder / "config.yaml").open(encoding="utf-8") as file:
         head = file.read(4096)
     if not head.startswith("run:") or not (folder / "trajectory.tum").is_file():
         return None
-    match = _SOURCE.search(head)
-    recording = f"; its recording is {match[1].strip(chr(39))}" if match else ""
-    is_run = "is a run directory" if source.is_dir() else f"is a file of the run {folder}"
-    return (
-        f"{source}: {is_run}, not a recording{recording}. lidarslam view {folder} shows it, lidarslam evaluate {folder}"
-        " gives its errors"
-    )
+    recording = f"; its recording is {match[1].strip(chr(39))}" if (match := _SOURCE.search(head)) else ""
+    kind = "is a run directory" if source.is_dir() else f"is a file of the run {folder}"
+    return f"{source}: {kind}, not a recording{recording}. lidarslam view {folder} shows it"
 
 
 def _unrecognised(source: Path) -> str | None:
@@ -287,10 +254,7 @@ def _unrecognised(source: Path) -> str | None:
         more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
         listed = ", ".join(str(path) for path in found[:_LISTED])
         return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {listed}{more}"
-    results = [entry for entry in _entries(source) if entry.is_dir() and result_of_program(entry) is not None]
-    if results:
-        return f"{source}: holds results of lidarslam, such as {results[0]}, and no recording; name the recording"
-    return _other_kind(source)
+    return None
 
 
 def _recordings_in(folder: Path) -> list[Path]:
@@ -315,12 +279,8 @@ def _reader_of(path: Path) -> str | None:
     return None
 
 
-def _other_kind(source: Path) -> str | None:
-    files = [source] if source.is_file() else [entry for entry in _entries(source) if entry.is_file()]
-    counts = Counter(path.suffix.lower() for path in files)
-    for suffixes, kind, remedy in _KINDS:
-        suffix = max(suffixes, key=lambda suffix: counts[suffix])
-        if 2 * counts[suffix] >= max(1, len(files)):
-            is_what = f"holds {suffix} files" if source.is_dir() else f"is a {suffix} file"
-            return f"{source}: {is_what}, {kind}; {remedy}"
-    return None
+def _kind(source: Path) -> str:
+    if not source.is_dir():
+        return ""
+    counts = Counter(entry.suffix.lower() for entry in _entries(source) if entry.is_file() and entry.suffix)
+    return f"holds {counts.most_common(1)[0][0]} files, " if counts else ""

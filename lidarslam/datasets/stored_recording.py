@@ -2,13 +2,15 @@
 
 import logging
 import re
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
@@ -23,7 +25,14 @@ from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, lea
 
 logger = logging.getLogger(__name__)
 
+# The commands to install them. ouster-sdk is no extra: it requires a version of rosbags that this program cannot use,
+# and does not need it for the functions used here.
+_INSTALL = {
+    "velodyne_decoder": "pip install 'lidarslam[velodyne]'",
+    "ouster.sdk": "pip install --no-deps ouster-sdk",
+}
 _LISTED = 8
+STORAGE_SUFFIXES = (".db3", ".mcap")  # of rosbag2
 _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
 
 
@@ -249,6 +258,51 @@ class CloudRecording(StoredRecording):
         return self._decode(item).fields
 
 
+class PacketRecording(StoredRecording):
+    """The sweeps of one sensor. A reader adds `_extent`, `_items`, `_read` and `_fields`."""
+
+    reader = "packets"
+    imu_name = "the sensor's own"
+    library: tuple[str, str]  # that decodes the packets, and whose packets
+    point_time: PointTimeModel
+
+    def __init__(self, source: Path, config: ReaderConfig) -> None:
+        require(*self.library)
+        super().__init__(source, config)
+        self._truth_path = truth_beside(source, self.name)
+        self._has_times = config.time_reference != "none"
+        self._point_time = self.point_time if self._has_times else None
+
+    def __len__(self) -> int:
+        return self._extent[0]
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """See `Recording`; sweeps are not counted beforehand, which would take a pass over all packets."""
+        return self._scans(scan_indices(sys.maxsize, start, stop, step), faults)
+
+    @cached_property
+    def _extent(self) -> tuple[int, float]:
+        """Number of sweeps, and the stamp of the last one."""
+        count, last = 0, 0.0
+        for scan in self.scans(faults=Faults()):
+            count, last = count + 1, scan.stamp
+        return count, last
+
+    def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
+        return self._extent[1]
+
+
+def require(library: str, purpose: str) -> None:
+    """Check that a library is installed; the message names the purpose."""
+    try:
+        import_module(library)
+    except ModuleNotFoundError as error:
+        name = library.partition(".")[0] if error.name and library.startswith(error.name) else error.name
+        raise ConfigError(f"{name} is not installed, which {purpose} need; {_INSTALL[library]}") from error
+
+
 def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
     """The indices `range(start, stop, step)` of a recording of `count` scans, a stop past the end being the end."""
     if start < 0 or step < 1 or (stop is not None and stop < 0):
@@ -294,6 +348,15 @@ def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun
 def _last_number(name: str) -> int | None:
     numbers = re.findall(r"[0-9]+", name)
     return int(numbers[-1]) if numbers else None
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The databases and MCAP files of a folder, without hidden ones such as macOS's `._` files.
+
+    A recorder that was killed leaves them without their metadata.yaml.
+    """
+    named = (entry for entry in folder.iterdir() if entry.suffix in STORAGE_SUFFIXES and entry.name[0] != ".")
+    return sorted(entry for entry in named if entry.is_file())
 
 
 def first_file(folders: Sequence[Path], *names: str) -> Path | None:

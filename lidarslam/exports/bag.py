@@ -46,7 +46,7 @@ def export_bag(
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".partial-") as folder:
             place = Path(folder) / (out.name if out.suffix == ".bag" else out.stem)
             with _writer(place, out.suffix) as writer:
-                topics = _Topics(writer)
+                topics = RosTopics(writer)
                 _write(topics, run, lidar_frame, with_clouds, count)
             for written in place.glob("*.mcap"):
                 write_chunk_checksums(written)
@@ -66,62 +66,41 @@ def _writer(place: Path, suffix: str) -> Rosbag1Writer | Rosbag2Writer:
 
 
 def _write(
-    topics: "_Topics", run: RunScans, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
+    topics: "RosTopics", run: RunScans, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
 ) -> None:
     """Everything, in the order of time; the whole path and the map come with the first stamp."""
-    messages, trajectory = topics.messages, run.trajectory
+    trajectory = run.trajectory
     first = float(trajectory.stamps[0])
-    topics.write(_PATH_TOPIC, first, messages.path(trajectory.stamps, _MAP_FRAME, trajectory.T_world_lidar))
+    topics.write(_PATH_TOPIC, first, topics.path(trajectory.stamps, _MAP_FRAME, trajectory.T_world_lidar))
     cloud = load_map(run.run)
     if len(cloud):
         attributes = cloud.attributes.only(("intensity", "rgb"))
-        topics.write(_MAP_TOPIC, first, messages.cloud(first, _MAP_FRAME, cloud.points, attributes))
+        topics.write(_MAP_TOPIC, first, topics.cloud(first, _MAP_FRAME, cloud.points, attributes))
     written = 0
     for index, scan in run.deskewed() if with_clouds else ():
         for number in range(written, index + 1):
             _write_pose(topics, run, number, lidar_frame)
         written = index + 1
         attributes = PointAttributes(intensity=scan.intensities, rgb=scan.colours, ring=scan.rings)
-        topics.write("/points", scan.stamp, messages.cloud(scan.stamp, lidar_frame, scan.points, attributes))
+        topics.write("/points", scan.stamp, topics.cloud(scan.stamp, lidar_frame, scan.points, attributes))
         count(written, len(trajectory))
     for number in range(written, len(trajectory)):
         _write_pose(topics, run, number, lidar_frame)
     count(len(trajectory), len(trajectory))
 
 
-def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str) -> None:
+def _write_pose(topics: "RosTopics", run: RunScans, number: int, lidar_frame: str) -> None:
     """Transforms and odometry of one scan; map -> odom is the correction of the odometry by mapping and graph."""
     stamp = float(run.trajectory.stamps[number])
     T_map_lidar, T_odom_lidar = run.trajectory.T_world_lidar[number], run.odometry.T_world_lidar[number]
     corrected = (_MAP_FRAME, _ODOM_FRAME, T_map_lidar @ inverse(T_odom_lidar))
-    messages = topics.messages
-    topics.write("/tf", stamp, messages.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar)))
+    topics.write("/tf", stamp, topics.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar)))
     known, sigmas = run.known_velocities(number), run.sigmas[number]
     covariance = np.diag(sigmas**2) if np.isfinite(sigmas).all() else None
     velocity = np.mean(known, axis=0) if known else None
-    header = messages.header(stamp, _MAP_FRAME)
-    odometry = made.odometry(messages.store, header, lidar_frame, T_map_lidar, covariance, velocity)
+    header = topics.header(stamp, _MAP_FRAME)
+    odometry = made.odometry(topics.store, header, lidar_frame, T_map_lidar, covariance, velocity)
     topics.write("/odometry", stamp, odometry)
-
-
-class _Topics:
-    """The topics of a bag, opened with their first message."""
-
-    def __init__(self, bag: Rosbag1Writer | Rosbag2Writer) -> None:
-        self._bag: Any = bag
-        self.messages = RosMessages(ros2=isinstance(bag, Rosbag2Writer))
-        self._connections: dict[str, Any] = {}
-        self.counts: dict[str, int] = {}
-
-    def write(self, topic: str, stamp: float, message: Any) -> None:
-        """Write a message, recorded at its stamp."""
-        if topic not in self._connections:
-            bag, latched = self._bag, topic in _LATCHED
-            how = {"offered_qos_profiles": [_qos(latched)]} if self.messages.ros2 else {"latching": int(latched)}
-            opened = bag.add_connection(topic, message.__msgtype__, typestore=self.messages.store, **how)
-            self._connections[topic] = opened
-        self._bag.write(self._connections[topic], nanoseconds(stamp), self.messages.serialize(message))
-        self.counts[topic] = self.counts.get(topic, 0) + 1
 
 
 def _qos(latched: bool) -> Qos:
@@ -139,25 +118,29 @@ def _qos(latched: bool) -> Qos:
     )
 
 
-def nanoseconds(stamp: float) -> int:
-    """A stamp in whole nanoseconds; `nanoseconds(stamp) / 10**9` is the stamp again."""
-    return round(stamp * 10**9)
+class RosTopics:
+    """The topics of a bag of ROS 2 (CDR) or ROS 1 (packed), opened with their first message; makes the messages."""
 
-
-class RosMessages:
-    """Makes and serialises messages: for ROS 2 as CDR, for ROS 1 packed."""
-
-    def __init__(self, ros2: bool) -> None:
-        self.ros2 = ros2
-        self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-        if not ros2:  # ROS 2's store has it
+    def __init__(self, bag: Rosbag1Writer | Rosbag2Writer) -> None:
+        self._bag: Any = bag
+        self._ros2 = isinstance(bag, Rosbag2Writer)
+        self.store = get_typestore(Stores.ROS2_JAZZY if self._ros2 else Stores.ROS1_NOETIC)
+        if not self._ros2:  # ROS 2's store has it
             self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
         self._sequence = 0
+        self._connections: dict[str, Any] = {}
+        self.counts: dict[str, int] = {}
 
-    def serialize(self, message: Any) -> bytes:
-        """The bytes of a message."""
-        serialize = self.store.serialize_cdr if self.ros2 else self.store.serialize_ros1
-        return bytes(serialize(message, message.__msgtype__))
+    def write(self, topic: str, stamp: float, message: Any) -> None:
+        """Write a message, recorded at its stamp."""
+        message_type = message.__msgtype__
+        if topic not in self._connections:
+            latched = topic in _LATCHED
+            how = {"offered_qos_profiles": [_qos(latched)]} if self._ros2 else {"latching": int(latched)}
+            self._connections[topic] = self._bag.add_connection(topic, message_type, typestore=self.store, **how)
+        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
+        self._bag.write(self._connections[topic], round(stamp * 10**9), bytes(serialize(message, message_type)))
+        self.counts[topic] = self.counts.get(topic, 0) + 1
 
     def transforms(self, stamp: float, *poses: tuple[str, str, FloatArray]) -> Any:
         """Parent frame, child frame and pose (4, 4) of the child in the parent, of each transform."""
@@ -190,4 +173,4 @@ class RosMessages:
     def header(self, stamp: float, frame: str) -> Any:
         """Of the next message."""
         self._sequence += 1
-        return made.header(self.store, nanoseconds(stamp), frame, self._sequence - 1)
+        return made.header(self.store, round(stamp * 10**9), frame, self._sequence - 1)

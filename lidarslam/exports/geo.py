@@ -82,19 +82,8 @@ def utm_around(geodetic: FloatArray) -> Utm:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class GeoRun:
-    """A run, and its place in UTM."""
-
-    run: Path
-    trajectory: Trajectory
-    track: GnssTrack
-    utm: Utm
-    placed: Georeference
-
-
-def georeference(run: Path) -> GeoRun:
-    """Align a run with the GNSS track of its recording."""
+def export_geo(run: Path, out: Path, overwrite: bool) -> Iterator[str]:
+    """Write map, trajectory and the pose of the world, aligned with the recording's GNSS track; lines about them."""
     trajectory, of = read_trajectory(run), read_source(run, "has the GNSS positions")
     track = read_gnss(of.source, of.reader)
     utm = utm_around(track.geodetic)
@@ -107,42 +96,33 @@ def georeference(run: Path) -> GeoRun:
             f"{run}: too short to determine the heading from its GNSS positions: they leave"
             f" {placed.heading_sigma_deg:.1f} deg open, more than {_LARGEST_HEADING_SIGMA_DEG:g}"
         )
-    return GeoRun(run, trajectory, track, utm, placed)
-
-
-def export_geo(geo: GeoRun, out: Path, overwrite: bool) -> Iterator[str]:
-    """Write map, trajectory and the pose of the world; lines about them."""
     make_directory(out)
     for name in _FILES:
         require_new(out / name, overwrite)
-    placed, utm = geo.placed, geo.utm
-    T = placed.T_map_world @ geo.trajectory.T_world_lidar
-    T[:, :3, 3] = placed.positions(geo.trajectory.positions)
-    trajectory = Trajectory(geo.trajectory.stamps, T)
-    lines = utm.geodetic(trajectory.positions)
-    cloud = load_map(geo.run)
+    T = placed.T_map_world @ trajectory.T_world_lidar
+    T[:, :3, 3] = placed.positions(trajectory.positions)
+    cloud, geodetic, name = load_map(run), utm.geodetic(T[:, :3, 3]), run.resolve().name
     if len(cloud):
         normals = cloud.normals @ placed.T_map_world[:3, :3].T
         with written(out / MAP) as partial:
             write_laz(partial, replace(cloud, points=placed.positions(cloud.points), normals=normals), utm.wkt)
     texts = {
-        TRAJECTORY: format_tum(trajectory),
-        GEOJSON: json.dumps(_geojson(geo, lines)) + "\n",
-        KML: _kml(geo.run.resolve().name, lines) + "\n",
-        ABOUT: json.dumps(_about(geo), indent=2) + "\n",
+        TRAJECTORY: format_tum(Trajectory(trajectory.stamps, T)),
+        GEOJSON: json.dumps(_geojson(name, trajectory.stamps, geodetic)) + "\n",
+        KML: _kml(name, geodetic) + "\n",
+        ABOUT: json.dumps(_about(placed, utm, track), indent=2) + "\n",
     }
-    for name, text in texts.items():
-        with written(out / name) as partial:
+    for file, text in texts.items():
+        with written(out / file) as partial:
             partial.write_text(text, encoding="utf-8")
     yield f"{utm.name}, EPSG:{utm.epsg}, scale {utm.scale:.6f}"
     yield f"{placed.matched:,} GNSS positions; residual {placed.rms_m:.2f} m RMS, {placed.median_m:.2f} m median"
     yield f"heading known to {placed.heading_sigma_deg:.2f} deg"
-    yield from (f"note: {note}" for note in geo.track.notes)
+    yield from (f"note: {note}" for note in track.notes)
     yield f"written to {', '.join(str(out / name) for name in _FILES if name != MAP or len(cloud))}"
 
 
-def _about(geo: GeoRun) -> dict[str, Any]:
-    placed, utm = geo.placed, geo.utm
+def _about(placed: Georeference, utm: Utm, track: GnssTrack) -> dict[str, Any]:
     return {
         "epsg": utm.epsg,
         "crs": utm.name,
@@ -153,15 +133,15 @@ def _about(geo: GeoRun) -> dict[str, Any]:
         "residual_rms_m": placed.rms_m,
         "residual_median_m": placed.median_m,
         "heading_sigma_deg": placed.heading_sigma_deg,
-        "lidar_antenna_m": geo.track.lidar_antenna.tolist(),
-        "notes": list(geo.track.notes),
+        "lidar_antenna_m": track.lidar_antenna.tolist(),
+        "notes": list(track.notes),
     }
 
 
-def _geojson(geo: GeoRun, geodetic: FloatArray) -> dict[str, Any]:
+def _geojson(name: str, stamps: FloatArray, geodetic: FloatArray) -> dict[str, Any]:
     """RFC 7946: longitude, latitude, height."""
     line = {"type": "LineString", "coordinates": np.round(geodetic[:, [1, 0, 2]], 9).tolist()}
-    about = {"name": geo.run.resolve().name, "times": geo.trajectory.stamps.tolist()}
+    about = {"name": name, "times": stamps.tolist()}
     return {"type": "FeatureCollection", "features": [{"type": "Feature", "properties": about, "geometry": line}]}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import make_directory, written
 from lidarslam.exports.source import read_map
 from lidarslam.mapping.global_map.occupancy_grid import (
@@ -20,6 +20,7 @@ from lidarslam.mapping.global_map.occupancy_grid import (
 )
 from lidarslam.storage.finished_run import read_trajectory
 
+SUFFIXES = (".yaml", ".yml")
 _FINEST_M = 0.05
 _GREY = {OCCUPIED: 0, UNKNOWN: 205, FREE: 254}
 # The shade of the unknown, (255 - 205) / 255 = 0.1961, lies between them.
@@ -63,9 +64,3 @@ def write_grid(path: Path, grid: OccupancyGrid) -> list[Path]:
         text = yaml.safe_dump({**about, **_THRESHOLDS}, sort_keys=False, default_flow_style=None)
         partial.write_text(text, encoding="utf-8")
     return [path, image]
-
-
-def require_yaml(path: Path) -> None:
-    """Check the suffix of a grid."""
-    if path.suffix not in (".yaml", ".yml"):
-        raise OutputError(f"{path}: expected a .yaml file, such as map.yaml; the image map.pgm is written beside it")

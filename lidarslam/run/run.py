@@ -276,10 +276,10 @@ def write_in_utm(run: Path) -> None:
 
     Positions that do not determine the heading are a warning only: the run is written already.
     """
-    from lidarslam.exports.geo import export_geo, georeference
+    from lidarslam.exports.geo import export_geo
 
     try:
-        for line in export_geo(georeference(run), run / UTM_FOLDER, overwrite=True):
+        for line in export_geo(run, run / UTM_FOLDER, overwrite=True):
             logger.info(line)
     except InputError as error:
         logger.warning("not written in UTM: %s", error)

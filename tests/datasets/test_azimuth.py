@@ -81,13 +81,6 @@ def test_angles_between_the_lasers_of_one_firing_are_removed_by_rings():
     np.testing.assert_allclose(found, (times - times.min()) * PERIOD_S / np.ptp(times), atol=2 * PERIOD_S / COLUMNS)
 
 
-def test_places_without_a_return_have_no_time():
-    points, _, rings = sweep(0.0)
-    points[::5], points[1::5] = 0.0, np.nan
-    found = offsets_from_order(RawCloud(points, rings=rings), PERIOD_S)
-    np.testing.assert_array_equal(np.isfinite(found), np.arange(len(found)) % 5 > 1)
-
-
 @pytest.mark.parametrize("order", ["firing", "rings"])
 def test_a_recording_as_measured_gets_times(tmp_path, order):
     recording = open_recording(record(tmp_path / "raw", order=order))
@@ -184,13 +177,3 @@ def test_a_real_drive_with_its_times_hidden(tmp_path, real_data):
         scale = given.time_offsets.max() / mine.time_offsets.max()
         assert scale == pytest.approx(1.0, abs=0.02)  # the rate is assumed
         np.testing.assert_allclose(scale * mine.time_offsets, given.time_offsets, atol=1e-4)
-
-
-@pytest.mark.real_data
-def test_a_real_compensated_drive_stays_without(tmp_path, real_data):
-    scans = real_data / "kitti_odometry_04" / "sequences" / "04" / "velodyne"
-    if not scans.is_dir():
-        pytest.skip("needs kitti_odometry_04")
-    for path in scans.glob("*.bin"):
-        (tmp_path / path.name).symlink_to(path)
-    assert open_recording(tmp_path).describe().point_time is None

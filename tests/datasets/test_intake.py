@@ -1,15 +1,19 @@
-"""What is seen of every scan before it is worked on."""
+"""What is seen of every scan before it is worked on; faults are counted by kind, or raised where nobody counts."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at, take_in
 from lidarslam.datasets.mounting import MountedRecording
+from lidarslam.datasets.stored_recording import FileRecording
 
 
 def seen(points, **fields):
@@ -22,11 +26,6 @@ def test_a_usual_scan_is_left_as_it_is(rng):
     scan, faults = seen(points)
     assert scan.points is points or np.array_equal(scan.points, points)
     assert faults.warnings() == ()
-
-
-@pytest.mark.parametrize("points", [np.empty((0, 3)), np.ones((1, 3)), np.full((50, 3), 900.0)])
-def test_a_few_points_say_nothing_about_their_unit(points):
-    assert seen(points)[1].warnings() == ()
 
 
 def test_a_scan_of_two_million_points_is_thinned_and_said(rng):
@@ -79,7 +78,7 @@ def test_times_of_no_sweep_are_told(rng, span_s):
 def test_times_shifted_away_from_the_stamp_are_told(rng, shift_s, told):
     points = rng.uniform(-8.0, 8.0, (1000, 3))
     _, faults = seen(points, time_offsets=np.linspace(0.0, 0.1, 1000) + shift_s)
-    assert ["stamped outside its sweep" in said and told in said for said in faults.warnings()] == [True] * bool(told)
+    assert ["stamped outside the sweep" in said and told in said for said in faults.warnings()] == [True] * bool(told)
 
 
 def test_points_without_a_time_are_counted(rng):
@@ -93,7 +92,7 @@ def test_points_without_a_time_are_counted(rng):
 
 
 def test_all_points_at_one_place_are_told():
-    assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scan has all its points at one place")
+    assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scan has all points at one place")
 
 
 class Recorded:
@@ -167,3 +166,47 @@ def strokes() -> Scan:
 def test_mirrored_axes_and_reversed_times_turn_the_other_way(recording, told):
     _, faults = taken(recording)
     assert ["turns counter-clockwise as seen from above" in said for said in faults.warnings()] == [True] * told
+
+
+class Odd(FileRecording):
+    """Scans of which those with an odd number are damaged."""
+
+    reader = "odd"
+
+    def __init__(self, numbers: list[int]) -> None:
+        super().__init__(Path("drive"), ReaderConfig(), [Path(str(number)) for number in numbers])
+        self.stamps = np.array(numbers, dtype=np.float64)
+
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
+        if self.stamps[index] % 2:
+            raise InputError(f"{self._files[index]} is damaged")
+        return Scan(np.ones((1, 3)), float(self.stamps[index]))
+
+
+def test_kinds_are_counted_and_the_first_of_each_is_remembered():
+    faults = Faults()
+    faults.note("scans have a fault", "a")
+    faults.leave_out("scans were left out: why", "b", 2)
+    faults.note("scans have a fault", "c")
+    assert faults.left_out == 2
+    assert faults.warnings() == ("2 scans have a fault; the first: a", "2 scans were left out: why; the first: b")
+
+
+def test_unreadable_scans_are_left_out_where_they_are_counted_and_raised_elsewhere():
+    faults = Faults()
+    assert [scan.stamp for scan in Odd([0, 1, 2, 3, 4]).scans(faults=faults)] == [0.0, 2.0, 4.0]
+    assert faults.left_out == 2
+    scans = Odd([0, 1]).scans()
+    assert next(scans).stamp == 0.0
+    with pytest.raises(InputError, match="1 is damaged"):
+        next(scans)
+
+
+def test_a_recording_is_described_by_its_first_readable_scan():
+    info = Odd([1, 3, 4, 6]).describe()
+    assert (info.first.stamp, info.scans, info.last_stamp) == (4.0, 4, 6.0)
+    assert info.notes == ("2 scans were left out: not readable; the first: 1 is damaged",)
+    with pytest.raises(InputError, match="1 is damaged"):
+        Odd([1, 3]).describe()
+    with pytest.raises(InputError, match="drive: holds no scan"):
+        Odd([]).describe()

@@ -10,7 +10,6 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import choose_reader, open_recording
-from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
 
 MIDNIGHT = np.datetime64("2011-09-26T13:04:32", "ns")
@@ -130,14 +129,6 @@ def test_rows_of_missing_scans_are_skipped(tmp_path, rng):
     np.testing.assert_allclose([scan.stamp for scan in scans], expected, rtol=0.0, atol=3e-7)
     assert len(recording.ground_truth) == 8
     assert any("0 to 7 only 6" in note for note in recording.describe().notes)
-
-
-def test_offsets_run_from_the_rear_over_the_left_to_the_rear():
-    azimuth = np.deg2rad([179.999, 135.0, 90.0, 45.0, 0.0, -45.0, -90.0, -135.0, -179.999])
-    points = np.column_stack([5.0 * np.cos(azimuth), 5.0 * np.sin(azimuth), np.linspace(-2.0, 2.0, 9)])
-    offsets = offsets_from_azimuth(points, before_s=0.048, after_s=0.056)
-    expected = [-0.048, -0.036, -0.024, -0.012, 0.0, 0.014, 0.028, 0.042, 0.056]
-    np.testing.assert_allclose(offsets, expected, atol=1e-6)
 
 
 def test_a_point_has_its_own_sweeps_start_and_end(drive):

@@ -139,6 +139,7 @@ def test_angles_are_those_of_the_recorded_axes():
     np.testing.assert_allclose(transform_of((10.0, 20.0, 30.0))[:3, :3], turn(10, 20, 30), atol=1e-15)
     odd = turn(70, 25, 110)
     mounting = mounting_with_up(odd.T[:, 2])
+    assert guess_mounting(points @ odd.T for points in street()).warning is not None
     assert not isinstance(mounting, str)
     np.testing.assert_allclose((transform_of(mounting)[:3, :3] @ odd.T)[:, 2], [0, 0, 1], atol=0.02)
     assert written(mounting).count(",") == 2
@@ -175,13 +176,6 @@ def test_the_ground_shows_a_turned_sensor(name):
     assert guess.mounting == name
     assert guess.warning is not None
     assert f"--set reader.mounting={name}" in guess.warning
-
-
-def test_an_odd_attitude_is_guessed_by_its_angles():
-    R = turn(70, 25, 110)
-    guess = guess_mounting(points @ R.T for points in street())
-    up = (transform_of(guess.mounting)[:3, :3] @ R)[2]
-    assert up[2] > np.cos(np.deg2rad(2.0))
 
 
 @cache

@@ -1,12 +1,13 @@
 """Every driver's cloud comes out of its bytes as it went in."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.point_table import PointField, RawCloud
+from lidarslam.datasets.point_table import PointField, RawCloud, read_colours, read_intensities
 from lidarslam.datasets.ros.bag_message import decode_custom_message, decode_point_cloud2
 
 from .conftest import STAMP_NS, point_table
@@ -36,15 +37,6 @@ def test_the_result_does_not_hold_on_to_the_message(make_sweep, ros2_kit):
     assert_same(cloud, sweep)
 
 
-def test_coordinates_alone_are_enough(ros2_kit, rng):
-    records = np.zeros((1, 9), [("z", "f8"), ("x", "f8"), ("y", "f8")])
-    for axis in "xyz":
-        records[axis] = rng.normal(size=(1, 9))
-    cloud = decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS))
-    np.testing.assert_array_equal(cloud.points, np.stack([records[axis][0] for axis in "xyz"], axis=1))
-    assert cloud.time_field is cloud.times is cloud.rings is None
-
-
 def test_fields_with_a_count(ros2_kit, make_sweep):
     sweep = make_sweep("velodyne", STAMP_NS)
     message = ros2_kit.cloud(sweep.records, STAMP_NS)
@@ -64,11 +56,6 @@ def test_an_unknown_datatype_matters_only_where_it_is_read(ros2_kit, make_sweep)
     message.fields[0].datatype = 11
     with pytest.raises(InputError, match="'x' has the unknown datatype 11"):
         decode_point_cloud2(message)
-
-
-def test_rings_stored_as_floats(ros2_kit):
-    records = point_table(np.ones((3, 3)), ring=np.array([5.0, np.nan, 31.0]))[None]
-    np.testing.assert_array_equal(decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS)).rings, [5, np.nan, 31])
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (1, 0), (0, 5)])
@@ -116,3 +103,74 @@ def test_livox_custom_message_cut_anywhere(bag_kit, rng):
     for length in range(4, len(raw) - 1):
         with pytest.raises(InputError, match="Livox CustomMsg"):
             decode_custom_message(raw[:length], bag_kit.ros2)
+
+
+RGB = np.array([[255, 128, 0], [1, 2, 3], [0, 0, 255], [255, 255, 255]], dtype=np.uint8)
+PACKED = (RGB.astype(np.uint32) << np.array([16, 8, 0], dtype=np.uint32)).sum(axis=1, dtype=np.uint32)
+
+
+table = partial(point_table, np.ones((4, 3)))  # four points with further columns
+
+
+@pytest.mark.parametrize(
+    ("names", "field"),
+    [
+        (["reflectivity", "Intensity"], "Intensity"),
+        (["scalar_Intensity"], "scalar_Intensity"),
+        (["reflectivity", "signal"], "reflectivity"),
+        (["time", "ring"], None),
+    ],
+)
+def test_the_field_of_intensity(names, field):
+    read = read_intensities(table(**{name: np.full(4, place, "f4") for place, name in enumerate(names)}))
+    assert (read is None) if field is None else read[0] == names.index(field)
+
+
+@pytest.mark.parametrize(
+    ("names", "colour"),
+    [
+        (["red", "green", "blue", "alpha"], [0, 1, 2]),
+        (["R", "G", "B"], [0, 1, 2]),
+        (["rgba", "rgb"], [0, 0, 1]),
+        (["red", "green"], None),
+        (["rgba", "intensity"], [0, 0, 0]),
+    ],
+)
+def test_the_fields_of_colour(names, colour):
+    read = read_colours(table(**{name: np.full(4, place, "u4") for place, name in enumerate(names)}))
+    assert (read is None) if colour is None else read[0].tolist() == colour
+
+
+ALPHA = np.uint32(0xFF000000)  # with it the bits of a float are those of NaN
+COLOURS = {
+    "bytes": {"red": RGB[:, 0], "green": RGB[:, 1], "blue": RGB[:, 2]},
+    "16 bits": dict(zip("rgb", RGB.T.astype(np.uint16) * 257, strict=True)),
+    "shares": dict(zip("rgb", RGB.T.astype(np.float32) / 255.0, strict=True)),
+    "floats to 255": dict(zip("rgb", RGB.T.astype(np.float64), strict=True)),
+    "packed": {"rgb": PACKED},
+    "packed float": {"rgb": PACKED.view(np.float32)},
+    "packed float with alpha": {"rgba": (PACKED | ALPHA).view(np.float32)},
+    "packed int": {"rgba": (PACKED | ALPHA).view(np.int32)},
+    "big endian": {"rgb": PACKED.astype(">u4")},
+    "big endian float": {"rgb": PACKED.view(np.float32).astype(">f4")},
+}
+
+
+@pytest.mark.parametrize("columns", COLOURS.values(), ids=list(COLOURS))
+def test_point_cloud2(ros2_kit, columns):
+    records = table(**columns, intensity=np.arange(4, dtype=np.uint16) * 20_000).reshape(2, 2)
+    if any(values.dtype.byteorder == ">" for values in columns.values()):
+        records = records.astype(records.dtype.newbyteorder(">"))
+    cloud = decode_point_cloud2(
+        ros2_kit.cloud(records, STAMP_NS, row_padding=5, is_bigendian=records["x"].dtype.byteorder == ">")
+    )
+    np.testing.assert_array_equal(cloud.colours, RGB)
+    assert cloud.intensities.tolist() == [0.0, 20_000.0, 40_000.0, 60_000.0]
+
+
+def test_fields_that_cannot_be_read_are_no_attributes(ros2_kit):
+    message = ros2_kit.cloud(table(intensity=np.ones(4, dtype="f4"), rgb=PACKED).reshape(1, 4), STAMP_NS)
+    message.fields[3].datatype, message.fields[4].offset = 99, 1000
+    cloud = decode_point_cloud2(message)
+    assert len(cloud.points) == 4
+    assert cloud.intensities is cloud.colours is None

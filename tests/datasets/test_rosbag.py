@@ -8,7 +8,6 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.info_text import describe_source
@@ -71,6 +70,7 @@ def test_livox_custom_message(bag_kit, rng, package, clock_ns):
         assert scan.stamp == stamp_ns / 10**9
         np.testing.assert_array_equal(scan.points, points)
         np.testing.assert_array_equal(scan.rings, lines)
+        assert set(scan.intensities) == {9.0}  # of `reflectivity`
         # A time base that is not the stamp's clock, or never set, leaves the first point at the stamp.
         base_s = float(Fraction(stamp_ns + clock_ns, 10**9) - Fraction(scan.stamp)) if abs(clock_ns) < 10**9 else 0.0
         np.testing.assert_allclose(scan.time_offsets, base_s + offset_ns / 1e9, rtol=0.0, atol=1e-9)
@@ -79,36 +79,11 @@ def test_livox_custom_message(bag_kit, rng, package, clock_ns):
     assert any("another clock" in note for note in info.notes) == (abs(clock_ns) > 10**9)
 
 
-@pytest.mark.parametrize("clock_ns", [0, -STAMP_NS])
-def test_livox_times_in_microseconds(ros2_kit, rng, clock_ns):
-    points, offset_us = rng.uniform(1, 9, (200, 3)).astype("f4"), np.linspace(0, 99_000, 200).astype("i8")
-    messages = [
-        (ns, ros2_kit.livox(points, offset_us, np.zeros(200), ns, ns + clock_ns, "livox_ros_driver2"))
-        for ns in stamps_ns(3)
-    ]
-    path = ros2_kit.write({"/livox/lidar": messages})
-    recording = open_recording(path)
-    for scan in recording.scans():
-        np.testing.assert_allclose(scan.time_offsets, offset_us * 1e-6, rtol=0.0, atol=1e-9)
-    assert any("in units of us instead of ns" in warning for warning in recording.warnings)
-    asked = open_recording(path, ReaderConfig(time_unit="ns"))
-    assert next(asked.scans()).time_offsets.max() == pytest.approx(99e-6)
-    assert not any("in units" in warning for warning in asked.warnings)
-
-
 def test_without_type_definitions(bag_kit, sweep):
     path = bag_kit.write({"/points": recorded(bag_kit, [sweep])}, definitions=False)
     if bag_kit.kind == "db3":  # as rosbag2 wrote it up to ROS 2 Humble
         for table in ("schema", "message_definitions"):
             execute(bag_kit.storage_file(path), f"DROP TABLE {table}")
-    assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
-
-
-def test_a_definition_that_cannot_be_parsed_does_not_matter(ros2_kit, sweep):
-    def add_nonsense(writer):
-        writer.add_connection("/odd", "odd_msgs/msg/Odd", msgdef="((( no definition", rihs01="0")
-
-    path = ros2_kit.write({"/points": recorded(ros2_kit, [sweep])}, extra=add_nonsense)
     assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
 
 
@@ -129,28 +104,13 @@ def test_file_of_compressed_messages_asks_for_the_folder(make_bag_kit, velodyne_
 
 
 def test_skipped_messages_are_not_decoded(drive, monkeypatch):
-    decoded = []
-    decode = BagFile.decode
-
-    def spy(self, message, time_field=None):
-        decoded.append(message.header_ns)
-        return decode(self, message, time_field)
-
+    decoded, decode = [], BagFile.decode
     recording = open_recording(drive[0])
     next(recording.scans())  # the time field has been looked at
+    spy = lambda bag, message, field=None: decoded.append(message.header_ns) or decode(bag, message, field)  # noqa: E731
     monkeypatch.setattr(BagFile, "decode", spy)
     assert len(list(recording.scans(1, None, 2))) == 3
     assert decoded == stamps_ns(6)[1::2]
-    decoded.clear()
-    assert len(recording) == 6
-    next(recording.scans(0))
-    assert decoded == stamps_ns(1)
-
-
-def test_scans_can_be_read_twice_and_side_by_side(drive):
-    recording = open_recording(drive[0])
-    pairs = zip(recording.scans(), recording.scans(), strict=True)
-    assert [one.stamp == other.stamp for one, other in pairs] == [True] * 6
 
 
 def test_description(drive):
@@ -218,19 +178,14 @@ def test_topic_that_is_not_there(drive, topic, message):
     assert "/points (sensor_msgs/msg/PointCloud2, 6 messages)" in str(caught.value)
 
 
-def test_bag_without_clouds(bag_kit):
-    path = bag_kit.write({"/header": [(STAMP_NS, bag_kit.header(STAMP_NS))]})
-    with pytest.raises(InputError, match=r"no point cloud topic.*/header \(std_msgs/msg/Header, 1 messages\)"):
+@pytest.mark.parametrize(
+    ("topics", "said"),
+    [((), "the bag is empty"), (("/header",), r"no point cloud topic.*/header \(std_msgs/msg/Header, 1 messages")],
+)
+def test_bag_without_clouds(bag_kit, topics, said):
+    path = bag_kit.write({topic: [(STAMP_NS, bag_kit.header(STAMP_NS))] for topic in topics})
+    with pytest.raises(InputError, match=said):
         open_recording(path)
-
-
-def test_bag_of_raw_packets(ros2_kit):
-    def add_packets(writer):
-        connection = writer.add_connection("/packets", "pandar_msgs/msg/PandarScan", msgdef="uint8 a", rihs01="0")
-        writer.write(connection, STAMP_NS, b"\0\1\0\0\0")
-
-    with pytest.raises(InputError, match="/packets holds raw packets"):
-        open_recording(ros2_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_packets))
 
 
 def test_clouds_of_ros1_in_a_bag_of_ros2(ros2_kit):
@@ -240,11 +195,6 @@ def test_clouds_of_ros1_in_a_bag_of_ros2(ros2_kit):
 
     with pytest.raises(InputError, match=r"those of ROS 1.*give the one it was converted from"):
         open_recording(ros2_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_clouds))
-
-
-def test_empty_bag(bag_kit):
-    with pytest.raises(InputError, match="the bag is empty"):
-        open_recording(bag_kit.write({}))
 
 
 def test_stamps_that_do_not_increase_are_skipped_and_counted(ros2_kit, sweep):
@@ -264,17 +214,16 @@ def test_stamps_that_do_not_increase_are_skipped_and_counted(ros2_kit, sweep):
 
 
 @pytest.mark.parametrize("reference", ["relative", "absolute"])
-@pytest.mark.parametrize("count", [25, 40])
-def test_simulated_time_from_zero(ros2_kit, reference, count):
+def test_simulated_time_from_zero(ros2_kit, reference):
     # In the first scan times from 0 to 0.1 s mean the same either way; a later one tells.
     seconds = np.linspace(0.0, 0.1, 64)
     clouds = []
-    for i in range(count):
+    for i in range(25):
         records = point_table(np.ones((64, 3)), timestamp=seconds + (i / 10 if reference == "absolute" else 0.0))
         clouds.append((i * PERIOD_NS + 10, ros2_kit.cloud(records[None], i * PERIOD_NS)))
     recording = open_recording(ros2_kit.write({"/points": clouds}))
     scans = list(recording.scans())
-    assert [scan.stamp for scan in scans] == [i / 10 for i in range(count)]
+    assert [scan.stamp for scan in scans] == [i / 10 for i in range(25)]
     for scan in scans:
         np.testing.assert_allclose(scan.time_offsets, seconds, rtol=0.0, atol=1e-9)
     assert recording.describe().point_time.reference == reference
@@ -286,16 +235,6 @@ def test_empty_clouds_are_scans_without_points(ros2_kit, make_sweep):
     clouds[0] = (clouds[0][0], ros2_kit.cloud(sweep.records[:0], STAMP_NS))
     scans = list(open_recording(ros2_kit.write({"/points": clouds})).scans())
     assert [len(scan) for scan in scans] == [0, 200]
-
-
-def test_ground_truth_beside_the_bag(drive):
-    path, _ = drive
-    assert open_recording(path).ground_truth is None
-    truth = Trajectory(np.array([1.0, 2.0]), np.stack([np.eye(4), np.eye(4)]))
-    write_tum(path.parent / "drive.tum", truth)
-    recording = open_recording(path)
-    np.testing.assert_array_equal(recording.ground_truth.stamps, truth.stamps)
-    assert recording.describe().ground_truth.name == "drive.tum"
 
 
 def test_truth_files_by_name(tmp_path):
@@ -370,9 +309,9 @@ def test_a_damaged_message_costs_no_other(ros2_kit, velodyne_clouds, sweep, chan
     assert [scan.stamp for scan in scans] == [stamps_ns(5)[i] / 10**9 for i in (1, 2, 4)]
     assert all(scan.time_offsets is not None for scan in scans)
     (warning,) = faults.warnings()
-    assert warning.startswith("2 scans were left out: they could not be read")
+    assert warning.startswith("2 scans were left out: not readable")
     assert reason in warning
-    assert any("could not be read" in note for note in recording.describe().notes)
+    assert any("not readable" in note for note in recording.describe().notes)
     with pytest.raises(InputError, match=r"message holds|bytes of a point|x, y and z"):
         list(recording.scans())
 
@@ -393,4 +332,4 @@ def test_a_scan_whose_times_are_worth_nothing_keeps_its_points(ros2_kit, make_sw
     scans = list(recording.scans(faults=faults))
     assert [scan.time_offsets is None for scan in scans] == [False, False, True, False]
     assert [len(scan) for scan in scans] == [200] * 4
-    assert faults.warnings()[0].startswith("1 scan has no usable times of its points")
+    assert faults.warnings()[0].startswith("1 scan has no usable times of points")

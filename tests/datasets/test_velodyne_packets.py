@@ -189,9 +189,7 @@ def test_an_empty_or_damaged_message_costs_no_other(velodyne_kit):
 @pytest.mark.parametrize(
     ("payload", "said"),
     [
-        (b"\xee\xff\x06\x01" + bytes(1076), "packets of a Hesai, which are not decoded; play it through"),
-        (b"\x55\xaa\x05\x0a" + bytes(1244), "packets of a RoboSense, which are not decoded; play it through"),
-        (bytes(100), "no packets of a Velodyne; for an Ouster, put the sensor's metadata beside it as other.json"),
+        (bytes(100), "no packets of a Velodyne; for an Ouster, .* as other.json"),
         (b"\x11" * 1206, "cannot be decoded"),
     ],
 )

@@ -14,9 +14,7 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
-from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
-from lidarslam.exports.bag import RosMessages, nanoseconds
+from lidarslam.exports.bag import RosTopics
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 from ..conftest import Room, lidarslam, succeeds
@@ -67,28 +65,22 @@ def write_bag(
     T_utm_fix: FloatArray | None = None,
     variance: float = 0.01,
 ) -> None:
-    messages = RosMessages(ros2=False)
-    types = messages.store.types
     T = T_utm_lidar if T_utm_fix is None else T_utm_fix
     antenna = T[:, :3, :3] @ ANTENNA + T[:, :3, 3]
     longitude, latitude = pyproj.Transformer.from_crs(32756, 4326, always_xy=True).transform(*antenna[:, :2].T)
     with Writer(path) as bag:
-        topics = {"/points": POINT_CLOUD2_TYPE, "/fix": "sensor_msgs/msg/NavSatFix", "/tf_static": TRANSFORMS_TYPE}
-        opened = {name: bag.add_connection(name, kind, typestore=messages.store) for name, kind in topics.items()}
-        fixed = messages.transforms(stamps[0], ("lidar", "gps", make_transform(np.eye(3), ANTENNA)))
-        bag.write(opened["/tf_static"], nanoseconds(stamps[0]), messages.serialize(fixed))
+        topics = RosTopics(bag)
+        types = topics.store.types
+        fixed = topics.transforms(stamps[0], ("lidar", "gps", make_transform(np.eye(3), ANTENNA)))
+        topics.write("/tf_static", stamps[0], fixed)
         for n, stamp in enumerate(stamps):
-            ns = nanoseconds(stamp)
             points = np.eye(3) + n if clouds is None else clouds[n]
-            cloud = messages.cloud(stamp, "lidar", points, PointAttributes())
-            bag.write(opened["/points"], ns, messages.serialize(cloud))
-            header = messages.cloud(stamp, "gps", np.eye(3), PointAttributes()).header
+            topics.write("/points", stamp, topics.cloud(stamp, "lidar", points, PointAttributes()))
             status = types["sensor_msgs/msg/NavSatStatus"](status=-1 if n < 5 else 0, service=1)
             at = (0.0, 0.0, 0.0) if n < 5 else (latitude[n], longitude[n], antenna[n, 2])
-            fix = types["sensor_msgs/msg/NavSatFix"](
-                header, status, *at, (variance * np.diag([1.0, 1.0, 4.0])).ravel(), 2
-            )
-            bag.write(opened["/fix"], ns, messages.serialize(fix))
+            covariance = (variance * np.diag([1.0, 1.0, 4.0])).ravel()
+            header = topics.header(stamp, "gps")
+            topics.write("/fix", stamp, types["sensor_msgs/msg/NavSatFix"](header, status, *at, covariance, 2))
 
 
 def test_trajectory_and_map_are_in_utm(run: Path, truth: FloatArray, tmp_path: Path) -> None:

@@ -231,8 +231,8 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: l
     assert [recording.directory for recording in outcome.summary.recordings] == ["01_in_room_0", None, "03_in_room_2"]
     assert not (tmp_path / "out" / "02_in_room_1").exists()
     (stopped,) = outcome.stopped
-    assert "no scan could be used: 5 scans were left out: they could not be read" in stopped
-    assert any("1 scan was left out: it could not be read" in warning for warning in outcome.summary.warnings)
+    assert "no scan could be used: 5 scans were left out: not readable" in stopped
+    assert any("1 scan was left out: not readable" in warning for warning in outcome.summary.warnings)
     assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
 
 

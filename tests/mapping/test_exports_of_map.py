@@ -159,7 +159,7 @@ def test_files_of_grids_mean_the_same_to_the_map_server(room, tmp_path):
     np.testing.assert_array_equal(meaning, grid.cells)
     assert lidarslam(*command).exit_code == 1
     succeeds(*command, "--overwrite")
-    assert lidarslam("export-grid", run, "--out", tmp_path / "map.png").exit_code == 1
+    assert lidarslam("export-grid", run, "--out", tmp_path / "map.png").exit_code == 2
 
 
 RADIUS_M = 3.0

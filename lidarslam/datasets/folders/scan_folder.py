@@ -40,12 +40,11 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
     files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
     skipped = sorted(path.name for path in set(candidates) - set(files))
-    shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
     gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
     no_files = "is no file" if len(gone) == 1 else "are no files"
     return (
         files,
-        [f"{count(len(skipped), 'other file')} not taken for scans: {shown}."] if skipped else [],
+        [f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."] if skipped else [],
         [f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}."] if gone else [],
     )
 

@@ -1,7 +1,6 @@
 """Packets of Velodyne's sensors, decoded by velodyne-decoder: those of one sweep, and captures (.pcap)."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
@@ -13,16 +12,13 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
-from lidarslam.datasets.packets.packet_recording import PacketRecording
 from lidarslam.datasets.point_table import PointField, fields_of, raw_cloud
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import PacketRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # Beyond the range of any model; the library's own limit is less than that of some.
 _FARTHEST_M = 1000.0
-_PACKETS_LOOKED_AT = 2000
-# First bytes of other makers' packets.
-_OTHER_MAKERS = {"Hesai": (b"\xee\xff",), "RoboSense": (b"\x55\xaa", b"\xa5\xff")}
 
 _StampedCloud = tuple[float, NDArray[np.void]]
 
@@ -55,7 +51,10 @@ class VelodyneCapture(PacketRecording):
                 return  # the recording of the capture was cut short
             raise InputError(f"{self._source}: {_reason(self._source, error)}") from error
         if not found:
-            raise InputError(f"{self._source}: {_other_sensor(self._source)}")
+            raise InputError(
+                f"{self._source}: holds no packets of a Velodyne; for an Ouster, put the sensor's metadata beside it as"
+                f" {self.name}.json; else play it through the sensor's driver, and record a bag"
+            )
 
     def _fields(self, item: _StampedCloud) -> tuple[PointField, ...]:
         return fields_of(item[1])
@@ -79,25 +78,6 @@ def _reason(path: Path, error: Exception) -> str:
     if "tcpdump" in said or type(error).__name__ == "NeedData":
         return f"is no capture that can be read; a .pcapng is converted by `editcap -F pcap {path} {path.stem}.pcap`"
     return f"its packets cannot be decoded ({said}); record it again, or play it through the sensor's driver"
-
-
-def _other_sensor(path: Path) -> str:
-    import velodyne_decoder
-
-    payloads: list[bytes] = []
-    with suppress(Exception):  # damaged; the packets found so far are judged
-        for _, payload in islice(velodyne_decoder.util.iter_pcap(path), _PACKETS_LOOKED_AT):
-            payloads.append(bytes(payload)) if isinstance(payload, bytes) else None
-    for maker, begins in _OTHER_MAKERS.items():
-        if any(payload.startswith(begins) for payload in payloads):
-            return (
-                f"holds packets of a {maker}, which are not decoded; play it through the sensor's driver, and record a"
-                " bag"
-            )
-    return (
-        "holds no packets of a Velodyne; for an Ouster, put the sensor's metadata beside it as"
-        f" {path.with_suffix('.json').name}; else play it through the sensor's driver, and record a bag"
-    )
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

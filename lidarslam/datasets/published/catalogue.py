@@ -24,9 +24,6 @@ class DataSet:
     choose: str = ""  # option that chooses a sequence, where the source does not
 
 
-def _data_set(row: dict[str, Any]) -> DataSet:
-    return DataSet(**{**row, "imu": row["imu"] == "yes"})
-
-
 _TABLE = files("lidarslam.datasets.published").joinpath("catalogue.csv").read_text(encoding="utf-8")
-CATALOGUE = tuple(map(_data_set, csv.DictReader(_TABLE.splitlines())))
+_ROWS: Any = csv.DictReader(_TABLE.splitlines())
+CATALOGUE = tuple(DataSet(**{**row, "imu": row["imu"] == "yes"}) for row in _ROWS)

@@ -97,10 +97,9 @@ def absent(source: Path) -> str | None:
     if folder.name in {*DATA_SETS, *known}:
         return f"{source}: is a data set of evalio; name one of its sequences{_choice(folder.name, known)}"
     data_set = folder.parent.name
-    if known and data_set not in known:
-        return f"{source}: evalio has no data set {data_set}; there are: {', '.join(known)}"
-    if known and source.name not in known[data_set]:
-        return f"{source}: evalio has no {full_name(source)}; there are{_choice(data_set, known)}"
+    if known and source.name not in known.get(data_set, ()):
+        there = _choice(data_set, known) or f": {', '.join(known)}"
+        return f"{source}: evalio has no {full_name(source)}; there are{there}"
     install = "" if known else "; evalio comes with pip install 'lidarslam[datasets]'"
     return f"{source}: is not downloaded: {how_to_get(source)}{install}"
 

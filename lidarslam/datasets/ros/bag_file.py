@@ -15,7 +15,7 @@ from io import BytesIO, RawIOBase
 from itertools import chain, count, pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -30,14 +30,14 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
+from lidarslam.datasets.stored_recording import storage_files
 
-Report = Callable[[str], None]
-
+Recovered = tuple[str, str, int, bytes]
+"""Topic, type as in ROS 2, time of recording in nanoseconds, and bytes of a message."""
 # Recorders write chunks of 1 to 16 MB, and a cloud of two million points has some 100 MB.
 MOST_BYTES = 1 << 28
 # Largest ratio of decompression of a file that is compressed as a whole; that of clouds is below twenty.
 _MOST_GROWTH = 100
-_STORAGE_SUFFIXES = (".db3", ".mcap")
 _LAST_MESSAGES_NS = 1_000_000_000
 _REPAIR = {
     ".bag": "rosbag reindex {}",
@@ -53,6 +53,10 @@ MCAP_MAGIC, _ROSBAG1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
 _TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
 # By the table itself, because the pages of its index are at the end.
 _ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
@@ -144,22 +148,21 @@ class BagFile:
     def _read_without_index(self, error: InputError) -> Counter[tuple[str, str]]:
         """Read without a folder's metadata, then without the file's index too; the error remains if both fail."""
         if self.path.is_dir():
-            files = _storage_files(self.path)
+            files = storage_files(self.path)
             if len(files) != 1:  # the order of several is in the metadata alone
                 raise error
             self.damage = f"{self.path}: its metadata.yaml is missing or damaged, so {files[0].name} was read by itself"
             self.path = files[0]
             with suppress(InputError):
                 return self._read_index()
-        reports: list[str] = []
-        counts: Counter[tuple[str, str]] = Counter()
-        with suppress(Exception):  # not even the beginning can be read
-            messages = recover(self.path, self._suffix(), reports.append)
-            counts.update((message.topic, message.message_type) for message in messages)
+        counts, why = Counter[tuple[str, str]](), ""
+        try:
+            counts.update(named[:2] for named in recover(self.path, self._suffix()))
+        except Exception as broken:  # perhaps not even the beginning can be read
+            why = f": {_reason(broken)}"
         if not counts:
             raise error
         self._has_index = False
-        why = "".join(f": {report}" for report in reports[:1])
         self.damage = (
             f"{self.path}: has no index that can be read, so its {counts.total()} messages were read one after another"
             f" as far as they go{why}; {self._remedy()}"
@@ -193,19 +196,17 @@ class BagFile:
             yield self._message(found[1], found[2], topic)
 
     def _in_sequence(self, topic: Topic) -> Iterator[BagMessage]:
-        with suppress(Exception):  # not even its beginning can be read any more
-            for message in recover(self.path, self._suffix(), lambda _: None):
-                if (message.topic, message.message_type) == (topic.name, topic.message_type):
-                    yield self._message(message.record_ns, message.raw, topic)
+        with suppress(Exception):  # up to the damage
+            for name, message_type, record_ns, raw in recover(self.path, self._suffix()):
+                if (name, message_type) == (topic.name, topic.message_type):
+                    yield self._message(record_ns, raw, topic)
 
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         try:
-            if self._messages_are_compressed:
-                with self._damage("a compressed message is damaged"):
-                    raw = unpacked_message(raw)
+            raw = unpacked_message(raw) if self._messages_are_compressed else raw
             header_ns, frame_id = read_header(raw, self.ros2)
-        except (InputError, ValueError) as error:
-            damage = str(error) if isinstance(error, InputError) else f"{self.path}: {error}"
+        except Exception as error:  # of the decompressor too
+            damage = f"{self.path}: a message is damaged: {_reason(error)}"
             return BagMessage(record_ns, 0, "", topic.message_type, b"", damage)
         return BagMessage(record_ns, header_ns, frame_id, topic.message_type, raw)
 
@@ -251,8 +252,7 @@ class BagFile:
         except InputError:
             raise
         except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{self.path}: {place} ({reason}); {self._remedy()}") from error
+            raise InputError(f"{self.path}: {place} ({_reason(error)}); {self._remedy()}") from error
 
     def _suffix(self) -> str:
         return self.path.suffix if self.ros2 else ".bag"
@@ -262,19 +262,13 @@ class BagFile:
             whole = min(self.path.glob("*.zstd"), default=None)
             if whole is not None:  # decompressed, it is a file that is read as far as possible
                 return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
-            files = _storage_files(self.path)
+            files = storage_files(self.path)
             such_as = f", such as {files[0]}" if files else ""
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files{such_as}"
         command = _REPAIR.get(self._suffix())
         if command is None:
             return "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml"
         return f"try `{command.format(self.path)}`, or copy the bag again"
-
-
-def _storage_files(folder: Path) -> list[Path]:
-    """The databases and MCAP files of a folder, without hidden ones such as macOS's `._` files."""
-    named = (entry for entry in folder.iterdir() if entry.suffix in _STORAGE_SUFFIXES and entry.name[0] != ".")
-    return sorted(entry for entry in named if entry.is_file())
 
 
 def _left_in_log(path: Path) -> str | None:
@@ -290,10 +284,10 @@ def _left_in_log(path: Path) -> str | None:
 def _require_kind(path: Path, ros2: bool) -> None:
     if path.is_dir():
         return
-    magic, kind, suffix = (_ROSBAG1_MAGIC, "a rosbag1", ".bag") if ros2 else (MCAP_MAGIC, "an MCAP", ".mcap")
+    magic, suffix = (_ROSBAG1_MAGIC, ".bag") if ros2 else (MCAP_MAGIC, ".mcap")
     with path.open("rb") as file:
         if file.read(len(magic)) == magic:
-            raise InputError(f"{path}: is {kind} file, by its first bytes; name it {path.with_suffix(suffix).name}")
+            raise InputError(f"{path}: is a {suffix} by its first bytes; name it {path.with_suffix(suffix).name}")
 
 
 def _last(messages: Iterable[BagMessage]) -> BagMessage | None:
@@ -310,19 +304,10 @@ def _storages(reader: Rosbag1Reader | Rosbag2Reader) -> list[Any]:
     return getattr(reader.storage, "storages", None) or [reader.storage]
 
 
-class RecoveredMessage(NamedTuple):
-    """One message; the type is named as in ROS 2, the time is that of recording in nanoseconds."""
-
-    topic: str
-    message_type: str
-    record_ns: int
-    raw: bytes
-
-
-def recover(path: Path, suffix: str, report: Report) -> Iterator[RecoveredMessage]:
-    """The messages of a `.bag`, `.mcap` or `.db3` file up to its first damaged place, which is reported in a line."""
+def recover(path: Path, suffix: str) -> Iterator[Recovered]:
+    """The messages of a `.bag`, `.mcap` or `.db3` file up to its first damaged place, a ValueError or the end."""
     if suffix == ".db3":
-        yield from _database(path, report)
+        yield from _database(path)
         return
     records: _Rosbag1 | _Mcap = _Rosbag1() if suffix == ".bag" else _Mcap()
     with path.open("rb") as file:
@@ -333,8 +318,7 @@ def recover(path: Path, suffix: str, report: Report) -> Iterator[RecoveredMessag
             try:
                 yield from records.read(file)
             except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
-                report(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})")
-                return
+                raise ValueError(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})") from error
 
 
 class _Rosbag1:
@@ -345,7 +329,7 @@ class _Rosbag1:
     def __init__(self) -> None:
         self._connections: dict[int, tuple[str, str]] = {}  # topic and type, by the number in each message
 
-    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+    def read(self, file: BinaryIO) -> Iterator[Recovered]:
         """The messages of the record that begins here."""
         header, size = Header.read(file), read_uint32(file)
         kind, data = header.get_uint8("op"), file.read(min(size, _LONGEST_RECORD))
@@ -359,7 +343,7 @@ class _Rosbag1:
             self._connections[header.get_uint32("conn")] = named
         elif kind == RecordType.MSGDATA:
             named = self._connections[header.get_uint32("conn")]
-            yield RecoveredMessage(*named, header.get_time("time"), data)
+            yield *named, header.get_time("time"), data
 
 
 class _Mcap:
@@ -371,7 +355,7 @@ class _Mcap:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str]] = {}
 
-    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+    def read(self, file: BinaryIO) -> Iterator[Recovered]:
         """The messages of the record that begins here."""
         opcode, size = struct.unpack("<BQ", read_exact(file, 9))
         if opcode in (_FOOTER, _DATA_END):  # the summary behind it repeats schemas and channels
@@ -395,10 +379,10 @@ class _Mcap:
             self._channels[channel] = (read_string(body), self._schemas[schema])
         elif opcode == _MESSAGE:
             channel, _, record_ns, _ = struct.unpack("<HIQQ", read_exact(body, 22))
-            yield RecoveredMessage(*self._channels[channel], record_ns, body.read())
+            yield *self._channels[channel], record_ns, body.read()
 
 
-def _within(content: bytes, read: Callable[[BinaryIO], Iterator[RecoveredMessage]]) -> Iterator[RecoveredMessage]:
+def _within(content: bytes, read: Callable[[BinaryIO], Iterator[Recovered]]) -> Iterator[Recovered]:
     stream = BytesIO(content)
     while stream.tell() < len(content):
         yield from read(stream)
@@ -407,10 +391,6 @@ def _within(content: bytes, read: Callable[[BinaryIO], Iterator[RecoveredMessage
 def _require_whole(data: bytes, size: int) -> None:
     if len(data) < size:
         raise ValueError(f"expected a record of {size:,} bytes, got {len(data):,}")
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def require_tables(path: Path) -> None:
@@ -426,7 +406,7 @@ def _connected(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
 
 
-def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
+def _database(path: Path) -> Iterator[Recovered]:
     require_tables(path)
     with path.open("rb") as file:
         header = file.read(32)
@@ -437,21 +417,14 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
         # Pages that are missing at the end (sqlite.org/fileformat2.html, 1.3) SQLite may take for zeros.
         page, pages = struct.unpack_from(">H10xI", header, 16)
         is_cut = path.stat().st_size < pages * (page if page > 1 else 65536)
-        for row, following in pairwise(chain(_rows(database, report), [None])):
+        for row, following in pairwise(chain(_rows(database), [None])):
             if row is None or (following is None and is_cut):
                 return
             topic, record_ns, raw = row
             if topic in topics and isinstance(record_ns, int) and isinstance(raw, bytes):
-                yield RecoveredMessage(*topics[topic], record_ns, raw)
-            else:
-                report(f"a row of it is no message (its data are of type {type(raw).__name__})")
+                yield *topics[topic], record_ns, raw
 
 
-def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:
-    rows = 0
-    try:
-        for row in database.execute(_ROWS):
-            yield row
-            rows += 1
-    except sqlite3.Error as error:
-        report(f"it breaks off after {rows:,} rows ({_reason(error)})")
+def _rows(database: sqlite3.Connection) -> Iterator[tuple[Any, ...]]:
+    with suppress(sqlite3.Error):  # damaged from here on
+        yield from database.execute(_ROWS)

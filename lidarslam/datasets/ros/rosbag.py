@@ -1,17 +1,25 @@
 """Point clouds of a rosbag: rosbag1, rosbag2 (SQLite or MCAP), as PointCloud2, Livox CustomMsg or packets."""
 
+import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.packets.packet_recording import require
+from lidarslam.datasets.packets.ouster import (
+    OusterRecording,
+    find_metadata,
+    frames_of_packets,
+    imu_packets,
+    read_sensor,
+)
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
@@ -26,11 +34,10 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
-from lidarslam.datasets.ros.ouster_bag import OusterBag
-from lidarslam.datasets.stored_recording import CloudRecording, truth_beside
+from lidarslam.datasets.stored_recording import CloudRecording, require, storage_files, truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
-_PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
+_STRING_TYPE = "std_msgs/msg/String"
 _TOPICS_LISTED = 20
 # As a share of one topic's messages, the most of all others together if these are no recordings: occasional maps.
 _NEGLIGIBLE = 0.05
@@ -132,8 +139,7 @@ class BagRecording(CloudRecording):
             damages.append(damage)
             faults.note(_DAMAGED, damage)
 
-        for message in self._bag.messages(self._topic, note):
-            count += 1
+        for count, message in enumerate(self._bag.messages(self._topic, note), 1):  # noqa: B007 - the last one counts
             yield message
         if not count:
             lists = f"{self._source}: its index lists {len(self)} messages of {self._topic.name}, it holds none;"
@@ -203,6 +209,52 @@ class BagRecording(CloudRecording):
                 pair = []
 
 
+class OusterBag(OusterRecording):
+    """The packets of an Ouster in one `lidar_packets` topic, as ouster_ros records them.
+
+    The sensor's metadata is in a topic or next to the bag.
+    """
+
+    reader = "rosbag"
+
+    def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
+        super().__init__(source, config)
+        self._bag = bag
+        self._topic = topic
+        self.topic, self.topics = topic.name, bag.topics
+        self.warnings = () if bag.damage is None else (bag.damage,)
+
+    @cached_property
+    def sensor(self) -> Any:
+        """See `OusterRecording`."""
+        if (text := next(self._contents("metadata", _STRING_TYPE), None)) is not None:
+            return read_sensor(text.decode(errors="replace"))
+        if (beside := find_metadata(self._source)) is not None:
+            return read_sensor(beside.read_text(encoding="utf-8", errors="replace"))
+        raise InputError(
+            f"{self._source}: {self.topic} holds packets of an Ouster, which need the sensor's metadata; put it"
+            f" beside the bag as {self.name}.json"
+        )
+
+    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
+        contents = self._contents(self._topic.name.rpartition("/")[2], self._topic.message_type)
+        return islice(frames_of_packets(self.sensor, contents), wanted.start, wanted.stop, wanted.step)
+
+    def _packets_of_imu(self) -> Iterator[Any]:
+        return imu_packets(self.sensor, self._contents("imu_packets", self._topic.message_type))
+
+    def _contents(self, name: str, message_type: str) -> Iterator[bytes]:
+        """The content of the messages of a topic other than that of the packets: a single string or array of bytes."""
+        beside = f"{self._topic.name.rpartition('/')[0]}/{name}"
+        topic = next((t for t in self._bag.topics if (t.name, t.message_type) == (beside, message_type)), None)
+        for message in self._bag.messages(topic) if topic is not None else ():
+            start = 8 if self._bag.ros2 else 4
+            order = ">" if self._bag.ros2 and message.raw[1:2] == b"\x00" else "<"
+            if len(message.raw) >= start:
+                (length,) = struct.unpack_from(order + "I", message.raw, start - 4)
+                yield message.raw[start : start + length].rstrip(b"\0" if message_type == _STRING_TYPE else b"")
+
+
 def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
     """The wanted point cloud topic, or the only one with many messages; without clouds, the only one of packets."""
     clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES and topic.messages]
@@ -222,18 +274,12 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
         raise SeveralTopicsError(message, clouds, topics)
     if not any(topic.messages for topic in topics):
         raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
-    others = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
     hint = ""
-    if others:
-        hint = (
-            f" {others[0].name} holds raw packets of a sensor whose packets are not decoded: play it through the"
-            " sensor's driver and record the point clouds."
-        )
-    elif any(topic.message_type.replace("/", "/msg/") in CLOUD_TYPES for topic in topics):
+    if any(topic.message_type.replace("/", "/msg/") in CLOUD_TYPES for topic in topics):
         hint = " Its messages are those of ROS 1, which are read from a .bag alone: give the one it was converted from."
     raise InputError(
-        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages.{hint} Its topics:"
-        f" {_listing(topics)}"
+        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages; packets of other"
+        f" sensors are not decoded.{hint} Its topics: {_listing(topics)}"
     )
 
 
@@ -252,10 +298,8 @@ def _has_packets(topic: Topic) -> bool:
 def _one_part(source: Path) -> str | None:
     """A sentence where a file is one of several of a rosbag2."""
     folder = source.absolute().parent
-    if source.is_dir() or not (folder / "metadata.yaml").is_file():
-        return None
-    parts = len(list(folder.glob(f"*{source.suffix}")))
-    return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
+    parts = storage_files(folder) if source.is_file() and (folder / "metadata.yaml").is_file() else []
+    return f"This file is one of {len(parts)} parts of the bag {folder}; name the folder." if len(parts) > 1 else None
 
 
 def _listing(topics: Sequence[Topic]) -> str:

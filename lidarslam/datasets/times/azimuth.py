@@ -17,9 +17,6 @@ from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel
 
 AZIMUTH_TIME = PointTimeModel("azimuth", "s", "relative")
 
-Decision = tuple[float | None, str | None, str | None]
-"""The duration of a sweep if the azimuth gives the times, a fact for the user, and the missing setting."""
-
 # Number of blocks of consecutive points whose mean azimuth is followed round the circle.
 _BLOCKS, _FEWEST_IN_BLOCK = 180, 8
 # Length of a block's mean direction: 1 where all its points have one azimuth; 0.95 is about +-18 degrees.
@@ -240,7 +237,7 @@ def point_timing(
     sweep_s, note, offer = None, None, None
     if reference in ("auto", "azimuth") and period_s is not None:
         orders = ([sweep_order(cloud) for cloud in run] for run in runs)
-        sweep_s, note, offer = (_as_asked if reference == "azimuth" else _as_measured)(orders, period_s)
+        sweep_s, note, offer = _by_azimuth(orders, period_s, reference == "azimuth")
     if fault is not None and sweep_s is not None:
         fault += "; the times follow from the azimuth instead."
     elif fault is not None:
@@ -249,21 +246,22 @@ def point_timing(
     return PointTiming(None if sweep_s is None else AZIMUTH_TIME, sweep_s, () if note is None else (note,), warnings)
 
 
-def _as_measured(runs: Iterable[list[SweepOrder | None]], period_s: float) -> Decision:
+def _by_azimuth(
+    runs: Iterable[list[SweepOrder | None]], period_s: float, is_asked: bool
+) -> tuple[float | None, str | None, str | None]:
+    """The duration of a sweep if the azimuth gives the times, a fact for the user, and the missing setting."""
+    if is_asked and all(order is None for run in runs for order in run):
+        return None, None, _NO_ORDER
     if period_s >= _LONGEST_SWEEP_S:
-        return None, None, None
+        return None, None, _TOO_SLOW if is_asked else None
+    if is_asked:
+        return period_s, _USED, None
     if not (pairs := list(_ordered_pairs(runs))):
         return None, _UNORDERED, None
     decision = are_as_measured(pairs)
     if decision is None:
         return None, None, _OFFERED
     return (period_s, _USED, None) if decision else (None, _NOT_USED, None)
-
-
-def _as_asked(runs: Iterable[list[SweepOrder | None]], period_s: float) -> Decision:
-    if all(order is None for run in runs for order in run):
-        return None, None, _NO_ORDER
-    return (period_s, _USED, None) if period_s < _LONGEST_SWEEP_S else (None, None, _TOO_SLOW)
 
 
 def _ordered_pairs(runs: Iterable[list[SweepOrder | None]]) -> Iterator[tuple[SweepOrder, SweepOrder]]:

@@ -141,18 +141,15 @@ def learn_point_time(
         is_clear = stamp is None or abs(stamp) > 2 * CLOCK_LIMIT_S
         if (found.model is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
             break
-    if (model := learned.model) is None:
-        logger.info("time of a point: none is known; scans are taken as measured at one instant, or compensated")
-    else:
-        logger.info("time of a point: field %r in %s, %s", model.field, model.unit, model.reference)
+    logger.info("time of a point: %s", learned.model)
     return learned
 
 
 def _unknown_field(cloud: RawCloud) -> str | None:
-    name = next((field.name for field in cloud.fields if "time" in field.name.lower()), None)
-    if name is None:
-        return None
-    return f"The points have no time field of a known name; if {name!r} is one, --set reader.time_field={name}"
+    for field in cloud.fields:
+        if "time" in (name := field.name).lower():
+            return f"The points have no time field of a known name; if {name!r} is one, --set reader.time_field={name}"
+    return None
 
 
 def infer_point_time(
@@ -181,7 +178,9 @@ def infer_point_time(
         return LearnedTime()
     spread = value_spread(values)
     if spread is None:
-        return LearnedTime(None, f"The time field {field!r} holds {_without_spread(values)}")
+        known = values[np.isfinite(values)]
+        holds = f"one value alone ({float(np.median(known)):.9g})" if len(known) else "no number"
+        return LearnedTime(None, f"The time field {field!r} holds {holds}")
     if spread.resolution > _COARSEST_OF_SWEEP * spread.span:
         return LearnedTime(None, f"The time field {field!r} is too coarse, with steps of {spread.resolution:g}")
     given = defined_unit if unit == "auto" else unit
@@ -201,19 +200,11 @@ def infer_point_time(
         span = f"({spread.first:.9g} to {spread.last:.9g})"
         return LearnedTime(None, f"The time field {field!r} {span} spans a sweep in no unit")
     model = PointTimeModel(field, found, "absolute" if by_clock else _reference(spread, found, reference))
-    return LearnedTime(model, _other_clock(model, values, stamp))
-
-
-def _other_clock(model: PointTimeModel, values: NDArray[np.generic], stamp: float | None) -> str | None:
-    if model.reference != "absolute" or stamp is None or model.shares_clock(values, stamp):
-        return None
-    said = f"The time field {model.field!r} reads another clock than the scans' stamps"
-    return f"{said}, so the earliest point of each scan gets its stamp."
-
-
-def _without_spread(values: NDArray[np.generic]) -> str:
-    known = values[np.isfinite(values)]
-    return "no number" if not len(known) else f"one value alone ({float(np.median(known)):.9g})"
+    warning = None
+    if model.reference == "absolute" and stamp is not None and not model.shares_clock(values, stamp):
+        said = f"The time field {field!r} reads another clock than the scans' stamps"
+        warning = f"{said}, so the earliest point of each scan gets its stamp."
+    return LearnedTime(model, warning)
 
 
 def _reference(spread: "ValueSpread", unit: str, reference: TimeReference) -> str:
