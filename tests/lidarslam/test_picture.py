@@ -25,8 +25,9 @@ from lidarslam.viewer.picture import (
     fit_frame,
     require_quantity,
     save_picture,
+    save_video,
+    turn_runs,
 )
-from lidarslam.viewer.video import save_video, turn_runs
 from lidarslam.viewer.view import View, draw_layer, fit_view, turning_views
 
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
