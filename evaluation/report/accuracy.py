@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.map.metrics import CloudErrors
-from lidarslam.evaluation.report.bulk import beyond_m, in_bulk, leaves, paths_in_bulk
+from lidarslam.evaluation.report.drawing import beyond_m, in_bulk, leaves, paths_in_bulk
 from lidarslam.evaluation.report.figure import (
     EQUAL_AXES,
     MOST_POINTS,

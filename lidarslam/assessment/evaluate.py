@@ -31,7 +31,7 @@ from lidarslam.evaluation.map.metrics import (
     MapComparison,
     compare_maps,
 )
-from lidarslam.evaluation.report.error_colours import DEFAULT_CLIP_M, DISTANCE_FIELD, error_colours
+from lidarslam.evaluation.report.drawing import DEFAULT_CLIP_M, DISTANCE_FIELD, error_colours
 from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, align_poses
 from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, common_instants
 from lidarslam.evaluation.trajectory.drift import Drift

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.report.error_colours import ramp, viridis
+from lidarslam.evaluation.report.drawing import ramp, viridis
 from lidarslam.viewer.view import View
 
 Quantity = Literal["height", "intensity", "error", "rgb"]

@@ -16,8 +16,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
-from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD
+from lidarslam.evaluation.report.drawing import DISTANCE_FIELD, beyond_m, leaves, paths_in_bulk
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors

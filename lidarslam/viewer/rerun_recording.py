@@ -26,7 +26,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text import one_line
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.evaluation.report.error_colours import viridis
+from lidarslam.evaluation.report.drawing import viridis
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.annotations import levels

@@ -19,7 +19,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.map.metrics import MapComparison
-from lidarslam.evaluation.report.error_colours import error_colours, viridis
+from lidarslam.evaluation.report.drawing import error_colours, viridis
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors

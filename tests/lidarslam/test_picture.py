@@ -162,11 +162,6 @@ def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:
     np.testing.assert_allclose(both, (first + second) / 2, atol=6)
 
 
-def test_a_run_without_a_map_or_with_one_pose_is_drawn() -> None:
-    assert not drawn(draw([DrawnRun("", NOTHING)])).any()
-    assert drawn(draw([DrawnRun("", NOTHING, np.zeros((1, 3)))])).any()
-
-
 def test_a_picture_is_written_as_png(tmp_path: Path) -> None:
     pixels = draw([DrawnRun("", cloud(np.eye(3)))]).pixels
     save_picture(tmp_path / "map.png", pixels)

@@ -213,6 +213,16 @@ def test_recordings_are_prepared_once(kept, monkeypatch):
     assert_as_kept(kept)
 
 
+def test_nothing_is_prepared_behind_a_link(room_folder, tmp_path):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "prepared").symlink_to(tmp_path / "outside")
+    linked = replace(request(room_folder, tmp_path / "out", tmp_path), prepared=None)
+    with pytest.raises(OutputError, match="is a link to another place"):
+        execute(linked, print)
+    assert not any((tmp_path / "outside").iterdir())
+
+
 @pytest.mark.parametrize(
     "forge",
     [
