@@ -38,8 +38,7 @@ from lidarslam.odometry.network.candidates import Described, Search
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 from lidarslam.odometry.network.exported import onnx_search, read_exported
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.network.shipped import default_weights, shipped_folder
-from lidarslam.odometry.registry import make_odometry
+from lidarslam.odometry.registry import default_weights, make_odometry, shipped_folder
 from lidarslam.pipeline.threads import in_order
 
 SCANS = 12

@@ -26,8 +26,8 @@ from lidarslam.run.summary_text import format_end, format_times
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.finished_run import load_map
+from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer
-from lidarslam.viewer.web_page import WebPage
 
 # A map of fewer points is too small for a search.
 _FEWEST_POINTS = 1000

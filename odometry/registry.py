@@ -1,12 +1,55 @@
-"""The odometry methods by name; a method's module is imported when it is chosen."""
+"""The odometry methods by name, a method's module being imported when it is chosen, and the bundled network."""
 
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
 from typing import cast
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import ODOMETRIES, LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import ConstantVelocity, Odometry
-from lidarslam.odometry.network.shipped import default_weights, require_train_extra, shipped_folder
+
+
+def default_weights() -> Path:
+    """The file of weights, for training and for accelerators.
+
+    ConfigError where the program was installed without it.
+    """
+    return _required("correlation.safetensors")
+
+
+def shipped_folder() -> Path:
+    """The folder of the same network as ONNX, for inference; errors likewise."""
+    return _required("correlation")
+
+
+def _required(name: str) -> Path:
+    path = Path(str(files("lidarslam.odometry"))) / "weights" / name
+    if not path.exists():
+        raise ConfigError(
+            f"{path}: the weights that come with the program are missing;"
+            " install it again, or name a file of weights with --weights FILE"
+        )
+    return path
+
+
+_LIBRARIES = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript")
+
+
+def require_train_extra(purpose: str) -> None:
+    """Check that the libraries of the extra are installed; the message names the purpose.
+
+    ConfigError where one is missing.
+    """
+    for name in _LIBRARIES:
+        try:
+            import_module(name)
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"{error.name} is not installed, which {purpose} needs; pip install 'lidarslam[train]'"
+                " (PyTorch's CPU build, installed first, is much smaller: https://pytorch.org/get-started/locally)"
+            ) from error
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.odometry.network.shipped import default_weights
+from lidarslam.odometry.registry import default_weights
 
 HIDDEN = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript")
 

@@ -29,8 +29,7 @@ _ICP_ITERATIONS = 40
 _ICP_STEP = 1e-6
 _NORMAL_NEIGHBOURS = 12
 _FEWEST_POINTS = 30
-# Extents that differ by this factor differ in unit.
-_OTHER_UNIT = 100.0
+
 # Points of the map while several poses are tried.
 _SEARCH_POINTS = 10_000
 # Cells across the target; features of both sizes propose a pose.
@@ -85,8 +84,7 @@ def align_map(
 
     Guesses are `T_reference_map` (4, 4) by name; with `refine`, ICP follows.
     """
-    if not search and len(guesses) != 1:
-        raise ValueError(f"expected one guess, or a search, got {len(guesses)} guesses")
+
     clouds = _Clouds.prepare(map_points, reference_points)
     tried = []
     for name, T_reference_map in guesses.items():
@@ -95,7 +93,7 @@ def align_map(
             return clouds.to_given(tried[-1])
     tried.append(_search(clouds))
     if not tried[-1].is_trustworthy:
-        raise InputError(_explain(tried) + _other_unit(clouds))
+        raise InputError(_explain(tried))
     return clouds.to_given(tried[-1])
 
 
@@ -203,7 +201,6 @@ class _Clouds:
         return T
 
     def _fitness(self, T: FloatArray) -> tuple[float, float | None]:
-        """Share of inliers and their root mean square distance."""
         distances, _ = self.tree.query(transform_points(T, self.mapped), distance_upper_bound=self.inlier_m, workers=-1)
         near = np.asarray(distances)[np.isfinite(distances)]
         return len(near) / len(self.mapped), float(np.sqrt(np.mean(near**2))) if len(near) else None
@@ -214,18 +211,7 @@ def _explain(tried: Sequence[MapAlignment]) -> str:
     reason = "cannot be aligned with its reference so that half of it fits"
     if tried[-1].fitness >= TRUSTED_FITNESS:
         reason = f"fits its reference at more than one pose ({100.0 * (tried[-1].runner_up or 0.0):.0f} % at another)"
-    return f"the map {reason} ({fits}); give the pose as a 4x4 text file with --map-alignment FILE"
-
-
-def _other_unit(clouds: _Clouds) -> str:
-    """A likely cause, where the clouds are of very different size."""
-    size, of_reference = (
-        float(np.abs(np.percentile(cloud, [10, 90], axis=0)).max()) for cloud in (clouds.mapped, clouds.reference)
-    )
-    factor = of_reference / max(size, 1e-9)
-    if 1.0 / _OTHER_UNIT < factor < _OTHER_UNIT:
-        return ""
-    return f". The reference is {factor:.3g} times as large: is it in metres?"
+    return f"the map {reason} ({fits}); are both in metres? Else give the pose as a 4x4 text file, --map-alignment FILE"
 
 
 def candidate_poses(source: FloatArray, target: FloatArray) -> list[FloatArray]:

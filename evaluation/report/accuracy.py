@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.map.metrics import CloudErrors
-from lidarslam.evaluation.report.bulk import beyond_m, in_bulk, leaves, paths_in_bulk
+from lidarslam.evaluation.report.drawing import beyond_m, in_bulk, leaves, paths_in_bulk
 from lidarslam.evaluation.report.figure import (
     EQUAL_AXES,
     MOST_POINTS,
@@ -130,7 +130,6 @@ def _traces(
 
 
 def _thin(count: int) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
-    """Rows of evenly spaced poses."""
     return np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int32)
 
 
@@ -202,7 +201,6 @@ def _over_distance(
     styles: Styles,
     signed: bool,
 ) -> Figure | None:
-    """A panel for each title, with a curve for each method."""
     if not measured:
         return None
     panels = [_error_panel(title, measured, of, styles, signed) for title, of in curves.items()]
@@ -386,7 +384,6 @@ def _map_panel(name: str, errors: CloudErrors, low: FloatArray, high: FloatArray
 
 
 def _height_from_above(size: FloatArray) -> int:
-    """Pixels of a panel that shows a scene of this size along x and y in one scale."""
     return int(np.clip(_NOMINAL_WIDTH * size[1] / size[0], _LOWEST, _TALLEST))
 
 

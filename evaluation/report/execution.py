@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.tracking import Status
-from lidarslam.evaluation.comparison.comparison import ScanSeries, SequenceComparison, lost_intervals
-from lidarslam.evaluation.comparison.quantities import times_note
+from lidarslam.evaluation.comparison.comparison import ScanSeries, SequenceComparison, lost_intervals, times_note
 from lidarslam.evaluation.report.figure import (
     Figure,
     Panel,

@@ -129,11 +129,11 @@ def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles
     return Panel(title, bars, {**axes, "hovermode": "closest", "barmode": "overlay"}, 70 + 30 * len(bars))
 
 
-def thin_curve(y: FloatArray, most: int = MOST_POINTS) -> NDArray[np.intp]:
-    """At most `most` rows of a curve (N,): the lowest and the highest of each of equal pieces, so that peaks stay."""
-    if len(y) <= most:
+def thin_curve(y: FloatArray) -> NDArray[np.intp]:
+    """Rows of a curve (N,), at most `MOST_POINTS`: lowest and highest of each of equal pieces, so that peaks stay."""
+    if len(y) <= MOST_POINTS:
         return np.arange(len(y))
-    piece = np.arange(len(y)) * (most // 2 - 1) // len(y)
+    piece = np.arange(len(y)) * (MOST_POINTS // 2 - 1) // len(y)
     order = np.lexsort((y, piece))
     ends = np.flatnonzero(np.diff(piece[order])) + 1
     return np.unique(np.r_[0, len(y) - 1, order[np.r_[0, ends]], order[np.r_[ends - 1, len(y) - 1]]])

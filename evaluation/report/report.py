@@ -12,16 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 
 from lidarslam.evaluation.comparison.comparison import Comparison, SequenceComparison, Table, number_text, printable
-from lidarslam.evaluation.report.accuracy import (
-    deviation_figure,
-    entropy_figure,
-    error_figure,
-    length_figure,
-    map_figure,
-    speed_figure,
-    trajectory_figure,
-)
-from lidarslam.evaluation.report.execution import resources_figure, scan_figure, tracking_figure
+from lidarslam.evaluation.report import accuracy, execution
 from lidarslam.evaluation.report.figure import Figure, Styles, method_styles
 from lidarslam.evaluation.report.tables import sequence_tables
 
@@ -91,19 +82,19 @@ def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Ta
     several = len(sequence.methods) > 1
     order: list[Table | Figure | None] = [
         *tables["summary"],
-        trajectory_figure(sequence, styles),
-        error_figure(sequence, styles),
-        deviation_figure(sequence, styles),
-        length_figure(sequence, styles),
-        speed_figure(sequence, styles),
+        accuracy.trajectory_figure(sequence, styles),
+        accuracy.error_figure(sequence, styles),
+        accuracy.deviation_figure(sequence, styles),
+        accuracy.length_figure(sequence, styles),
+        accuracy.speed_figure(sequence, styles),
         *tables["drift"],
-        map_figure(sequence),
-        entropy_figure(sequence, styles) if several else None,
+        accuracy.map_figure(sequence),
+        accuracy.entropy_figure(sequence, styles) if several else None,
         *tables["map"],
-        scan_figure(sequence, styles),
-        resources_figure(sequence, styles) if several else None,
+        execution.scan_figure(sequence, styles),
+        execution.resources_figure(sequence, styles) if several else None,
         *tables["time"],
-        tracking_figure(sequence, styles) if several else None,
+        execution.tracking_figure(sequence, styles) if several else None,
         *tables["tracking"],
     ]
     return (block for block in order if block is not None)
@@ -139,17 +130,14 @@ def _environment() -> Environment:
 
 
 def _heading_spans(table: Table) -> list[tuple[str, int]]:
-    """Each common heading with the number of successive columns below it."""
     return [(heading, len(list(columns))) for heading, columns in groupby(table.columns, lambda column: column.heading)]
 
 
 def _markdown(text: str) -> str:
-    """The text in one line, shown as it is."""
     return _MARKDOWN_SPECIAL.sub(r"\\\1", " ".join(text.split()).translate(_HTML_SPECIAL))
 
 
 def _fence(text: str) -> str:
-    """The text between fences longer than any in it."""
     fence = "`" * max(3, 1 + max((len(run) for run in re.findall("`+", text)), default=0))
     return f"{fence}\n{text}\n{fence}"
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 from lidarslam.evaluation.comparison.comparison import (
+    QUANTITIES,
     WHOLE,
     MethodResult,
     SequenceComparison,
@@ -13,8 +14,8 @@ from lidarslam.evaluation.comparison.comparison import (
     TableColumn,
     TableRow,
     lost_intervals,
+    times_note,
 )
-from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
 from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
 _SUMMARY = (
@@ -148,7 +149,6 @@ def _time_table(sequence: SequenceComparison) -> Table:
 
 
 def _lost_table(sequence: SequenceComparison) -> Table:
-    """Intervals of lost tracking and the reasons of failures."""
     numbers = {"Lost scans": "", "First": "scan", "Last": "scan", "From": "s", "To": "s"}
     columns = [TableColumn("", label, unit, int(unit == "s")) for label, unit in numbers.items()]
     status, reason = (TableColumn("", label, numeric=False) for label in ("Status", "Reason"))

@@ -28,16 +28,11 @@ def align(estimate: Trajectory, reference: Trajectory, method: AlignmentMethod =
     Both trajectories hold the same instants. `se3` minimises the squared distances of all positions, `first_pose`
     lets the first poses coincide, `none` is the identity for trajectories that share a world already.
     """
-    if len(estimate) != len(reference) or not len(estimate):
-        raise ValueError(f"alignment needs poses of the same instants, got {len(estimate)} and {len(reference)}")
     if method == "se3":
         return align_se3(estimate.T_world_lidar, reference.T_world_lidar)
-    if method == "first_pose":
-        T_reference_estimate: FloatArray = reference.T_world_lidar[0] @ inverse(estimate.T_world_lidar[0])
-        return T_reference_estimate
     if method == "none":
         return np.eye(4)
-    raise ValueError(f"alignment must be se3, first_pose or none, got {method!r}")
+    return np.asarray(reference.T_world_lidar[0] @ inverse(estimate.T_world_lidar[0]))
 
 
 def align_se3(estimate: FloatArray, reference: FloatArray) -> FloatArray:

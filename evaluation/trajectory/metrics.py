@@ -25,8 +25,7 @@ Metric = Callable[[Trajectory, Trajectory], Mapping[str, float]]
 _UNRELATED_SHARE = 0.15
 # Sensors that stay on one spot have no spread to compare with.
 _NEGLIGIBLE_M = 0.05
-# Ratio of the spreads of one drive in two units, of which metres and millimetres are the likeliest.
-_OTHER_UNIT = 20.0
+
 # Orientations of one sensor differ by less, unless tracking was lost, when the positions differ, too.
 _OTHER_FRAME_DEG = 45.0
 
@@ -78,14 +77,14 @@ class TrajectoryMetrics:
         translations_m = (T_true_world @ self.T_reference_estimate @ T)[:, :3, 3]
         return translations_m, np.rad2deg(np.stack([roll, pitch, yaw], axis=-1))
 
-    def to_json(self) -> dict[str, object]:
-        """The content of metrics.json, with no map compared."""
+    def to_json(self, map_metrics: Mapping[str, object] | None = None) -> dict[str, object]:
+        """The content of metrics.json: these errors, and those of a map."""
         return {
             "association": self.association.to_json(),
             "trajectory": asdict(self.errors),
             "kitti": self.kitti and self.kitti.to_json(),
             "segments": {str(m): drift and drift.to_json(10) for m, drift in self.segments.items()},
-            "map": None,
+            "map": map_metrics,
             **({"plugins": dict(self.plugins)} if self.plugins else {}),
         }
 
@@ -143,11 +142,9 @@ def metrics_json(
     trajectory: TrajectoryMetrics | None, map_metrics: Mapping[str, object] | None = None
 ) -> dict[str, object]:
     """The content of metrics.json: a trajectory's errors and a map's, None where there is no reference for it."""
-    parts = dict.fromkeys(("association", "trajectory", "kitti", "segments"))
-    return {
-        **(parts if trajectory is None else trajectory.to_json()),
-        "map": None if map_metrics is None else dict(map_metrics),
-    }
+    if trajectory is not None:
+        return trajectory.to_json(map_metrics)
+    return {**dict.fromkeys(("association", "trajectory", "kitti", "segments")), "map": map_metrics}
 
 
 def trajectory_errors(
@@ -197,32 +194,23 @@ def disagreement(metrics: TrajectoryMetrics) -> str | None:
     They agree while the ATE is a small part of the reference's spread, the root mean square distance of its positions
     from their mean, and the orientations differ by far less than a right angle.
     """
-    spread_m, own_spread_m = _spread_m(metrics.association.reference), _spread_m(metrics.association.estimate)
-    error_m = metrics.errors.ate_rmse_m
-    if error_m <= max(_UNRELATED_SHARE * spread_m, _NEGLIGIBLE_M):
-        return _other_frame(metrics.errors.ate_rotation_rmse_deg)
-    message = (
-        f"the trajectory does not follow its reference: the ATE is {error_m:.3g} m, the spread of the reference"
-        f" {spread_m:.3g} m; it is {metrics.association.estimate.length_m:.3g} m long, the reference"
-        f" {metrics.association.reference.length_m:.3g} m"
-    )
-    if min(spread_m, own_spread_m) > 0.0 and max(spread_m / own_spread_m, own_spread_m / spread_m) > _OTHER_UNIT:
-        return f"{message}; are both in metres?"
-    return f"{message}; it drifts, tracking was lost, or the reference belongs to another recording or sensor"
-
-
-def _other_frame(angle_deg: float) -> str | None:
-    if angle_deg < _OTHER_FRAME_DEG:
-        return None
-    return (
-        f"the positions follow the reference, but the orientations differ by {angle_deg:.3g} deg: the reference is of"
-        " another frame than the LiDAR's, such as a camera's, or its quaternions begin with qw, which ends TUM's"
-    )
-
-
-def _spread_m(trajectory: Trajectory) -> float:
-    offsets = trajectory.positions - trajectory.positions.mean(axis=0)
-    return float(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
+    reference, errors = metrics.association.reference, metrics.errors
+    offsets = reference.positions - reference.positions.mean(axis=0)
+    spread_m = float(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
+    if errors.ate_rmse_m > max(_UNRELATED_SHARE * spread_m, _NEGLIGIBLE_M):
+        return (
+            f"the trajectory does not follow its reference: the ATE is {errors.ate_rmse_m:.3g} m, the spread of the"
+            f" reference {spread_m:.3g} m; it is {metrics.association.estimate.length_m:.3g} m long, the reference"
+            f" {reference.length_m:.3g} m; it drifts, tracking was lost, or the reference is in another unit, or of"
+            " another recording or sensor"
+        )
+    if errors.ate_rotation_rmse_deg >= _OTHER_FRAME_DEG:
+        return (
+            f"the positions follow the reference, but the orientations differ by {errors.ate_rotation_rmse_deg:.3g}"
+            " deg: the reference is of another frame than the LiDAR's, or its quaternions begin with qw, which ends"
+            " TUM's"
+        )
+    return None
 
 
 def _differences(T_a: FloatArray, T_b: FloatArray) -> tuple[FloatArray, FloatArray]:

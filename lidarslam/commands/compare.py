@@ -63,9 +63,9 @@ def compare(
     the report so far; else 4 if a bound of --max or --min is not met.
     """
     from lidarslam.compare.comparison import run_compare
+    from lidarslam.compare.method_run import Limits
     from lidarslam.compare.methods import DEFAULT_METHODS, parse_methods
     from lidarslam.compare.plan import CompareRequest, RecordingEntry
-    from lidarslam.compare.supervised import Limits
     from lidarslam.config.settings import reader_settings
     from lidarslam.core.text import command_line
     from lidarslam.storage.default_places import source_name

@@ -78,8 +78,7 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
 
     Exit status 4 if a bound of --max or --min is not met; everything is written then too.
     """
-    from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate
-    from lidarslam.assessment.text import format_evaluation
+    from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
     from lidarslam.evaluation.comparison.gates import format_gates, judge
     from lidarslam.storage.finished_run import read_summary
 

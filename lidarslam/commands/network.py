@@ -49,7 +49,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun;
     --jobs and --ray are for the preparation of recordings.
     """
-    from lidarslam.odometry.network.shipped import require_train_extra
+    from lidarslam.odometry.registry import require_train_extra
     from lidarslam.storage.default_places import source_name
 
     if out is None:
@@ -75,12 +75,11 @@ def export(weights: Path | None, out: Path | None) -> None:
     `lidarslam run --weights DIR` starts faster with the folder than with the weights file, as it does not import torch.
     docs/odometry.md lists inputs and outputs of the graphs.
     """
-    from lidarslam.odometry.network.shipped import require_train_extra
+    from lidarslam.odometry.registry import require_train_extra
 
     require_train_extra("an export")
-    from lidarslam.odometry.network.checkpoint import load_checkpoint
-    from lidarslam.odometry.network.export import export_onnx
-    from lidarslam.odometry.network.shipped import default_weights
+    from lidarslam.odometry.network.checkpoint import export_onnx, load_checkpoint
+    from lidarslam.odometry.registry import default_weights
 
     weights = weights or default_weights()
     checkpoint = load_checkpoint(weights)

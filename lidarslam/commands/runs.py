@@ -13,7 +13,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, ser
 if TYPE_CHECKING:
     from lidarslam.mapping.config import MapFormat
     from lidarslam.mapping.loops.closure import GivenLoops
-    from lidarslam.viewer.web_page import WebPage
+    from lidarslam.viewer.rerun_program import WebPage
 
 _SCANS = (click.IntRange(min=0), click.IntRange(min=0))
 _POSE_GRAPH = click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")

@@ -11,7 +11,7 @@ import click
 from lidarslam.core.text import one_line, printable
 
 if TYPE_CHECKING:
-    from lidarslam.viewer.web_page import WebPage
+    from lidarslam.viewer.rerun_program import WebPage
 
 EXIT_MENDABLE = 1
 EXIT_LOST = 3

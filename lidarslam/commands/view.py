@@ -13,7 +13,7 @@ from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
 from lidarslam.core.errors import InputError
 
 if TYPE_CHECKING:
-    from lidarslam.viewer.web_page import WebPage
+    from lidarslam.viewer.rerun_program import WebPage
 
 _RRD = ".rrd"
 
@@ -168,7 +168,7 @@ def _draw(runs: list[Any], picture: Path, colour: Any, oblique: bool) -> None:
 
 def _film(places: tuple[Path, ...], video: Path, colour: Any) -> None:
     from lidarslam.run.progress import show_count
-    from lidarslam.viewer.video import check_video_file, save_video, turn_runs
+    from lidarslam.viewer.picture import check_video_file, save_video, turn_runs
 
     check_video_file(video)
     runs = _drawn(places, colour, apart=False)

@@ -9,38 +9,139 @@ import contextlib
 import ctypes
 import os
 import signal
+import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
+import psutil
 from pydantic import ConfigDict, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
 from lidarslam.compare.peers.estimation import describe_peer, execute_peer
 from lidarslam.compare.peers.registry import peer_named
-from lidarslam.compare.supervised import Ending, Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
+from lidarslam.core.child_processes import bound
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
-from lidarslam.core.files import remove_partial_files
+from lidarslam.core.files import open_own, remove_partial_files
 from lidarslam.core.json_text import read_json
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
 from lidarslam.run.request import RunRequest, describe_run
-from lidarslam.run.results import RunOutcome
 from lidarslam.run.run import execute
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY, RunDirectory
 from lidarslam.storage.finished_run import read_summary
+
+# Between two samples of the memory; a sample costs a millisecond or two of a core.
+_PERIOD_S = 0.2
+# For an interrupted command to write its results.
+_GRACE_S = 60.0
+
+Cause = Literal["itself", "memory", "time", "interrupt"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a command; None: no limit."""
+
+    memory_mb: float | None = None  # resident memory of all its processes together
+    timeout_s: float | None = None  # wall time
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a command ended."""
+
+    cause: Cause  # by itself, or because a limit or an interruption ended it
+    status: int  # its exit status, negative for the signal that ended it
+    wall_s: float  # from its start to its end
+    # largest resident memory of its process tree, sampled five times a second, units of 1024 x 1024 bytes; shared pages
+    # count for each process. None where no sample was taken.
+    peak_rss_mb: float | None
+
+
+def supervise(
+    command: Sequence[str], log: Path, limits: Limits, on_line: Callable[[str], None], cwd: Path | None = None
+) -> Ending:
+    """Run a command to its end; none of its processes outlives this call, nor this process.
+
+    On Ctrl-C the command is interrupted too and given a minute to write its results; a second Ctrl-C ends that.
+
+    Its standard error goes to a log; `on_line` is called with every line of its standard output, from another thread.
+    """
+    started = time.monotonic()
+    with (
+        open_own(log, anew=True) as stderr,
+        subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            cwd=cwd,
+            start_new_session=True,
+            errors="replace",
+        ) as process,
+    ):
+        reading = threading.Thread(target=_pass_on, args=(process.stdout, on_line), daemon=True)
+        reading.start()
+        peaks = [0.0]
+        with bound(process):
+            try:
+                cause = _wait(process, limits, peaks)
+            except KeyboardInterrupt:
+                cause = "interrupt"
+                process.send_signal(signal.SIGINT)
+                with contextlib.suppress(KeyboardInterrupt):
+                    _wait(process, Limits(limits.memory_mb, _GRACE_S), peaks)
+        reading.join()
+    return Ending(cause, process.returncode, time.monotonic() - started, max(peaks) or None)
+
+
+def _pass_on(lines: Iterable[str] | None, on_line: Callable[[str], None]) -> None:
+    for line in lines or ():
+        with contextlib.suppress(Exception):  # the pipe has to be emptied, or the process waits forever
+            on_line(line.rstrip("\n"))
+
+
+def _wait(process: "subprocess.Popen[str]", limits: Limits, peaks: list[float]) -> Cause:
+    """Wait for the end of the process or for a limit; the peak of the memory is appended."""
+    until = None if limits.timeout_s is None else time.monotonic() + limits.timeout_s
+    while True:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_PERIOD_S)
+            return "itself"
+        rss_mb = tree_rss_mb(process.pid)
+        peaks.append(rss_mb)
+        if limits.memory_mb is not None and rss_mb > limits.memory_mb:
+            return "memory"
+        if until is not None and time.monotonic() > until:
+            return "time"
+
+
+def tree_rss_mb(pid: int) -> float:
+    """Resident memory of a process and its descendants, 1024 x 1024 bytes each; 0 when it is gone."""
+    total = 0
+    with contextlib.suppress(psutil.Error):
+        root = psutil.Process(pid)
+        for process in (root, *root.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):  # ended meanwhile
+                total += process.memory_info().rss
+    return total / 2**20
+
 
 # In addition to a run's own files: how its process ended, and its standard error.
 PROCESS, LOG = "process.json", "process.log"
 COMMAND = (sys.executable, "-m", "lidarslam.compare.method_run")
 # The process starts here, so that no package in the user's folder is found first.
 _ROOT = Path(__file__).resolve().parents[2]
-_SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
+
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
 _LONGEST_MESSAGE = 300
 _STOPPED, _LOST = 1, 3  # exit statuses
@@ -62,12 +163,6 @@ class MethodRun:
 
 
 _RUN = TypeAdapter(MethodRun)
-
-
-def encode(run: MethodRun) -> tuple[str, str]:
-    """The arguments; the run overwrites, and saves no state and draws no page, which would count as its time."""
-    request = replace(run.request, overwrite=True, resumable=False, report=False)
-    return str(Path.cwd()), _RUN.dump_json(replace(run, request=request)).decode()
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -108,7 +203,10 @@ def run_method(
         if len(words) == 2 and all(word.isdecimal() for word in words):
             progress(int(words[0]), int(words[1]))
 
-    ending = supervise([*command, *encode(run)], folder / LOG, limits, see, _ROOT)
+    # It overwrites, and saves no state and draws no page, which would count as its time.
+    request = replace(run.request, overwrite=True, resumable=False, report=False)
+    encoded = _RUN.dump_json(replace(run, request=request)).decode()
+    ending = supervise([*command, str(Path.cwd()), encoded], folder / LOG, limits, see, _ROOT)
     remove_partial_files(folder)
     status, message = judge(ending, folder, folder / LOG, limits)
     result = MethodResult(folder.name, status, message, wall_s=ending.wall_s, peak_rss_mb=ending.peak_rss_mb)
@@ -172,47 +270,46 @@ def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> tuple[Meth
         return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
     if has_result and ending.status in (0, _LOST):
         return ("lost", _where_lost(folder)) if ending.status else ("ok", "")
-    return _failed(ending.status, has_result, _last_words(log))
+    return _failed(ending.status, has_result, log)
 
 
-def _failed(status: int, has_result: bool, said: str) -> tuple[MethodStatus, str]:
+def _failed(status: int, has_result: bool, log: Path) -> tuple[MethodStatus, str]:
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    said = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    said = said.removeprefix("lidarslam: ")[:_LONGEST_MESSAGE]
     if any(words in said for words in _MEMORY_ERRORS):
         return "out of memory", said
     if status == -signal.SIGKILL:
         return "out of memory", "killed by the system (signal 9), as it does when memory runs out"
     if status < 0:
-        reason = f"{_SIGNALS.get(-status, 'ended by the system')} (signal {-status})"
-        return "failed", f"{reason}: {said}" if said else reason
+        return "failed", f"{signal.strsignal(-status)} (signal {-status}){said and f': {said}'}"
     return ("stopped" if has_result else "failed"), said or f"ended with status {status} and said nothing"
 
 
 def _where_lost(folder: Path) -> str:
     summary = read_summary(folder)
-    if not summary["lost"] and not summary["map_contradictions"]:
-        return f"{summary['unconstrained_m']:.1f} m of its way are hardly constrained"
-    if not summary["lost"]:
-        slid = summary["map_contradictions"][0]
+    for first in summary["lost"]:
+        return f"first lost on scan {first['first']}: {first['reason']}"
+    for slid in summary["map_contradictions"]:
         return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"
-    first = summary["lost"][0]
-    return f"first lost on scan {first['first']}: {first['reason']}"
-
-
-def _last_words(log: Path) -> str:
-    """The last line on standard error, without the program's name before it."""
-    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    return last.removeprefix("lidarslam: ")[:_LONGEST_MESSAGE]
+    return f"{summary['unconstrained_m']:.1f} m of its way are hardly constrained"
 
 
 def main() -> int:
     """Run; the exit status."""
     folder, text = sys.argv[1:]
     os.chdir(folder)
-    _obey_parent()
-    with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as progress:
+    with contextlib.suppress(OSError, AttributeError):  # end with the supervisor, however that ends (Linux)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # its Ctrl-C is ours; processes of Ray block it
+    with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as out:
         os.dup2(2, 1)
         try:
-            outcome = _run(_RUN.validate_json(text), partial(print, file=progress))
+            run, progress = _RUN.validate_json(text), partial(print, file=out)
+            if run.peer is not None:
+                outcome = execute_peer(run.request, peer_named(run.peer), progress, run.range_m)
+            else:
+                outcome = execute(run.request, lambda number, total, _: progress(number, total))
         except LidarSlamError as error:
             print(f"lidarslam: {error}", file=sys.stderr)
             return _STOPPED
@@ -220,19 +317,6 @@ def main() -> int:
         print(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", file=sys.stderr)
         return _STOPPED
     return _LOST if outcome.summary.went_astray else 0
-
-
-def _obey_parent() -> None:
-    """End with the supervisor, however that ends (Linux), and take its Ctrl-C, which processes of Ray block."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-
-
-def _run(run: MethodRun, progress: Callable[[int, int], None]) -> RunOutcome:
-    if run.peer is not None:
-        return execute_peer(run.request, peer_named(run.peer), progress, run.range_m)
-    return execute(run.request, lambda number, total, _: progress(number, total))
 
 
 if __name__ == "__main__":

@@ -37,11 +37,7 @@ _SHORTEST_M = 10.0
 DEFAULT_METHODS = "learned+map,kiss-icp"
 # A peer's run: its poses as they are.
 _PEER = ("odometry.method=external", "mapping.method=off", "pose_graph.enabled=false")
-_ONLY_WITH_MAP = {
-    "constant-velocity": "only predicts",
-    "imu": "measures turns alone",
-    "learned+imu": "the IMU takes part in scan-to-map registration",
-}
+_ONLY_WITH_MAP = ("constant-velocity", "imu", "learned+imu")
 _NAME = re.compile(
     r"(?P<base>[A-Za-z][\w.-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?"
 )
@@ -95,29 +91,15 @@ def parse_method(name: str) -> Method:
     if match is None or odometry is None:
         raise ConfigError(f"no method is called {name!r}; there are: {_grammar()}")
     if odometry in _ONLY_WITH_MAP and not match["mapping"]:
-        raise ConfigError(
-            f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
-            " a map"
-        )
+        raise ConfigError(f"{name}: estimates a motion with a map alone; compare {odometry}+map or {odometry}+loam")
     by_scene = match["voxel"] == BY_SCENE and odometry == "kiss-icp"
-    size = None if match["voxel"] is None or by_scene else _voxel_size_m(name, match)
-    voxel = () if size is None else (f"odometry.kiss_icp.voxel_size_m={size!r}",)
+    voxel = () if match["voxel"] is None or by_scene else (f"odometry.kiss_icp.voxel_size_m={match['voxel']}",)
+    if voxel and odometry != "kiss-icp":
+        raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
     deskew = ("odometry.kiss_icp.deskew=false",) if base == _NO_DESKEW else ()
     pose_graph = str(match["graph"] is not None).lower()
     switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
     return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches), by_scene=by_scene)
-
-
-def _voxel_size_m(name: str, match: re.Match[str]) -> float:
-    if _BASES.get(match["base"]) != "kiss-icp":
-        raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
-    try:
-        size_m = float(match["voxel"])
-    except ValueError:
-        size_m = 0.0
-    if not 0.0 < size_m < float("inf"):
-        raise ConfigError(f"{name}: expected a voxel size in metres, as in kiss-icp@0.5, got {match['voxel']!r}")
-    return size_m
 
 
 def parse_methods(names: str) -> tuple[Method, ...]:

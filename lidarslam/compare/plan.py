@@ -1,29 +1,33 @@
-"""A comparison as it is asked for, and its runs; mistakes are found here, before the first method is run."""
+"""A comparison as it is asked for, also by a benchmark file, and its runs; mistakes are found before the first run."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from lidarslam.compare.method_run import PROCESS, MethodRun
-from lidarslam.compare.methods import Method, scene_range_m
+from lidarslam.compare.method_run import PROCESS, Limits, MethodRun
+from lidarslam.compare.methods import Method, parse_method, scene_range_m
 from lidarslam.compare.peers.interface import MAX_RANGE_M
-from lidarslam.compare.supervised import Limits
 from lidarslam.config.settings import load_config
+from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import require_no_link
 from lidarslam.core.settings import Settings
-from lidarslam.core.tasks import SERIAL, Where
+from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import require_name, safe_name
+from lidarslam.datasets.fetched import fetched, is_url
+from lidarslam.datasets.published.evalio import located
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.evaluation.comparison.comparison import MissingRecording
+from lidarslam.evaluation.comparison.comparison import MissingRecording, TablePlan
 from lidarslam.evaluation.comparison.gates import Gate
-from lidarslam.evaluation.comparison.quantities import TablePlan
 from lidarslam.run.request import RunRequest
+from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
 from lidarslam.storage import directory as files
-from lidarslam.storage.comparison_folder import COMPARISON, RESERVED
+from lidarslam.storage.comparison_folder import COMPARISON, RECORDINGS, RESERVED
 
 
 class Simulated(Settings):
@@ -81,7 +85,7 @@ class CompareRequest:
     title: str = ""
     command: str = ""
     tables: tuple[TablePlan, ...] = ()  # means over recordings
-    # file with recordings, methods and tables, and the root of its paths; see `lidarslam.compare.benchmark`
+    # file with recordings, methods and tables, and the root of its paths; see `lidarslam.compare.plan`
     benchmark: Path | None = None
     data: Path | None = None
     gates: tuple[Gate, ...] = ()  # bounds of the figures
@@ -149,8 +153,6 @@ def _check_entry(request: CompareRequest, entry: RecordingEntry) -> None:
 
 def _check_folder(request: CompareRequest, planned: list[PlannedRecording]) -> None:
     out = request.out
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"{out}: a file is in the way; name another directory")
     if any(out.resolve() == recording.source.resolve() for recording in planned):
         raise OutputError(f"{out}: is the recording itself; name another directory for the comparison")
     if (out / files.TRAJECTORY_TUM).is_file() and (out / files.CONFIG).is_file():
@@ -166,3 +168,135 @@ def _check_folder(request: CompareRequest, planned: list[PlannedRecording]) -> N
             f"{out}: holds a comparison already ({found.relative_to(out)}); name another directory, take what is"
             " finished of it with --reuse, or replace it with --overwrite"
         )
+
+
+class BenchmarkMethod(Settings):
+    """A method under a name of its own, with settings of its own."""
+
+    name: str
+    method: str = Field(description="as --methods names it")
+    set: tuple[str, ...] = Field((), description="settings, key.path=value")
+
+
+class Benchmark(Settings):
+    """The whole file; paths are relative to the data's folder."""
+
+    title: str
+    data: str | None = Field(None, description="the user's data below --data, in words")
+    recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
+    methods: tuple[str | BenchmarkMethod, ...] = Field(min_length=1)
+    set: tuple[str, ...] = Field((), description="settings for everything, key.path=value")
+    reference: str | None = Field(None, description="a method's name; null: ground truth")
+    tables: tuple[TablePlan, ...] = ()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        names = [recording.name for recording in self.recordings]
+        if None in names or len({*names}) < len(names):
+            raise ValueError("a recording has no name, or two have the same name")
+        methods = [method if isinstance(method, str) else method.name for method in self.methods]
+        if len({*methods}) < len(methods):
+            raise ValueError("two methods have the same name")
+        for recording in self.recordings:
+            if (recording.source is None) == (recording.simulate is None):
+                raise ValueError(f"recording {recording.name}: give either source or simulate")
+        for table in self.tables:
+            unknown = {name for group in table.groups.values() for name in group}.difference(names)
+            if unknown:
+                listed = ", ".join(sorted(unknown))
+                raise ValueError(f"table {table.title!r} names recordings that are not listed: {listed}")
+        return self
+
+
+def load_benchmark(path: Path) -> Benchmark:
+    """Read a benchmark file."""
+    try:
+        return Benchmark.model_validate(read_yaml(path))
+    except ValidationError as error:
+        faults = [
+            ": ".join(filter(None, [".".join(map(str, fault["loc"])), fault["msg"].removeprefix("Value error, ")]))
+            for fault in error.errors()
+        ]
+        raise ConfigError(f"{path}: {'; '.join(faults)}") from None
+
+
+def fill_request(request: CompareRequest, benchmark: Benchmark) -> CompareRequest:
+    """The comparison of a benchmark; methods that the request names already replace its own.
+
+    The benchmark's paths are relative to `request.data`; without it, to the current folder, and those of the
+    recordings that are simulated to one in `request.out`.
+    """
+    return replace(
+        request,
+        recordings=tuple(_located(entry, benchmark, request.data, request.out) for entry in benchmark.recordings),
+        methods=request.methods or tuple(_method(method) for method in benchmark.methods),
+        settings=(*benchmark.set, *request.settings),
+        skip_missing=True,
+        title=benchmark.title,
+        tables=benchmark.tables,
+    )
+
+
+def require_data(request: CompareRequest, benchmark: Benchmark) -> None:
+    """Refuse a benchmark none of whose recordings is there or can be simulated."""
+    if any(entry.simulate or (entry.source and entry.source.exists()) for entry in request.recordings):
+        return
+    place = "the current folder" if request.data is None else str(request.data)
+    needed = "name their folder with --data" if benchmark.data is None else f"--data is {benchmark.data}"
+    raise InputError(f"{benchmark.title}: none of its recordings is in {place}; {needed}")
+
+
+def make_recordings(
+    request: CompareRequest, counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+) -> None:
+    """Simulate the recordings that are not there yet."""
+    wanted = [
+        RecordRequest(entry.source, **entry.simulate.model_dump())
+        for entry in request.recordings
+        if entry.simulate is not None and entry.source is not None and not (entry.source / README).is_file()
+    ]
+    made = [one.out for one in wanted if one.out.parent == request.out / RECORDINGS]
+    require_no_link([request.out / RECORDINGS, *made])
+    if request.where.jobs == 1 or len(wanted) < 2:  # a cluster may have other disks
+        for one in wanted:
+            with counting(f"recording {one.out.name}") as counter:
+                record(one, counter)
+        return
+    with counting(f"{len(wanted)} recordings side by side") as counter, open_tasks(request.where) as tasks:
+        scans = [one.scans for one in wanted]
+        for number, _ in enumerate(tasks.run(_record, wanted), start=1):
+            counter(sum(scans[:number]), sum(scans))
+
+
+def _record(request: RecordRequest) -> None:
+    record(request, lambda *_: None)
+
+
+def _located(entry: RecordingEntry, benchmark: Benchmark, data: Path | None, out: Path) -> RecordingEntry:
+    root = data or Path()
+    simulated = (data or out / RECORDINGS) / (entry.name or "")
+    reference_map = None if entry.reference_map is None else root / entry.reference_map
+    reference = entry.reference or benchmark.reference
+    if entry.reference is not None and (root / entry.reference).is_file():
+        reference = str(root / entry.reference)
+    return replace(
+        entry,
+        source=simulated if entry.source is None else _found(root, entry.source),
+        prior=None if entry.prior is None else root / entry.prior,
+        reference=reference,
+        reference_map=reference_map or (simulated / REFERENCE_MAP if entry.source is None else None),
+    )
+
+
+def _found(root: Path, source: Path) -> Path:
+    return fetched(source) if is_url(source) else root / located(source)
+
+
+def _method(method: str | BenchmarkMethod) -> Method:
+    try:
+        if isinstance(method, str):
+            return parse_method(method)
+        named = parse_method(method.method)
+        return replace(named, name=method.name, settings=(*named.settings, *method.set))
+    except ConfigError as error:
+        raise ConfigError(f"{error}; the benchmark's methods can be replaced with --methods") from None

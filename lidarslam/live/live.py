@@ -28,7 +28,7 @@ from lidarslam.run.request import LiveRequest, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans
 from lidarslam.run.run import open_odometry, open_session, require_no_trajectory
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.viewer.web_page import WebPage
+from lidarslam.viewer.rerun_program import WebPage
 
 if TYPE_CHECKING:  # needs the extra
     from lidarslam.live.dds import DdsNode

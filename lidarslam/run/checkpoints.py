@@ -42,7 +42,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
     config = request.config
     tree = config.model_dump(mode="json", exclude=WITHOUT_EFFECT)
     if config.odometry.is_learned:
-        from lidarslam.odometry.network.shipped import default_weights
+        from lidarslam.odometry.registry import default_weights
 
         tree["odometry"]["learned"]["weights"] = _digest(config.odometry.learned.weights or default_weights())
     run = describe_run(request) | {"prior": None if request.prior is None else _digest(request.prior)}

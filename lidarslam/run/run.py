@@ -47,8 +47,8 @@ from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, reason_of, 
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RERUN, RunDirectory
 from lidarslam.storage.unfinished import Unfinished
+from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer
-from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:  # GTSAM and SciPy take a while to load
     from lidarslam.mapping.inertial.inertial import Inertial
@@ -174,8 +174,7 @@ class RunSession(Generic[R]):
 
     @contextmanager
     def _viewing(self, name: str, page: WebPage | None) -> Iterator[Viewer]:
-        from lidarslam.viewer.rerun_recording import IncompleteRecordingError
-        from lidarslam.viewer.rerun_viewer import rerun_viewer
+        from lidarslam.viewer.rerun_recording import IncompleteRecordingError, rerun_viewer
 
         viewer, spawn = self.request.config.viewer, self.request.rerun == "spawn"
         try:

@@ -24,8 +24,8 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapper import Mapper
+from lidarslam.odometry.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.network.checkpoint import Kind, read_tensor_file, write_tensor_file
-from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 from lidarslam.odometry.training.preparation import PreparedRecording, prepare
 from lidarslam.pipeline.threads import in_order
 from lidarslam.run.interruption import handling
@@ -197,23 +197,19 @@ def prepared(
 
 def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: Counter) -> PreparedRecording:
     """One of the pieces of a stretch, as `prepared`."""
-    key, path = _key(piece, config), file_of(piece, config, cache)
+    path = file_of(piece, config, cache)
     try:
-        tensors, content = read_tensor_file(path, _KIND)
-        kept = PreparedRecording(**tensors)
+        kept = PreparedRecording(**read_tensor_file(path, _KIND)[0])
         kept.require(len(piece), config.images)
-        if _digest({**content, "name": ""}) != _digest({**key, "name": ""}):
-            raise InputError(f"{path}: is of another recording")
-    except (InputError, TypeError, ValueError):  # not there yet, damaged, or of another recording: made again
+    except (InputError, TypeError, ValueError):  # not there yet, or damaged: made again
         made = _prepare(piece, config, count)
-        write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **key})
+        write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **_key(piece, config)})
         return made
     count(len(piece))
     return kept
 
 
 def _key(piece: Stretch, config: TrainingConfig) -> dict[str, Any]:
-    """The parameters that a prepared stretch depends on."""
     images = config.images.model_dump(mode="json")
     key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": images}
     return key if piece.is_simulated else {**key, "teacher": config.teacher}

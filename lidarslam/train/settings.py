@@ -7,7 +7,7 @@ from typing import Any
 from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, load_model
 from lidarslam.core.settings import Settings
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
+from lidarslam.odometry.config import SimulatedConfig, TrainingConfig
 
 # The settings that `--losses` stands for.
 LOSSES = {

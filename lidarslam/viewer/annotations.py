@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.report.error_colours import ramp, viridis
+from lidarslam.evaluation.report.drawing import ramp, viridis
 from lidarslam.viewer.view import View
 
 Quantity = Literal["height", "intensity", "error", "rgb"]
@@ -206,7 +206,6 @@ def short(text: str) -> str:
 
 
 def _mark(pen: ImageDraw.ImageDraw, column: float, row: float, radius: float, colour: Colour) -> None:
-    """A disc at the start, else a square."""
     box = [column - radius, row - radius, column + radius, row + radius]
     draw = pen.ellipse if colour == START else pen.rectangle
     draw(box, fill=colour, outline=INK if colour == START else HALO, width=max(1, round(radius / 4)))

@@ -1,7 +1,9 @@
-"""Maps and trajectories of runs, comparisons and clouds as a picture, drawn without a window or a graphics card."""
+"""Maps and trajectories as pictures, drawn without a window or a graphics card, and as videos of one turn."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +16,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.evaluation.report.bulk import beyond_m, leaves, paths_in_bulk
-from lidarslam.evaluation.report.error_colours import DISTANCE_FIELD
+from lidarslam.evaluation.report.drawing import DISTANCE_FIELD, beyond_m, leaves, paths_in_bulk
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
@@ -25,7 +26,7 @@ from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
 from lidarslam.storage.finished_run import read_scans, read_trajectory, shown_map
 from lidarslam.viewer import annotations as notes
 from lidarslam.viewer.annotations import UNKNOWN, Colour, ColourScale, Entry, Quantity, fit_scale
-from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view
+from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view, turning_views
 
 TOP, OBLIQUE = 90.0, 35.0
 # Factor of the pixels along each side that are drawn and then averaged.
@@ -47,14 +48,6 @@ _REFERENCE: Colour = (150, 150, 150)
 _REFERENCE_WIDER = 2.0
 _MAP_TINT = 0.55  # the share of a run's colour in that of its map; the rest is white
 _RAMP_LENGTH = 0.08
-_NOT_IN_MAP = "the map has none; its recording has none, or global_map.fields leaves it out"
-_LACKS: dict[Quantity, str] = {
-    "height": "there is no map",
-    "intensity": _NOT_IN_MAP,
-    "rgb": _NOT_IN_MAP,
-    "error": "its recording has no ground truth, or is not there any more; a map with its distances to a reference map"
-    " is made by `lidarslam evaluate RUN --reference-map MAP --errors errors.ply`",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +176,6 @@ def _draw_maps(
 
 
 def _point_colours(run: DrawnRun, frame: Frame) -> NDArray[np.uint8]:
-    """Colours (N, 3) of the points of a single run."""
     values, rgb = run.point_values(frame.quantity), run.cloud.attributes.rgb
     if frame.quantity == "rgb" and rgb is not None:
         return rgb
@@ -193,7 +185,6 @@ def _point_colours(run: DrawnRun, frame: Frame) -> NDArray[np.uint8]:
 
 
 def _tint(colour: Colour) -> NDArray[np.float32]:
-    """The colour of a run's map."""
     return np.float32(_MAP_TINT) * np.array(colour, dtype=np.float32) + np.float32(255.0 * (1.0 - _MAP_TINT))
 
 
@@ -266,7 +257,8 @@ def require_quantity(run: DrawnRun, quantity: Quantity) -> None:
     if known is None:
         known = run.pose_values(quantity)
     if known is None or not np.isfinite(known).any():
-        raise InputError(f"{run.name}: cannot be coloured by {quantity}: {_LACKS[quantity]}")
+        found = "a file of `evaluate --errors`, or the recording's ground truth" if quantity == "error" else "its map"
+        raise InputError(f"{run.name}: cannot be coloured by {quantity}: there is none in {found}")
 
 
 def _load(path: Path, truth: Trajectory | None) -> DrawnRun:
@@ -298,3 +290,62 @@ def _distances_m(path: Path, points: int) -> FloatArray | None:
     table = read_ply(path)
     found = DISTANCE_FIELD in (table.dtype.names or ()) and len(table) == points
     return table[DISTANCE_FIELD].astype(np.float64) if found else None
+
+
+_FRAMES = 72
+_PER_SECOND = 12
+# Keeps a GIF file to a few megabytes.
+_WIDTH, _GIF_COLOURS = 640, 64
+_VIDEO_SUFFIXES = (".gif", ".mp4")
+
+
+def check_video_file(path: Path) -> None:
+    """Refuse a file that cannot be written later."""
+    if path.suffix.lower() not in _VIDEO_SUFFIXES:
+        raise OutputError(f"{path}: a video must end in .gif or .mp4")
+    if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
+        raise OutputError(f"{path}: .mp4 is written by ffmpeg, which is not on PATH; install it, or name a .gif file")
+
+
+def turn_runs(
+    runs: Sequence[DrawnRun],
+    quantity: Quantity = "height",
+    count: Callable[[int, int], None] = lambda *_: None,
+    frames: int = _FRAMES,
+) -> Iterator[NDArray[np.uint8]]:
+    """Frames (height, width, 3) of one turn of runs in one world, all of one size and scale.
+
+    `count` is called with the number of each drawn frame, from 1, and their total.
+    """
+    frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
+    turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)
+    for number, view in enumerate(turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
+        yield draw_runs(runs, replace(frame, view=view))
+        count(number, frames)
+
+
+def save_video(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
+    """Write frames (height, width, 3) as .gif or .mp4."""
+    check_video_file(path)
+    with written(path) as partial:
+        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(partial, frames)
+
+
+def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
+    images = map(Image.fromarray, frames)
+    # One palette without dithering, so that static parts are the same in successive frames.
+    first = next(images).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
+    others = (image.quantize(palette=first, dither=Image.Dither.NONE) for image in images)
+    duration_ms = 1000 // _PER_SECOND
+    first.save(path, format="GIF", save_all=True, append_images=others, duration=duration_ms, loop=0)
+
+
+def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:
+    even = [frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # the codec wants even sides
+    size, rate = f"{even[0].shape[1]}x{even[0].shape[0]}", str(_PER_SECOND)
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
+    command = ["ffmpeg", "-loglevel", "error", "-y", *given, "-pix_fmt", "yuv420p", "-f", "mp4", str(path.resolve())]
+    done = subprocess.run(command, input=b"".join(frame.tobytes() for frame in even), capture_output=True, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip()
+        raise OutputError(f"ffmpeg ended with status {done.returncode}: {said}")

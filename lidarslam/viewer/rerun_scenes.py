@@ -19,7 +19,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.map.metrics import MapComparison
-from lidarslam.evaluation.report.error_colours import error_colours, viridis
+from lidarslam.evaluation.report.drawing import error_colours, viridis
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
@@ -215,7 +215,6 @@ def _log_scan(recording: rr.RecordingStream, index: int, scan: Scan, truth: Traj
 
 
 def _layout_of_scans(has_truth: bool) -> rrb.Blueprint:
-    """The scan in the frame of the sensor, next to the scan on the true path."""
     scan = rrb.Spatial3DView(origin=f"/{_LIDAR}", name="Scan", background=BACKGROUND)
     views = [scan]
     if has_truth:
@@ -234,10 +233,13 @@ def show_errors(comparison: MapComparison, positions: FloatArray, clip_m: float)
     """
     points = comparison.reference_errors.points
     middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
-    clouds = {"map_to_reference": comparison.map_errors, "reference_to_map": comparison.reference_errors}
+    clouds = {
+        "map_to_reference": (comparison.map_errors, "Map: distance to the reference"),
+        "reference_to_map": (comparison.reference_errors, "Reference: distance to the map"),
+    }
 
     def log(recording: rr.RecordingStream) -> None:
-        for entity, errors in clouds.items():
+        for entity, (errors, _) in clouds.items():
             colours = error_colours(errors.distances_m, clip_m)
             cloud = rr.Points3D(errors.points - middle, colors=colours, radii=MAP_RADIUS)
             recording.log(f"world/{entity}", cloud, static=True)
@@ -247,20 +249,12 @@ def show_errors(comparison: MapComparison, positions: FloatArray, clip_m: float)
         text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"
         recording.log("legend", rr.TextDocument(text), static=True)
 
-    return Show("map errors", _layout_of_errors(), log)
-
-
-def _layout_of_errors() -> rrb.Blueprint:
-    """Both clouds side by side, above the legend."""
-    titles = {
-        "map_to_reference": "Map: distance to the reference",
-        "reference_to_map": "Reference: distance to the map",
-    }
     views = [
         rrb.Spatial3DView(
             origin="/world", name=title, contents=["/world/path", f"/world/{entity}"], background=BACKGROUND
         )
-        for entity, title in titles.items()
+        for entity, (_, title) in clouds.items()
     ]
     legend = rrb.TextDocumentView(origin="/legend", name="Colours")
-    return rrb.Blueprint(rrb.Vertical(rrb.Horizontal(*views), legend, row_shares=[8, 1]), collapse_panels=True)
+    layout = rrb.Vertical(rrb.Horizontal(*views), legend, row_shares=[8, 1])
+    return Show("map errors", rrb.Blueprint(layout, collapse_panels=True), log)

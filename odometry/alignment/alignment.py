@@ -109,7 +109,6 @@ def align(start: InitialEstimate, sweeps: SweepPair, effort: Effort = NORMAL) ->
 
 
 def _align_roughly(starts: Iterable[FloatArray], sweeps: SweepPair) -> list[Alignment]:
-    """From each of several motions (4, 4)."""
     cost = PointToPlane(sweeps, _ROUGH.column_step)
     return [_align(InitialEstimate(T), sweeps, cost, _ROUGH.iterations) for T in starts]
 

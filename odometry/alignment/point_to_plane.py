@@ -79,24 +79,16 @@ def _correspond(
 
     The time of a pixel is found by projecting without motion within the previous sweep, which is exact but at its seam.
     """
-    _move(size, _single(motion.T.reshape(16)), _single(motion.late), work)
+    _move(size, motion.T.reshape(16).astype(np.float32), motion.late.astype(np.float32), work)
     for taken_back in range(2 if planes.rolling else 1):
         if taken_back:
-            _take_back(size, _single(motion.early), work)
+            _take_back(size, motion.early.astype(np.float32), work)
         _project(size, planes, work)
         for k in range(size):
             pixel = planes.pixels[int(work[_PIXEL + k])]
             work[_AT_X + k], work[_AT_Y + k], work[_AT_Z + k] = pixel[0], pixel[1], pixel[2]
             work[U + k], work[V + k], work[W + k], work[_T + k] = pixel[3], pixel[4], pixel[5], pixel[6]
     _judge(size, scale_m, is_robust, work)
-
-
-@compiled_part
-def _single(values: FloatArray) -> Floats:
-    rounded = np.empty(len(values), dtype=np.float32)
-    for i in range(len(values)):
-        rounded[i] = values[i]
-    return rounded
 
 
 @compiled_part
@@ -282,7 +274,6 @@ def _products(size: int, first: int, second: int, by: int, work: Floats) -> tupl
 
 @compiled_part
 def _mirror(total: FloatArray, in_view: FloatArray, inlier: FloatArray) -> None:
-    """Complete the sums from the upper triangles of their blocks."""
     for p in range(6):
         for q in range(p):
             total[p, q + 6] = total[q, p + 6]

@@ -103,7 +103,6 @@ def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
 
 @compiled
 def _write_coordinates(points: FloatArray, x: Floats, y: Floats, z: Floats, ranges: Floats) -> None:
-    """Write the coordinates of points (N, 3) to single precision, and their ranges."""
     for i in range(len(points)):
         x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
     for i in range(len(points)):

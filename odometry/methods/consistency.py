@@ -112,7 +112,6 @@ def _least_ratio(inlier: NDArray[np.bool_], facing: NDArray[np.intp]) -> float:
 
 
 def _thinned(points: FloatArray) -> FloatArray:
-    """One point per cell, the cells sized by the scene."""
     if len(points) < _MIN_PLANES:
         return points
     return points[one_per_cell(points, _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1))))]

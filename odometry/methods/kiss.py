@@ -1,14 +1,17 @@
 """KISS-ICP (Vizzo et al., RA-L 2023) behind the odometry protocol.
 
-Two things differ from calling the library: it runs in a child process, because it aborts on some inputs; and its pose,
-which belongs to the end of the sweep, is expressed at the scan's stamp.
+Two things differ from calling the library: it runs in a child process, because it aborts on some inputs (an assertion
+in its C++ part, not an exception); and its pose, which belongs to the end of the sweep, is expressed at the scan's
+stamp. Run as a module, this file is the child process; its argument is the file descriptor of its end of a pipe.
 """
 
 import logging
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
 from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +40,7 @@ class _Worker:
     def __init__(self, settings: dict[str, Any]) -> None:
         self._pipe, end = Pipe()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "lidarslam.odometry.methods.kiss_worker", str(end.fileno())],
+            [sys.executable, "-m", "lidarslam.odometry.methods.kiss", str(end.fileno())],
             stdin=subprocess.DEVNULL,
             stdout=2,  # the library's output
             pass_fds=[end.fileno()],
@@ -50,7 +53,7 @@ class _Worker:
             raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?") from error
 
     def ask(self, message: Any) -> Any:
-        """The answer to a message, see `kiss_worker`; EOFError or OSError if the child died."""
+        """The answer to a message, see `main`; EOFError or OSError if the child died."""
         self._pipe.send(message)
         return self._pipe.recv()
 
@@ -66,8 +69,6 @@ class _Worker:
 
 @dataclass(frozen=True, eq=False)
 class _TimedPose:
-    """KISS-ICP's pose and the instant it belongs to."""
-
     time: float
     T_map_lidar: FloatArray
 
@@ -116,7 +117,6 @@ class KissOdometry:
             self._worker = None
 
     def _points_in_range(self, scan: Scan) -> int:
-        """Number of points that the library uses."""
         ranges = np.linalg.norm(scan.points, axis=1)
         return int(((ranges > self._config.min_range_m) & (ranges < self._config.max_range_m)).sum())
 
@@ -150,7 +150,6 @@ class KissOdometry:
         return inverse(previous.T_map_lidar) @ self._previous.T_map_lidar
 
     def _at(self, time: float, pose: _TimedPose) -> _TimedPose:
-        """Extrapolate a pose at the current velocity."""
         return _TimedPose(time, pose.T_map_lidar @ exp(self._velocity * (time - pose.time)))
 
     def _begin(self, first: _TimedPose) -> Motion:
@@ -178,7 +177,6 @@ class KissOdometry:
 
 
 def _library_settings(config: KissConfig) -> dict[str, Any]:
-    """The sections of the library's own configuration."""
     voxel_size = config.voxel_size_m or config.max_range_m / 100.0
     return {
         "data": {"max_range": config.max_range_m, "min_range": config.min_range_m, "deskew": config.deskew},
@@ -186,3 +184,28 @@ def _library_settings(config: KissConfig) -> dict[str, Any]:
         "registration": {"max_num_threads": config.threads},
         "adaptive_threshold": {"initial_threshold": config.initial_threshold_m},
     }
+
+
+def main() -> None:
+    """Until the parent closes the pipe: take the settings, answered by None, and then points (N, 3) and stamps (M,).
+
+    These are answered by the pose (4, 4) and the number of points registered.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends this process
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    pipe: Connection = Connection(int(sys.argv[1]))
+    odometry = KissICP(KISSConfig.model_validate(pipe.recv()))
+    pipe.send(None)
+    while True:
+        try:
+            points, stamps = pipe.recv()
+        except EOFError:
+            return
+        _, source = odometry.register_frame(points, stamps)
+        pipe.send((np.asarray(odometry.last_pose), len(source)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,13 +1,10 @@
 """An exported network in ONNX Runtime: inference without torch, which starts at once."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from threading import Thread
-from time import monotonic, sleep
 from typing import Any
-from weakref import ref
 
 import onnxruntime
 from pydantic import ValidationError
@@ -16,7 +13,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.images.projection import Floats
-from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Search, WholePairs
+from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
 
 DESCRIPTION = "network.json"
 COLUMNS, TURNS, BIRD, PEAKS, PAIR = "columns.onnx", "turns.onnx", "bird.onnx", "peaks.onnx", "pair.onnx"
@@ -24,8 +21,6 @@ COLUMNS, TURNS, BIRD, PEAKS, PAIR = "columns.onnx", "turns.onnx", "bird.onnx", "
 # To be raised whenever graphs of before mean something else: 2, cells of a metre.
 _HEADER = {"kind": "a network exported by lidarslam", "version": 2}
 _FATAL_ERRORS_ONLY = 4
-# Limits of a graph: seconds for one pair of scans, which take milliseconds, and memory for all, which is below 100 MB.
-_MOST_S, _MOST_BYTES = 60.0, 1 << 30
 
 
 @dataclass(frozen=True)
@@ -72,71 +67,33 @@ def onnx_search(exported: Exported, threads: int) -> Search:
     InputError where a graph is missing or cannot be used.
     """
     if exported.network.name != "correlation":
-        return WholePairs(_Graph(exported.folder / PAIR, threads))
-    parts = (_Graph(exported.folder / name, threads) for name in (COLUMNS, TURNS, BIRD, PEAKS))
+        return WholePairs(_graph(exported.folder / PAIR, threads))
+    parts = (_graph(exported.folder / name, threads) for name in (COLUMNS, TURNS, BIRD, PEAKS))
     return CorrelationSearch(CorrelationParts(*parts))
 
 
-class _Graph:
-    """A graph of bounded time and memory: it is part of a file from elsewhere, and may loop without end."""
+def _graph(path: Path, threads: int) -> Graph:
+    options, run_options = onnxruntime.SessionOptions(), onnxruntime.RunOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = run_options.log_severity_level = _FATAL_ERRORS_ONLY
+    # Threads that wait in a loop for more work would take it from mapping, which runs in parallel.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    with _usable(path):
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    names = [value.name for value in session.get_inputs()]
 
-    def __init__(self, path: Path, threads: int) -> None:
-        _bound_memory()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = _FATAL_ERRORS_ONLY
-        # Threads that wait in a loop for more work would take it from mapping, which runs in parallel.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.add_session_config_entry("session.use_env_allocators", "1")
-        self._path, self._run, self.deadline_s = path, onnxruntime.RunOptions(), float("inf")
-        self._run.log_severity_level = _FATAL_ERRORS_ONLY
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # of many kinds, all of ONNX Runtime's own
-            raise self._unusable(error) from error
-        self._inputs = [value.name for value in self._session.get_inputs()]
-        _watched().append(ref(self))
+    def run(*inputs: Floats) -> list[Floats]:
+        with _usable(path):
+            return list(session.run(None, dict(zip(names, inputs, strict=True)), run_options))
 
-    def __call__(self, *inputs: Floats) -> list[Floats]:
-        self.deadline_s = monotonic() + _MOST_S
-        try:
-            return list(self._session.run(None, dict(zip(self._inputs, inputs, strict=True)), self._run))
-        except Exception as error:
-            raise self._unusable(error) from error
-        finally:
-            self.deadline_s = float("inf")
+    return run
 
-    def end(self) -> None:
-        """End the computation in progress."""
-        self._run.terminate = True
 
-    def _unusable(self, error: Exception) -> InputError:
+@contextmanager
+def _usable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # of many kinds, all of ONNX Runtime's own
         reason = " ".join(str(error).split())
-        return InputError(f"{self._path}: cannot be used ({reason}); make it again with `lidarslam export`")
-
-
-@cache
-def _bound_memory() -> None:
-    memory = onnxruntime.OrtMemoryInfo(
-        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
-    )
-    limits = dict.fromkeys(("arena_extend_strategy", "initial_chunk_size_bytes", "max_dead_bytes_per_chunk"), -1)
-    with suppress(Exception):  # the process has one of its own already
-        onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": _MOST_BYTES, **limits}))
-
-
-@cache
-def _watched() -> "list[ref[_Graph]]":
-    """All graphs, which a thread of its own ends at their deadlines."""
-    graphs: list[ref[_Graph]] = []
-
-    def watch() -> None:
-        while True:
-            sleep(1.0)
-            for graph in (reference() for reference in tuple(graphs)):
-                if graph is not None and monotonic() > graph.deadline_s:
-                    graph.end()
-
-    Thread(target=watch, daemon=True, name="deadlines of graphs").start()
-    return graphs
+        raise InputError(f"{path}: cannot be used ({reason}); make it again with `lidarslam export`") from error

@@ -371,7 +371,6 @@ def _convolution(channels_in: int, channels_out: int, stride: tuple[int, int] = 
 
 
 def _head(outputs: int) -> nn.Sequential:
-    """(B, 1000) -> (B, outputs)."""
     return nn.Sequential(nn.Linear(_FEATURES, _HEAD_FEATURES), nn.Tanh(), nn.Linear(_HEAD_FEATURES, outputs))
 
 

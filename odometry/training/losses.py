@@ -1,22 +1,27 @@
-"""The objective of training: the geometric losses of DeLORA (Nubert et al., ICRA 2021), and the distance from labels.
+"""The objective of training, the geometric losses of DeLORA (Nubert et al., ICRA 2021), and validation.
 
 Everything is averaged over the correspondences of each item of the batch. Gradients flow through the moved source
 points and normals only: correspondences are taken as given.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 from torch.nn import functional
 
+from lidarslam.odometry.config import LossConfig, TrainingConfig
 from lidarslam.odometry.images import bird_eye
+from lidarslam.odometry.network.checkpoint import torch_search
 from lidarslam.odometry.network.networks import PairEstimate, has_normal
 from lidarslam.odometry.network.torch_geometry import inverse, log, rotate, transform_points
-from lidarslam.odometry.training.config import LossConfig, TrainingConfig
 from lidarslam.odometry.training.pairs import PairBatch
+from lidarslam.odometry.training.preparation import PreparedRecording
 
 # The robust losses gate the distance of a correspondence, and weigh residuals with Huber's kernel of this scale.
 _GATE_M, _HUBER_M = 1.0, 0.1
@@ -63,7 +68,6 @@ def geometric_loss(T_prev_curr: Tensor, source: Surfaces, target: Surfaces, conf
 
 
 def _pick(values: Tensor, index: Tensor) -> Tensor:
-    """Values (B, M, 3) at index (B, N), giving (B, N, 3)."""
     return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
 
 
@@ -95,7 +99,6 @@ def nearest(query: Tensor, reference: Tensor, valid: Tensor) -> tuple[Tensor, Te
 
 
 def _by_kd_tree(query: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
-    """Index and distance (N,) for queries (N, 3)."""
     # Splitting at the middle instead of the median builds faster, which counts as every tree is used once.
     lengths, found = cKDTree(reference.numpy(), balanced_tree=False, compact_nodes=False).query(query.numpy())
     return torch.from_numpy(found), torch.from_numpy(lengths)
@@ -224,3 +227,72 @@ def _surfaces(images: Tensor, most: int | None = None, generator: Generator | No
         values = values.gather(1, order.topk(most, dim=1).indices[..., None].expand(-1, -1, 6))
     points, normals = values[..., :3], values[..., 3:]
     return Surfaces(points, normals, has_normal(normals, -1))
+
+
+_LEAST_RATE = 0.01  # of the learning rate, at the end
+_WEIGHT_DECAY = 1e-3
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Errors of a network against the pseudo-labels of recordings that it is not trained on."""
+
+    # rotation_rms_deg, translation_rms_m: over all valid pairs
+    rotation_rms_deg: float
+    translation_rms_m: float
+    # rotation_median_deg, translation_median_m: likewise
+    rotation_median_deg: float
+    translation_median_m: float
+    covered_percent: tuple[float, float, float]  # of the errors that lie within one, two and three standard deviations
+    pairs: int  # their number; without any, all else is NaN
+
+
+def learning_rate(step: int, config: TrainingConfig) -> float:
+    """Rises linearly, then falls along half a cosine."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+
+def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
+    """AdamW; biases, scales and the like are not decayed."""
+    decayed = [p for p in network.parameters() if p.ndim > 1]
+    others = [p for p in network.parameters() if p.ndim <= 1]
+    groups = [{"params": decayed, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.98))
+
+
+def validate(
+    network: nn.Module, recordings: Sequence[PreparedRecording], device: torch.device | str = "cpu"
+) -> Validation:
+    """Every pair of consecutive scans whose label is valid, as it is.
+
+    The network, in evaluation mode, answers as in use: by its most probable candidate.
+    """
+    errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
+    search = torch_search(network, device)
+    for recording in recordings:
+        points, normals = recording.points.numpy(), recording.normals.float().numpy()
+        before = search.describe(points[0], normals[0])
+        for number, (label, is_valid) in enumerate(zip(recording.T_prev_curr, recording.valid, strict=True), start=1):
+            candidates, before = search.compare(before, points[number], normals[number])
+            if is_valid:
+                T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
+                errors.append(motion_error(T_prev_curr[None], label[None]))
+                sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
+    return summarise(torch.cat(errors), torch.cat(sigmas))
+
+
+def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
+    """Statistics of errors (N, 6) with standard deviations (N, 6)."""
+    if not len(errors):
+        return Validation(math.nan, math.nan, math.nan, math.nan, (math.nan, math.nan, math.nan), 0)
+    rotation = torch.rad2deg(errors[:, :3].norm(dim=1))
+    translation = errors[:, 3:].norm(dim=1)
+    covered = [100.0 * float((errors.abs() <= k * sigmas).float().mean()) for k in (1, 2, 3)]
+    return Validation(
+        float(rotation.square().mean().sqrt()), float(translation.square().mean().sqrt()),
+        float(rotation.median()), float(translation.median()),
+        (covered[0], covered[1], covered[2]), len(errors),
+    )  # fmt: skip

@@ -44,19 +44,15 @@ class PreparedRecording:
         return len(self.points)
 
     def require(self, scans: int, images: ImageConfig) -> None:
-        """Raise ValueError for a recording that `prepare` cannot have made of `scans` scans; some may be left out."""
+        """Raise ValueError for shapes that `prepare` cannot have made of `scans` scans; some may be left out."""
         count, size = len(self.points), (images.rows, images.columns)
         shapes = {
             "points": (count, 3, *size), "normals": (count, 3, *size), "offsets": (count, *size),
             "interval_s": (count - 1,), "T_prev_curr": (count - 1, 4, 4), "valid": (count - 1,),
         }  # fmt: skip
-        for name, shape in shapes.items():
-            tensor: Tensor = getattr(self, name)
-            is_of_type = tensor.dtype == torch.bool if name == "valid" else tensor.is_floating_point()
-            if tensor.shape != shape or not is_of_type or not bool(tensor.isfinite().all()):
-                raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {shape}, finite")
-        if not 2 <= count <= scans or float(self.interval_s.min()) <= 0.0:
-            raise ValueError(f"{count} images of {scans} scans, in intervals from {float(self.interval_s.min())} s")
+        found = {name: tuple(tensor.shape) for name, tensor in vars(self).items()}
+        if found != shapes or not 2 <= count <= scans:
+            raise ValueError(f"expected tensors of the shapes {shapes}, got {found}")
 
 
 def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:

@@ -24,7 +24,7 @@ time.sleep(60)
 # What a comparison, a first run, and a run with KISS-ICP start, as `PARENT` starts it; each prints processes.
 SUPERVISED = f"""
 from pathlib import Path
-from lidarslam.compare.supervised import Limits, supervise
+from lidarslam.compare.method_run import Limits, supervise
 supervise([sys.executable, "-c", {FAMILY!r}], Path(os.devnull), Limits(), lambda line: print(line, flush=True))
 """
 COMPILING = """

@@ -62,12 +62,10 @@ def test_extrapolation_does_not_trust_two_poses_a_microsecond_apart():
 @pytest.mark.parametrize(
     ("estimate_s", "reference_s", "words"),
     [
-        (np.arange(10.0), 100.0 + np.arange(10.0), "found 0.*10 pose.*0.000 to 9.000 s.*100.000 to 109.*100.000 s"),
-        (1e9 + np.arange(10.0), 1e18 + 1e9 * np.arange(10.0), "nanoseconds"),
-        (np.arange(10.0) + 0.5, np.arange(11.0), "found 0.*not bridged.*typically 1 s"),
-        (np.arange(2.0), np.arange(10.0), "found 2.*too short"),
-        (np.arange(10.0), np.arange(1.0), "found 1.*1 pose.*too short"),
-        (np.arange(0.0), np.arange(10.0), "no pose.*too short"),
+        (np.arange(10.0), 100.0 + np.arange(10.0), "found 0.*10 poses from 0.000 to 9.000 s.*100.000.*the clock"),
+        (np.arange(10.0) + 0.5, np.arange(11.0), "found 0.*not bridged"),
+        (np.arange(10.0), np.arange(1.0), "found 1.*1 pose .*too short"),
+        (np.arange(0.0), np.arange(10.0), "0 poses.*too short"),
     ],
 )
 def test_too_few_matches_are_refused_with_a_likely_cause(estimate_s, reference_s, words):

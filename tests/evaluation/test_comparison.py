@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,17 +9,20 @@ import pytest
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import (
+    QUANTITIES,
     Comparison,
     LostInterval,
     MethodResult,
     MethodStatus,
     MissingRecording,
+    Published,
     SequenceComparison,
     TableCell,
+    TablePlan,
     TableRow,
     lost_intervals,
+    mean_table,
 )
-from lidarslam.evaluation.comparison.quantities import QUANTITIES, Published, TablePlan, mean_table
 from lidarslam.evaluation.report.tables import sequence_tables
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
@@ -69,16 +71,6 @@ def test_a_method_without_anything_is_null_and_never_0() -> None:
     assert content["message"] == "aborted (signal 6)"
     absent = ("metrics", "ms_per_scan_median", "ms_per_scan_p95", "lost_scans", "peak_rss_mb", "wall_s", "run")
     assert [content[key] for key in absent] == [None] * len(absent)
-
-
-def test_metrics_are_those_of_metrics_json_with_the_map_in_place(result: MethodResult) -> None:
-    assert result.metrics is not None
-    assert result.to_json()["metrics"] == result.metrics.to_json()
-    mapped = replace(result, map_metrics={"chamfer_m": 0.1}).to_json()["metrics"]
-    assert mapped == {**result.metrics.to_json(), "map": {"chamfer_m": 0.1}}
-    only_map: Any = MethodResult("m", "ok", map_metrics={"chamfer_m": 0.1}).to_json()["metrics"]
-    assert only_map["map"] == {"chamfer_m": 0.1}
-    assert only_map["trajectory"] is None
 
 
 def test_one_recording_has_its_own_keys_and_several_a_list(result: MethodResult) -> None:

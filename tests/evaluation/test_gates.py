@@ -19,7 +19,6 @@ from lidarslam.evaluation.comparison.gates import (
     judge,
     judge_comparison,
     parse_gate,
-    require_methods,
 )
 
 from ..conftest import lidarslam
@@ -63,13 +62,6 @@ def test_other_forms_are_refused(text: str) -> None:
         parse_gate("min", text, with_method=True)
     with pytest.raises(ConfigError, match=r"expected NAME=VALUE"):
         parse_gate("min", "learned:ate=0.1")
-
-
-def test_a_misspelt_name_is_answered_with_the_names() -> None:
-    with pytest.raises(ConfigError, match="'aet'; there are: ate, ate_rotation, rpe"):
-        parse_gate("max", "aet=0.1")
-    with pytest.raises(ConfigError, match="there are: learned, kiss-icp"):
-        require_methods([Gate("max", "ate", 0.1, "learnt")], ["learned", "kiss-icp"])
 
 
 def test_the_names_are_keys_of_the_written_files(run: Path) -> None:
@@ -125,7 +117,4 @@ def test_the_exit_status_of_evaluate(run: Path) -> None:
     assert failed.exit_code == 4
     assert (run / "metrics.json").is_file()
     assert "2 of 3 failed" in failed.stdout
-    for wrong in ("aet=0.1", "learned:ate=0.1"):
-        misspelt = lidarslam(*command, "--max", wrong)
-        assert misspelt.exit_code == 2
-        assert f"--max {wrong}: " in misspelt.stderr
+    assert lidarslam(*command, "--max", "aet=0.1").exit_code == 2

@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.map.entropy import map_entropy
 from lidarslam.evaluation.map.metrics import compare_maps
 from lidarslam.evaluation.map.voxel_thinning import thin
-from lidarslam.evaluation.report.error_colours import error_colours
+from lidarslam.evaluation.report.drawing import error_colours
 
 UTM = np.array([5e5, 5e6, 300.0])
 

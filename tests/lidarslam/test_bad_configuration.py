@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.network.shipped import default_weights
+from lidarslam.odometry.registry import default_weights
 
 from ..conftest import lidarslam
 from .conftest import refused, summary_of

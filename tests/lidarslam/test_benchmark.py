@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.compare.benchmark import Benchmark, fill_request, load_benchmark
 from lidarslam.compare.methods import parse_method, parse_methods
-from lidarslam.compare.plan import CompareRequest
+from lidarslam.compare.plan import Benchmark, CompareRequest, fill_request, load_benchmark
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError
 from lidarslam.simulation.motion import CARRIERS
@@ -158,17 +157,20 @@ def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> 
         ("kiss-icp+graph+map", "no method is called"),
         ("kiss-icp+map+loam", r"no method is called .* each with \+map or \+loam, with \+graph, or"),
         ("prior@0.5", "only kiss-icp takes a voxel size"),
-        ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
         ("form@scene", "form has no voxel size"),
-        ("kiss-icp@nan", "expected a voxel size"),
-        ("imu", r"measures turns alone; compare imu\+map or imu\+loam"),
-        ("learned+imu", r"takes part in scan-to-map registration; compare learned\+imu\+map"),
-        ("constant-velocity", r"only predicts; compare constant-velocity\+map or constant-velocity\+loam"),
+        ("imu", r"with a map alone; compare imu\+map or imu\+loam"),
+        ("learned+imu", r"with a map alone; compare learned\+imu\+map"),
     ],
 )
 def test_what_is_no_method_is_refused_in_words(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         parse_method(name)
+
+
+@pytest.mark.parametrize("size", ["fine", "nan", "-1"])
+def test_a_voxel_size_is_checked_like_the_setting(size: str) -> None:
+    with pytest.raises(ConfigError, match="voxel_size_m"):
+        load_config(None, parse_method(f"kiss-icp@{size}").settings)
 
 
 @pytest.mark.parametrize(("names", "message"), [("kiss-icp,kiss-icp", "named twice"), (" , ", "no method is named")])

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate
-from lidarslam.assessment.text import format_evaluation
+from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points

@@ -7,7 +7,6 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.odometry.network.exported import DESCRIPTION, read_exported
 from lidarslam.storage.comparison_folder import run_directories
 
 from ..conftest import succeeds
@@ -42,13 +41,6 @@ def test_a_forged_comparison(tmp_path: Path, text: str) -> None:
     (tmp_path / "comparison.json").write_text(text)
     with pytest.raises(InputError, match=r"comparison\.json: not a comparison"):
         run_directories(tmp_path)
-
-
-@pytest.mark.parametrize("text", [f'{{"kind": "x", "version": {LONG}}}', DEEP, "[]", '{"version": 1e999}'])
-def test_a_forged_network(tmp_path: Path, text: str) -> None:
-    (tmp_path / DESCRIPTION).write_text(text)
-    with pytest.raises(InputError, match=f"{DESCRIPTION} is missing or damaged"):
-        read_exported(tmp_path)
 
 
 @pytest.mark.parametrize("count", ["99999999999999999999", "9223372036854775807", "1000000000000", LONG])

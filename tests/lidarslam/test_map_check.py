@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from lidarslam.compare.method_run import judge
-from lidarslam.compare.supervised import Ending, Limits
+from lidarslam.compare.method_run import Ending, Limits, judge
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum

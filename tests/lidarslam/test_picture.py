@@ -25,8 +25,9 @@ from lidarslam.viewer.picture import (
     fit_frame,
     require_quantity,
     save_picture,
+    save_video,
+    turn_runs,
 )
-from lidarslam.viewer.video import save_video, turn_runs
 from lidarslam.viewer.view import View, draw_layer, fit_view, turning_views
 
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
@@ -159,11 +160,6 @@ def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:
     assert first[2] > first[0] + 50, "blue"
     assert second[0] > second[2] + 50, "vermilion"
     np.testing.assert_allclose(both, (first + second) / 2, atol=6)
-
-
-def test_a_run_without_a_map_or_with_one_pose_is_drawn() -> None:
-    assert not drawn(draw([DrawnRun("", NOTHING)])).any()
-    assert drawn(draw([DrawnRun("", NOTHING, np.zeros((1, 3)))])).any()
 
 
 def test_a_picture_is_written_as_png(tmp_path: Path) -> None:

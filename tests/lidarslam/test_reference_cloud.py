@@ -12,7 +12,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from lidarslam.assessment.reference_cloud import read_cloud
+from lidarslam.assessment.inputs import read_cloud
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 

@@ -36,7 +36,8 @@ KILLED = -KILL
 SERVER = """
 import json, os, shutil, signal, sys, threading
 from pathlib import Path
-import lidarslam.viewer.rerun_viewer, lidarslam.run.run, mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
+import lidarslam.viewer.rerun_recording, lidarslam.run.run
+import mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
 import lidarslam.odometry.methods.learned
 from lidarslam.cli import main
 

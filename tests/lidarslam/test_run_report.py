@@ -12,11 +12,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.evaluation.comparison.comparison import MethodResult
 from lidarslam.storage.comparison_folder import run_directories
-from lidarslam.viewer.run_report import changed_settings, leave_report
+from lidarslam.viewer.run_report import leave_report
 
 from ..conftest import succeeds
 
@@ -113,11 +112,6 @@ def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_m
     bands = next(plot["layout"]["shapes"] for plot in plots if plot["layout"].get("shapes"))
     assert [band["fillcolor"] for band in bands] == ["#e69f00", "#d4003c"]
     np.testing.assert_allclose([[band["x0"], band["x1"]] for band in bands], [[0.1, 0.3], [0.4, 0.5]], atol=1e-6)
-
-
-def test_settings_that_differ_from_the_defaults_are_listed_with_these() -> None:
-    assert changed_settings(load_config()) == {}
-    assert changed_settings(load_config(None, ["mapping.method=off"])) == {"mapping.method": "off (default surfels)"}
 
 
 def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path: Path, whole_run: Path) -> None:

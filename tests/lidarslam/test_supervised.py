@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.compare.supervised import Ending, Limits, supervise
+from lidarslam.compare.method_run import Ending, Limits, supervise
 
 Run = Callable[..., Ending]
 

@@ -19,17 +19,17 @@ import torch
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
+from lidarslam.odometry.config import SimulatedConfig
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.training.config import LossConfig, SimulatedConfig
+from lidarslam.odometry.training.losses import summarise, validate
 from lidarslam.odometry.training.pairs import AUGMENTATION, Pairs
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.training import summarise, validate
 from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import data as training_data
 from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
-from lidarslam.train.settings import LOSSES, load_train_config
+from lidarslam.train.settings import load_train_config
 from lidarslam.train.train import TrainRequest, execute
 
 from ..conftest import lidarslam, succeeds
@@ -45,8 +45,8 @@ def small_steps() -> Iterator[None]:
     earlier = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("lidarslam.train.loop.LOG_EVERY", 3)
-        patched.setattr("lidarslam.train.loop.VALIDATE_EVERY", 4)
+        patched.setattr("lidarslam.train.train.LOG_EVERY", 3)
+        patched.setattr("lidarslam.train.train.VALIDATE_EVERY", 4)
         patched.setattr("lidarslam.odometry.training.losses._GEOMETRIC_POINTS", 64)
         yield
     torch.set_num_threads(earlier)
@@ -181,7 +181,7 @@ def test_what_a_training_leaves(room_folder, whole):
 
 def test_where_no_held_out_pair_can_be_aligned_the_last_weights_are_kept(room_folder, tmp_path, ready, monkeypatch):
     nothing = summarise(torch.zeros(0, 6), torch.zeros(0, 6))
-    monkeypatch.setattr("lidarslam.train.loop.validate", lambda *_, **__: nothing)
+    monkeypatch.setattr("lidarslam.train.train.validate", lambda *_, **__: nothing)
     console = Console()
     execute(request(room_folder, tmp_path / "out", ready), console)
     assert any("nothing to compare with" in line for line in console.lines)
@@ -228,13 +228,9 @@ def test_nothing_is_prepared_behind_a_link(room_folder, tmp_path):
     [
         lambda tensors: tensors.pop("valid"),
         lambda tensors: tensors.update({n: tensors[n][..., ::2] for n in ("points", "normals", "offsets")}),
-        lambda tensors: tensors.update(valid=tensors["valid"].long()),
-        lambda tensors: tensors.update(interval_s=tensors["interval_s"][:-1]),
         lambda tensors: tensors.update({name: torch.cat([one, one]) for name, one in tensors.items()}),
-        lambda tensors: tensors["points"].view(-1)[0].fill_(torch.nan),
-        lambda tensors: tensors["interval_s"][0].fill_(0.0),
     ],
-    ids=["missing", "other image", "type", "short", "long", "nan", "interval"],
+    ids=["missing", "other image", "long"],
 )
 def test_prepared_recordings_that_do_not_fit_are_made_anew(kept, forge):
     (file,) = kept[2].iterdir()
@@ -271,17 +267,6 @@ def test_of_the_simulated_recordings_some_kinds_can_be_chosen():
         simulated(SimulatedConfig(recordings=1, worlds=("strete",)))
     with pytest.raises(ConfigError, match=r"simulated\.recordings=1: none is of the worlds"):
         simulated(SimulatedConfig(recordings=1, worlds=("park",)))
-
-
-def test_named_losses():
-    losses = {name: load_train_config(None, settings).training.geometric for name, settings in LOSSES.items()}
-    assert losses == {
-        "both": LossConfig(),
-        "paper": LossConfig(robust=False),
-        "point-to-plane": LossConfig(plane_to_plane=False),
-        "plane-to-plane": LossConfig(point_to_plane=False),
-        "alignment": None,
-    }
 
 
 @pytest.mark.long
@@ -353,8 +338,8 @@ def test_two_processes_train_one_network(room_folder, tmp_path, ready):
 def test_a_short_recording_is_learnt_by_heart(room_folder, tmp_path, ready, monkeypatch):
     """Labels play no part: alignment found the motions that the error is measured against."""
     unchanged = AUGMENTATION._replace(roll=0.0, any_roll=0.0, mirror=0.0, scale=0.0, drop_beams=0.0, hide_sector=0.0)
-    monkeypatch.setattr("lidarslam.train.loop.Pairs", partial(Pairs, augmentation=unchanged))
-    monkeypatch.setattr("lidarslam.train.loop.VALIDATE_EVERY", 100)
+    monkeypatch.setattr("lidarslam.train.train.Pairs", partial(Pairs, augmentation=unchanged))
+    monkeypatch.setattr("lidarslam.train.train.VALIDATE_EVERY", 100)
     settings = ("training.steps=300", "training.batch=8", "training.hold_out=0.0")
     execute(request(room_folder, tmp_path / "out", ready, *settings), print)
     trained = load_checkpoint(tmp_path / "out" / "weights.safetensors")

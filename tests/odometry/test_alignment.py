@@ -20,7 +20,6 @@ from lidarslam.odometry.alignment.alignment import (
     find_degeneracy,
     joined_information,
     replaced_along,
-    try_instead,
 )
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
@@ -207,20 +206,6 @@ def wrong_by_m(aligned: Alignment) -> float:
     return float(errors(aligned.T_prev_curr, ahead(1.4))[1])
 
 
-def test_alignment_from_rest_stays_there_and_knows_it(street):
-    found = one_on_the_other(street, REST)
-    assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
-    assert found.inlier_share > 0.3  # the ground and the walls go along
-    assert found.explained < DOUBTFUL - 0.2
-    np.testing.assert_allclose(np.abs(found.weakest), [1.0, 0.0, 0.0], atol=0.05)
-
-
-def test_a_good_alignment_is_not_searched_around(street):
-    found = best_of(street, ahead(1.35))
-    alone = one_on_the_other(street, ahead(1.35))
-    assert np.array_equal(found.T_prev_curr, alone.T_prev_curr)
-
-
 def test_of_guesses_that_explain_as_much_the_first_is_taken(corridor):
     """Nothing tells how far ahead one is, and all guesses lie well."""
     sweeps = corridor.sweeps(2, (0.0,) * 6)
@@ -235,12 +220,6 @@ def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m,
     information = np.eye(6) / sigma_m**2
     searched = best_of(street, REST, information=information)
     assert (wrong_by_m(searched) < 0.02) == (searched.explained > DOUBTFUL) == found
-
-
-def test_the_best_of_many_guesses_is_found_roughly(street):
-    guesses = [ahead(0.1 * x) for x in (-20, -10, 0, 13, 25)]
-    found = try_instead(one_on_the_other(street, REST), guesses, second_on_first(street), FINE)
-    assert wrong_by_m(found) < 0.02
 
 
 def test_the_less_likely_a_guess_the_more_it_must_explain(street, monkeypatch):

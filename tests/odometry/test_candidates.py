@@ -11,7 +11,7 @@ from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
 from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, _peaks, _shift_scores
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 from lidarslam.odometry.network.networks import CorrelationNetwork
-from lidarslam.odometry.network.shipped import default_weights
+from lidarslam.odometry.registry import default_weights
 
 TURN_DEG = 2.0
 

@@ -72,8 +72,8 @@ def test_a_pickle_is_refused_unopened(how, tmp_path):
         (lambda _, __: None, "no such file"),
         (lambda path, _: path.write_text("some notes that are long enough"), "is no safetensors file"),
         (lambda path, _: path.mkdir(), "is no safetensors file"),
-        (lambda path, weights: save_file(weights, path), "another program"),
-        (lambda path, weights: write_tensor_file(path, Kind("a training", 1), weights, {}), "holds a training, not"),
+        (lambda path, weights: save_file(weights, path), "holds no weights"),
+        (lambda path, weights: write_tensor_file(path, Kind("a training", 1), weights, {}), "holds no weights"),
         (lambda path, weights: write_tensor_file(path, Kind("weights", 99), weights, {}), "version 99, .* use a newer"),
     ],
 )

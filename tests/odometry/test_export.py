@@ -3,21 +3,24 @@
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
 from torch.nn import functional
 
 from lidarslam.core.errors import InputError
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
-from lidarslam.odometry.network import exported as exported_module
 from lidarslam.odometry.network.candidates import CorrelationSearch
-from lidarslam.odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of, torch_search
-from lidarslam.odometry.network.export import export_onnx
+from lidarslam.odometry.network.checkpoint import (
+    Checkpoint,
+    checkpoint_of,
+    export_onnx,
+    load_checkpoint,
+    network_of,
+    torch_search,
+)
 from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, onnx_search, read_exported
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.odometry.network.shipped import default_weights, shipped_folder
+from lidarslam.odometry.registry import default_weights, shipped_folder
 
 SHAPE = (16, 96)
 # Sums in another order differ in the last digits of float32.
@@ -99,37 +102,4 @@ def test_damaged_graphs_are_refused(tmp_path, are_there):
     described(tmp_path)
     for name in (COLUMNS, TURNS, BIRD, PEAKS) if are_there else ():
         (tmp_path / name).write_bytes(b"no graph")
-    assert_unusable(tmp_path)
-
-
-def exported_with(folder: Path, nodes: list[onnx.NodeProto], **constants: np.ndarray) -> None:
-    """A folder whose graph of the columns answers with `out`, of any input."""
-    described(folder)
-    inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("points", "normals")]
-    outputs = [helper.make_tensor_value_info("out", TensorProto.FLOAT, None)]
-    initial = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "columns", inputs, outputs, initial)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    for name in (COLUMNS, TURNS, BIRD, PEAKS):
-        (folder / name).write_bytes(model.SerializeToString())
-
-
-def test_a_loop_without_an_end_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(exported_module, "_MOST_S", 0.5)
-    values = [("step", TensorProto.INT64), ("on", TensorProto.BOOL), ("x", TensorProto.FLOAT)]
-    given = [helper.make_tensor_value_info(name, kind, [] if name != "x" else None) for name, kind in values]
-    kept = [helper.make_tensor_value_info(f"{name}_", kind, [] if name != "x" else None) for name, kind in values[1:]]
-    same = [helper.make_node("Identity", [name], [f"{name}_"]) for name, _ in values[1:]]
-    body = helper.make_graph(same, "body", given, kept)
-    loop = helper.make_node("Loop", ["", "true", "points"], ["out"], body=body)
-    exported_with(tmp_path, [loop], true=np.array(True))
-    assert_unusable(tmp_path)
-
-
-def test_a_tensor_of_gigabytes_is_refused(tmp_path):
-    fill = helper.make_node("ConstantOfShape", ["size"], ["large"])
-    product = helper.make_node("Mul", ["count", "ones"], ["size"])
-    ones = [helper.make_node("Shape", ["points"], ["shape"]), helper.make_node("Div", ["shape", "shape"], ["ones"])]
-    answer = helper.make_node("ReduceMax", ["large"], ["out"])
-    exported_with(tmp_path, [*ones, product, fill, answer], count=np.array([1_000, 1_000, 1_000, 1]))
     assert_unusable(tmp_path)

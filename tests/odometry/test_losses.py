@@ -9,10 +9,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from lidarslam.odometry.config import LossConfig, TrainingConfig
 from lidarslam.odometry.network.networks import PairEstimate
 from lidarslam.odometry.network.torch_geometry import inverse, rotate, transform_points
 from lidarslam.odometry.training import losses as module
-from lidarslam.odometry.training.config import LossConfig, TrainingConfig
 from lidarslam.odometry.training.losses import Objective, Surfaces, geometric_loss, nearest, objective
 from lidarslam.odometry.training.pairs import PairBatch, pair_of, stack
 

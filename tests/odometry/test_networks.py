@@ -8,13 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidarslam.odometry.config import NetworkConfig
+from lidarslam.odometry.config import NetworkConfig, TrainingConfig
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.network.networks import CorrelationNetwork, DeloraNetwork, PairImages
 from lidarslam.odometry.network.networks import make_network as network_named
 from lidarslam.odometry.network.torch_geometry import inverse
-from lidarslam.odometry.training.config import TrainingConfig
 from lidarslam.odometry.training.losses import objective
 from lidarslam.odometry.training.pairs import PairBatch, birds, pair_of, rotate_columns
 

@@ -8,12 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from lidarslam.core import geometry
+from lidarslam.odometry.config import TrainingConfig
 from lidarslam.odometry.network.networks import CorrelationNetwork, PairEstimate, PairImages
-from lidarslam.odometry.training.config import TrainingConfig
-from lidarslam.odometry.training.losses import objective
+from lidarslam.odometry.training.losses import learning_rate, make_optimizer, objective, validate
 from lidarslam.odometry.training.pairs import birds, pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
-from lidarslam.odometry.training.training import learning_rate, make_optimizer, validate
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 

@@ -154,7 +154,6 @@ def _take_imu(estimator: Estimator, samples: ImuSamples | None, taken: int, unti
 
 
 def _at_stamps(poses: Poses, stamps: FloatArray) -> Trajectory:
-    """The trajectory at those stamps that the poses cover."""
     instants, T_world_lidar = poses.instants, poses.T_world_lidar
     if not np.isfinite(T_world_lidar).all():
         raise PeerError(f"some of its {len(instants)} poses are not finite")

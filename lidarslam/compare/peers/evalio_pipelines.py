@@ -195,6 +195,5 @@ def _as_recorded(sweep: Sweep) -> list[Any]:
 
 
 def _since_start(sweep: Sweep) -> FloatArray:
-    """Seconds (N,) since the sweep's start."""
     offsets = sweep.scan.time_offsets
     return np.zeros(len(sweep.scan)) if offsets is None else offsets - offsets.min()

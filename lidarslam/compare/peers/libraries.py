@@ -14,6 +14,10 @@ _DOWNSAMPLING_M, _VOXEL_M = 0.25, 1.0
 _HORIZON, _CLEAR_CYCLE = 100, 10
 
 
+def _scale(range_m: float | None) -> float:
+    return 1.0 if range_m is None else range_m / MAX_RANGE_M
+
+
 class KissSlamEstimator(Estimator):
     """KISS-SLAM: KISS-ICP with motion compensation, and a pose graph.
 
@@ -21,14 +25,14 @@ class KissSlamEstimator(Estimator):
     over the sweep and belong to its middle.
     """
 
-    def __init__(self, _: ImuSamples | None, range_m: float) -> None:
+    def __init__(self, _: Sweep, __: ImuSamples | None, range_m: float | None) -> None:
         from kiss_slam.config import load_config
         from kiss_slam.slam import KissSLAM
 
         config: Any = load_config(None)
-        config.odometry.preprocessing.max_range = range_m
-        config.odometry.mapping.voxel_size *= range_m / MAX_RANGE_M
-        config.local_mapper.voxel_size *= range_m / MAX_RANGE_M
+        config.odometry.preprocessing.max_range = range_m or MAX_RANGE_M
+        config.odometry.mapping.voxel_size *= _scale(range_m)
+        config.local_mapper.voxel_size *= _scale(range_m)
         self._slam: Any = KissSLAM(config)
         self._instants: list[float] = []
 
@@ -53,12 +57,12 @@ class RkoLioEstimator:
     times count as measured at one instant.
     """
 
-    def __init__(self, imu: ImuSamples, range_m: float) -> None:
+    def __init__(self, _: Sweep, imu: ImuSamples | None, range_m: float | None) -> None:
         from rko_lio.config import LIOConfig
         from rko_lio.lio import LIO
 
-        self._T_lidar_imu = np.eye(4) if imu.T_lidar_imu is None else imu.T_lidar_imu
-        self._lio: Any = LIO(LIOConfig(voxel_size=range_m / MAX_RANGE_M, max_range=range_m))
+        self._T_lidar_imu = np.eye(4) if imu is None or imu.T_lidar_imu is None else imu.T_lidar_imu
+        self._lio: Any = LIO(LIOConfig(voxel_size=_scale(range_m), max_range=range_m or MAX_RANGE_M))
         self._poses: list[tuple[float, FloatArray]] = []
 
     def add_imu(self, samples: ImuSamples, number: int) -> None:
@@ -101,10 +105,10 @@ class SmallGicpEstimator(Estimator):
     the motion: a pose belongs to the middle of its sweep.
     """
 
-    def __init__(self, _: ImuSamples | None, range_m: float) -> None:
+    def __init__(self, _: Sweep, __: ImuSamples | None, range_m: float | None) -> None:
         import small_gicp
 
-        self._scale = range_m / MAX_RANGE_M
+        self._scale = _scale(range_m)
         self._map: Any = small_gicp.GaussianVoxelMap(self._scale * _VOXEL_M)
         self._map.set_lru(horizon=_HORIZON, clear_cycle=_CLEAR_CYCLE)
         self._threads = os.cpu_count() or 1

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
-from typing import Any, cast
+from typing import cast
 
 from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
-from lidarslam.compare.peers.interface import MAX_RANGE_M, Estimator, PeerError, Sweep
+from lidarslam.compare.peers.interface import Estimator, PeerError, Sweep
 from lidarslam.compare.peers.libraries import KissSlamEstimator, RkoLioEstimator, SmallGicpEstimator
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.plugins import PlugPoint
@@ -49,24 +49,14 @@ class Peer:
             raise PeerError("needs an IMU, and the recording has none")
 
 
-def _evalio(name: str, first: Sweep, imu: ImuSamples | None, range_m: float | None) -> Estimator:
-    return EvalioEstimator(PIPELINES[name], first, imu, range_m)
-
-
-def _library(
-    make: Callable[[Any, float], Estimator], _: Sweep, imu: ImuSamples | None, range_m: float | None
-) -> Estimator:
-    return make(imu, range_m or MAX_RANGE_M)
-
-
 _ALL = (
     *(
-        Peer(name, "evalio", "evalio", partial(_evalio, name), pipeline.needs_imu, bool(pipeline.voxels_m))
-        for name, pipeline in PIPELINES.items()
+        Peer(name, "evalio", "evalio", partial(EvalioEstimator, one), one.needs_imu, bool(one.voxels_m))
+        for name, one in PIPELINES.items()
     ),
-    Peer("kiss-slam", "kiss_slam", "kiss-slam", partial(_library, KissSlamEstimator)),
-    Peer("small-gicp", "small_gicp", "small_gicp", partial(_library, SmallGicpEstimator)),
-    Peer("rko-lio", "rko_lio", "rko_lio", partial(_library, RkoLioEstimator), needs_imu=True),
+    Peer("kiss-slam", "kiss_slam", "kiss-slam", KissSlamEstimator),
+    Peer("small-gicp", "small_gicp", "small_gicp", SmallGicpEstimator),
+    Peer("rko-lio", "rko_lio", "rko_lio", RkoLioEstimator, needs_imu=True),
 )
 PEERS = {peer.name: peer for peer in _ALL}
 ALL_PEERS = PlugPoint("peer", tuple(PEERS))
