@@ -34,7 +34,8 @@ from lidarslam.run.run import execute
 
 def called():
     loops = (o for o in gc.get_objects() if isinstance(o, Dispatcher) and o.py_func.__module__.startswith("lidarslam"))
-    return {(o.py_func.__module__, o.py_func.__name__): set(o.overloads) for o in loops if hasattr(o._cache, "_cache")}
+    kept = (o for o in loops if hasattr(o._cache, "has_overloads"))
+    return {(o.py_func.__module__, o.py_func.__name__): set(o.overloads) for o in kept}
 
 main(list(PARTS))
 before = called()
