@@ -11,7 +11,7 @@ from typing import Any
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import only_writer
-from lidarslam.core.state import Saved, decode, encode
+from lidarslam.core.state import Saved, decode, encode, read_state, write_state
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.core.text import safe_name
 from lidarslam.datasets.fetched import fetch
@@ -28,7 +28,6 @@ from lidarslam.run.results import TrackedScans
 from lidarslam.run.run import NoScanError, Progress, RunSession, open_odometry, track
 from lidarslam.storage.directory import RunDirectory, files_in
 from lidarslam.storage.finished_run import read_summary
-from lidarslam.storage.state_file import read_state, write_state
 from lidarslam.storage.unfinished import About, CheckpointFiles, Unfinished
 
 # The names that `open_parts` gives to directories; other directories in a summary must not be removed.
@@ -88,7 +87,7 @@ def earlier_parts(out: Path) -> set[str]:
 
 def read_part(saved: Saved) -> TrackedScans:
     """The recording of a file; InputError where it is damaged."""
-    part: TrackedScans = decode(TrackedScans, saved.value("part"), saved)
+    part: TrackedScans = decode(TrackedScans, saved.value("part"))
     return part
 
 
@@ -134,7 +133,6 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
         interruptions = stack.enter_context(Interruptions())
         recording = open_recording(task.request.source, task.request.config.reader)
         files = CheckpointFiles(out)
-        files.require_own()
         files.make_folder()
         stack.enter_context(only_writer(files.folder, _PATIENCE_S))
         description = describe_computed(task.request, recording) | task.merge
@@ -156,7 +154,7 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
             return PartDone(0, missing, error.interrupted)
         interruptions.protect_results()
         graph.end_recording()
-        write_state(files.tracked, {"part": encode(TrackedScans, scans), "graph": graph.state()})
+        write_state(files.tracked, {"part": encode(scans), "graph": graph.state()})
         if not scans.interrupted:
             for path in (files.state, files.tiles):  # the state is not resumed any more
                 path.unlink(missing_ok=True)

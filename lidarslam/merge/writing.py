@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidarslam.config.settings import dump_yaml
-from lidarslam.core.state import Saved
+from lidarslam.core.state import Saved, read_state
 from lidarslam.core.text import count, joined
 from lidarslam.datasets.published.evalio import resolved
 from lidarslam.datasets.recording import Recording
@@ -21,7 +21,6 @@ from lidarslam.run.summary import GraphSummary, WrittenMap, graph_and_map_json, 
 from lidarslam.run.summary_text import format_map
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.state_file import read_state
 from lidarslam.storage.unfinished import CheckpointFiles
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
@@ -30,7 +29,7 @@ if TYPE_CHECKING:  # GTSAM takes a while to load
 
 @dataclass(frozen=True)
 class MergedRecording:
-    """One recording of a merge."""
+    """One recording of a merge, as in summary.json."""
 
     name: str  # of the recording
     directory: str | None  # of its run, next to the common map; None when no scan could be used
@@ -60,13 +59,9 @@ class MergeSummary:
 
     def to_json(self) -> dict[str, Any]:
         """The content of summary.json."""
-        return {
-            "recordings": [vars(recording) for recording in self.recordings],
-            "elapsed_s": self.elapsed_s,
-            "peak_rss_mb": self.peak_rss_mb,
-            "lost_scans": self.lost_scans,
-            **graph_and_map_json(self.graph, self.map, self.warnings),
-        }
+        own = {name: getattr(self, name) for name in ("elapsed_s", "peak_rss_mb", "lost_scans")}
+        recordings = [vars(recording) for recording in self.recordings]
+        return {"recordings": recordings} | own | graph_and_map_json(self.graph, self.map, self.warnings)
 
 
 # In the summary of a run; that of the merge says how to correct it.

@@ -2,11 +2,8 @@
 
 from pathlib import Path
 
-from pydantic import TypeAdapter
-from typing_extensions import TypedDict
-
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.json_text import read_json
+from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.text import require_name
 from lidarslam.storage.directory import TRAJECTORY_TUM
 
@@ -15,24 +12,6 @@ COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.m
 # Next to the recordings' folders: recordings that a benchmark has made.
 RECORDINGS = "recordings"
 RESERVED = frozenset({COMPARISON, REPORT_HTML, REPORT_MD, RECORDINGS})
-
-
-class _Sequence(TypedDict):
-    sequence: str
-
-
-class _Method(TypedDict):
-    run: str | None
-
-
-class _Comparison(TypedDict, total=False):
-    """The content that is read back: of one recording, or of several."""
-
-    methods: dict[str, _Method]
-    sequences: list[_Sequence] | None
-
-
-_SHAPE = TypeAdapter(_Comparison)
 
 
 def run_directories(path: Path) -> list[Path]:
@@ -44,7 +23,7 @@ def run_directories(path: Path) -> list[Path]:
     if not file.is_file() or (path / TRAJECTORY_TUM).is_file():
         return [path]
     try:
-        content = read_json(file, _SHAPE)
+        content = read_json(file, ANY_OBJECT)
         sequences = content.get("sequences")
         if sequences is not None:
             names = ", ".join(str(path / sequence["sequence"]) for sequence in sequences)
@@ -52,7 +31,7 @@ def run_directories(path: Path) -> list[Path]:
         places = [method["run"] for method in content["methods"].values() if method["run"]]
         # A recording's name and a method's: a comparison names no runs elsewhere.
         runs = [Path(*(require_name(part, "run") for part in place.split("/"))) for place in places]
-    except (OSError, ValueError, KeyError, ConfigError) as error:
+    except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
         raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
     if not runs:
         raise InputError(f"{path}: none of its methods came to a result")

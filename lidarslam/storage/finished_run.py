@@ -5,16 +5,14 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, with_config
-from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.json_text import read_json
+from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
@@ -34,20 +32,12 @@ def not_a_run(path: Path) -> str:
     """Why nothing can be read from a path that should be a run directory."""
     if not path.exists():
         return absent(path)
-    if path.is_file():
-        if path.name in files.FILES and (path.parent / files.TRAJECTORY_TUM).is_file():
-            return f"{path}: is a file of the run {path.parent}; name the directory"
-        what = "is a file, expected a run directory"
-    else:
-        for pattern in _PATTERNS:
-            if found := sorted(str(file.parent) for file in path.glob(pattern)):
-                more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
-                return f"{path}: is no run, but holds some; name them: {', '.join(found[:_LISTED])}{more}"
-        what = f"not a run directory (no {files.TRAJECTORY_TUM})"
     with suppress(InputError):
         choose_reader(path)
-        return f"{path}: is a recording, {what}; make one with lidarslam run {path} --out RUN"
-    return f"{path}: {what}; lidarslam run makes one from a recording"
+        return f"{path}: is a recording, not a run directory; make one with lidarslam run {path} --out RUN"
+    runs = sorted(str(file.parent) for pattern in _PATTERNS for file in path.glob(pattern))
+    hint = f"it holds the runs {', '.join(runs[:_LISTED])}" if runs else "lidarslam run makes one from a recording"
+    return f"{path}: is not a run directory (no {files.TRAJECTORY_TUM}); {hint}"
 
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
@@ -194,54 +184,6 @@ def read_scans(path: Path, poses: int) -> ScanTable:
     return ScanTable(file, rows, statuses)
 
 
-class _Stretch(TypedDict):
-    first: NonNegativeInt
-    last: NonNegativeInt
-
-
-class _LostStretch(_Stretch):
-    reason: str
-
-
-class _Loop(TypedDict):
-    first_scan: int
-    second_scan: int
-    accepted: bool
-
-
-class _PoseGraph(TypedDict):
-    loops: list[_Loop]
-
-
-class _Localisation(TypedDict):
-    map: str
-
-
-class _Recording(TypedDict):
-    directory: str | None
-
-
-@with_config(ConfigDict(extra="allow"))  # at all depths
-class _Summary(TypedDict, total=False):
-    """The content that is read back, of any version; other keys are kept as they are."""
-
-    scans: NonNegativeInt
-    lost_scans: NonNegativeInt
-    lost: list[_LostStretch]
-    map_contradictions: list[_Stretch]
-    length_m: float
-    unconstrained_m: float
-    map_voxel_size_m: Annotated[float, Field(gt=0.0)] | None
-    map_entropy: float | None
-    ms_per_scan: dict[str, dict[str, float | None]]
-    pose_graph: _PoseGraph | None
-    localisation: _Localisation | None
-    recordings: list[_Recording]
-    warnings: list[str]
-
-
-_SHAPE = TypeAdapter(_Summary)
-
 # Share of the path, of a metre at least, that may be unconstrained.
 _MOST_UNCONSTRAINED, _SHORTEST_M = 0.1, 1.0
 
@@ -257,6 +199,6 @@ def read_summary(path: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        return cast(dict[str, Any], read_json(file, _SHAPE))
+        return read_json(file, ANY_OBJECT)
     except (OSError, ValueError) as error:
         raise InputError(f"{file}: not a run's summary ({error}); make the run again") from error

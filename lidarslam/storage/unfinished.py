@@ -14,9 +14,8 @@ from pydantic import TypeAdapter
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
 from lidarslam.core.json_text import read_json
-from lidarslam.core.state import Saved
+from lidarslam.core.state import Saved, read_state
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, describes_run, remove_files
-from lidarslam.storage.state_file import read_state
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +39,7 @@ class About:
         """Of the run in a directory; None where none is unfinished; InputError where the file is damaged."""
         path = run / ABOUT
         try:
-            return read_json(path, _SHAPE, any_path=True)
+            return read_json(path, _SHAPE)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError) as error:
@@ -117,11 +116,6 @@ class CheckpointFiles:
         self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"  # of graph and global map
         self.tracked = self.folder / "tracked.npz"  # a recording of a merge that was tracked
 
-    def require_own(self) -> None:
-        """Before anything is resumed from them, or locked; InputError where their folder is a link."""
-        if self.folder.is_symlink():
-            raise InputError(f"{self.folder}: is a link to another place; begin again with --overwrite")
-
     def make_folder(self) -> None:
         """Make the folder, unless it exists; a link there is replaced; OutputError where it cannot be made."""
         try:
@@ -178,7 +172,6 @@ class Unfinished:
         run = directory.path
         about = About(description)
         if resume:
-            CheckpointFiles(run).require_own()
             if (begun := About.read(run)) is None:
                 raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
             _require_same(run, begun.description, description)

@@ -229,6 +229,7 @@ def test_links_are_replaced_and_never_written_through(
         if name != "config.yaml":
             (finished_run / name).symlink_to(outside / name)
     (finished_run / "config.yaml").write_text("run:\n")
+    (finished_run / "unfinished").symlink_to(outside)
     for name in FILES:
         (finished_run / f".partial-{os.getpid()}-{name}").symlink_to(outside / name)
     succeeds("run", small_recording, "--out", finished_run, *FAST, "--rerun", "save", "--pcd", "--overwrite")

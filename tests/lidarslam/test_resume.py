@@ -396,19 +396,6 @@ def test_another_recording_is_not_taken_for_it(expected: Whole, source: Path, ki
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["state.npz", "run.json"])
-def test_damage_is_told_in_one_line(expected: Whole, killed: Path, name: str) -> None:
-    path = killed / "unfinished" / name
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    ended = expected.again(killed, "--resume")
-    assert_refused(ended, f"{name}: is damaged")
-    assert "--overwrite" in ended.said
-    expected.assert_finishes(killed, "--overwrite")
-
-
-@pytest.mark.long
 def test_a_run_killed_before_its_first_state_begins_again(expected: Whole, tmp_path: Path) -> None:
     out, event = tmp_path / "run", 1
     while not (out / "unfinished" / "run.json").exists():
