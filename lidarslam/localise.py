@@ -128,7 +128,7 @@ def execute(
         phase("searching for the place")
         tracked = track(session, recording, chosen, progress, mapper=localiser)
         session.end_scans()
-        session.close_viewer()
+        session.shown.close()
         return _write(request, session, tracked, localiser)
 
 

@@ -11,8 +11,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import corrected, transform_of
 
-# Three rows of more columns than any point has are the coordinates of many points.
-_TRANSPOSED, _MOST_COLUMNS = 3, 32
+# More columns than any point has are many points.
+_MOST_COLUMNS = 32
 # No sweep lasts longer, and no clock reading is smaller.
 _LONGEST_OFFSET_S = 10.0
 # Of a cloud as KITTI stores it: x, y, z, intensity.
@@ -39,10 +39,8 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, co
     table = _numbers("points", getattr(points, "points", points))
     if not table.size:
         table = np.empty((0, 3))
-    if table.ndim != 2 or table.shape[1] < 3:
-        raise InputError(f"points must be (N, 3) or (N, 3 and more), x, y, z first; got the shape {table.shape}")
-    if len(table) == _TRANSPOSED and table.shape[1] > _MOST_COLUMNS:
-        raise InputError(f"points must be (N, 3), got the shape {table.shape}; give points.T")
+    if table.ndim != 2 or not 3 <= table.shape[1] <= _MOST_COLUMNS:
+        raise InputError(f"points must be (N, 3), x, y, z first, got the shape {table.shape}; give points.T of (3, N)")
     times = None if point_times is None else _times(point_times, len(table))
     intensities = np.array(table[:, 3]) if table.shape[1] == _WITH_INTENSITY else None
     scan = Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times, intensities=intensities)
@@ -59,19 +57,14 @@ def make_vector(name: str, numbers: ArrayLike) -> FloatArray:
 
 def check_stamp(stamp: float, last: float | None) -> float:
     """The stamp in seconds; InputError where it is no number of seconds, or not after the last one."""
-    try:
-        seconds = float(stamp)
-    except (TypeError, ValueError):
-        raise InputError(f"stamp must be a number of seconds, got {stamp!r}") from None
-    if not np.isfinite(seconds):
-        raise InputError(f"stamp must be a finite number of seconds, got {seconds}")
-    if abs(seconds) > _LATEST_STAMP_S:
-        raise InputError(f"stamp must be in seconds, got {seconds:.6g}; multiply nanoseconds by 1e-9")
+    seconds = _numbers("stamp", stamp)
+    if seconds.shape or not abs(seconds) <= _LATEST_STAMP_S:
+        raise InputError(f"stamp must be a finite number of seconds, got {stamp!r}; multiply nanoseconds by 1e-9")
     if last is not None and seconds <= last:
         raise InputError(
-            f"stamps must increase: {seconds:.9f} s is not after the scan before, {last:.9f} s; leave this scan out"
+            f"stamps must increase: {seconds:.9f} s is not after the scan before, {last:.9f} s; leave it out"
         )
-    return seconds
+    return float(seconds)
 
 
 def check_sweep(scan: Scan, interval_s: float) -> None:
@@ -87,10 +80,9 @@ def check_sweep(scan: Scan, interval_s: float) -> None:
 
 
 def _times(point_times: ArrayLike, count: int) -> FloatArray:
-    times = _numbers("point_times", point_times).reshape(-1)
-    if len(times) != count:
-        raise InputError(f"point_times must have one entry a point, got {len(times)} for {count} points")
-    seconds = np.array(times, dtype=np.float64)
+    seconds = np.array(_numbers("point_times", point_times).reshape(-1), dtype=np.float64)
+    if len(seconds) != count:
+        raise InputError(f"point_times must have one entry a point, got {len(seconds)} for {count} points")
     largest = float(np.abs(seconds[np.isfinite(seconds)]).max(initial=0.0))
     if largest > _LONGEST_OFFSET_S:
         raise InputError(
@@ -105,10 +97,7 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise InputError(f"{name} must be an array of numbers: {error}") from None
-    if array.dtype.names is not None:
-        fields = ", ".join(array.dtype.names)
-        raise InputError(f"{name} must be an array of numbers, got the fields {fields}; stack their columns")
+        raise InputError(f"{name} must be numbers: {error}") from None
     if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} must be an array of numbers, got {array.dtype}")
+        raise InputError(f"{name} must be numbers, got {array.dtype}")
     return array

@@ -32,7 +32,7 @@ from lidarslam.pipeline.pipeline import Pipeline, map_error
 from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.loop_closing import GraphOutcome, begin_graph, correct
 from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
-from lidarslam.run.run import draw_report, open_odometry, require_no_trajectory
+from lidarslam.run.run import draw_report, open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 
@@ -68,7 +68,6 @@ class Slam:
 
     def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
         self._config = make_config(config)
-        require_no_trajectory(self._config)
         with CompileAhead(parts_of(self._config)) as compiling:
             self._odometry = open_odometry(self._config, None)
             compiling.wait(logger.info)

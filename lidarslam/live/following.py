@@ -34,10 +34,9 @@ ODOMETRY_TOPIC, TF_TOPIC, TF_STATIC_TOPIC = "/lidarslam/odometry", "/tf", "/tf_s
 _POLL_S, _SHOWN_EVERY_S = 0.2, 1.0
 # Number of reports without a message after which the silence is reported.
 _SILENT = 5
-_SILENCE = "no scan came for some seconds; waiting on, Ctrl-C ends the run and writes its results"
-_NOTHING = (
-    "the topic is published, but nothing comes; waiting on. Publisher and this program may see each other without being"
-    " able to reach each other (firewall, container, network interface), or the publisher is idle"
+_SILENCE = (
+    "no scan came for some seconds; Ctrl-C ends the run; the publisher is idle, or cannot reach this program"
+    " (firewall, container, network interface)"
 )
 # A static transform is sent again to later subscribers; discovery of its publisher takes a while.
 _STATIC_WITHIN_S = 5.0
@@ -89,7 +88,7 @@ class Follower:
         self._silent = self._silent + 1 if counts.received == self._received else 0
         self._received = counts.received
         if self._silent == _SILENT:
-            logger.warning(_SILENCE if counts.received else _NOTHING)
+            logger.warning(_SILENCE)
 
     def on_arrival(self, message: Arrived) -> None:
         """Count a message."""

@@ -26,7 +26,7 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.request import LiveRequest, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans
-from lidarslam.run.run import open_odometry, open_session, require_no_trajectory
+from lidarslam.run.run import open_odometry, open_session
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.viewer.web_page import WebPage
 
@@ -55,7 +55,6 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     node = _open_node(request.domain)
     request = replace(request, config=bounded(request.config))
     config, faults = request.config, Faults()
-    require_no_trajectory(config)
     with open_session(request, show) as session:
         log = session.log
         session.begin_graph()

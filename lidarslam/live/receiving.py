@@ -63,7 +63,10 @@ def find_topic(published: Published, wanted: str | None, domain: int, within_s: 
             if len(clouds) > 1:
                 raise InputError(f"clouds are published on {_names(clouds)}; choose one with --topic")
             return clouds[0]
-        seen = f"waiting for {wanted or 'clouds'} in domain {domain}; {_what_is_seen(clouds, len(topics))}"
+        seen = (
+            f"waiting for {wanted or 'clouds'} in domain {domain}; {len(topics)} topics are seen, clouds on"
+            f" {_names(clouds) or 'none: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)'}"
+        )
         if waited_s > _PATIENCE_S and not is_told:
             logger.warning(seen)
             is_told = True
@@ -74,14 +77,6 @@ def find_topic(published: Published, wanted: str | None, domain: int, within_s: 
 
 def _names(topics: Iterable[PublishedTopic]) -> str:
     return ", ".join(topic.name for topic in topics)
-
-
-def _what_is_seen(clouds: Iterable[PublishedTopic], topics: int) -> str:
-    if names := _names(clouds):
-        return f"clouds are published on {names}"
-    if topics:
-        return f"{topics} topics are published, none of them with clouds"
-    return "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
 
 
 @dataclass(frozen=True)

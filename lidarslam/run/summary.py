@@ -69,14 +69,9 @@ class WrittenMap:
 
     def to_json(self) -> dict[str, Any]:
         """Its keys of summary.json."""
-        return {
-            "map_points": self.points,
-            "map_voxel_size_m": self.voxel_size_m,
-            "map_points_moved": self.moved,
-            "map_entropy": self.entropy,
-            "map_fields": list(self.fields),
-            "map_tiles": None if self.tiled is None else self.tiled.to_json(),
-        }
+        named = {f"map_{name}": getattr(self, name) for name in ("points", "voxel_size_m", "entropy")}
+        tiles = None if self.tiled is None else self.tiled.to_json()
+        return named | {"map_points_moved": self.moved, "map_fields": list(self.fields), "map_tiles": tiles}
 
 
 @dataclass(frozen=True)

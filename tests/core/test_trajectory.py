@@ -172,14 +172,18 @@ def test_tum_dialects(text, written):
 @pytest.mark.parametrize(
     ("read", "text", "words"),
     [
-        (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got 7"),
-        (read_tum, "# header\n1 0 0 0 zero 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got '1 0 0 0 zero 0 0 1'"),
+        (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got 7 words"),
+        (
+            read_tum,
+            "# header\n1 0 0 0 zero 0 0 1\n",
+            r"poses\.txt:2: expected 8 numbers, got 8 words, .1 0 0 0 zero",
+        ),
         (read_tum, "1 0 0 0 0 0 0 nan\n", r"poses\.txt.*no poses"),
         (read_tum, "1 0 0 0 0 0 0 0\n", r"poses\.txt.*no poses"),
         (read_tum, "1 0 0 0 90 0 45 1\n", r"poses\.txt.*no poses"),
         (read_tum, "# only a header\n", r"poses\.txt: holds no pose; expected"),
         (read_tum, b"\xff\xfe\x00\x01", r"poses\.txt: cannot be read as text"),
-        (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt:1: expected 12 numbers, got 11"),
+        (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt:1: expected 12 numbers, got 11 words"),
         (read_kitti_poses, "2 0 0 0 0 2 0 0 0 0 2 0\n", r"poses\.txt.*no poses"),
         (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 -1 0\n", r"poses\.txt.*no poses"),
         (read_kitti_poses, "", r"poses\.txt: holds no pose; expected twelve"),

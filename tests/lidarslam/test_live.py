@@ -303,7 +303,7 @@ def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatc
 
 
 def test_it_waits_no_longer_than_it_is_told() -> None:
-    with pytest.raises(InputError, match=r"0.3 s are over, waiting for /points in domain 3; no ROS 2 topic"):
+    with pytest.raises(InputError, match=r"0.3 s are over, waiting for /points in domain 3; 0 topics are seen"):
         find_topic(lambda: [], "/points", 3, 0.3)
 
 

@@ -205,8 +205,8 @@ POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (60, 3))
     [
         (np.zeros((5, 2)), None, 0.2, r"must be \(N, 3\).* \(5, 2\)"),
         (POINTS.T, None, 0.2, r"\(3, 60\); give points\.T"),
-        (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "got the fields x, y"),
-        (np.array([["a", "b", "c"]]), None, 0.2, "array of numbers"),
+        (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "points must be numbers"),
+        (np.array([["a", "b", "c"]]), None, 0.2, "must be numbers"),
         (POINTS, np.zeros(7), 0.2, "7 for 60 points"),
         (POINTS, np.full(60, 1.7e9), 2.0, "subtract the stamp"),
         (POINTS, np.linspace(0, 1e8, 60), 2.0, "nanoseconds by 1e-9"),
@@ -215,7 +215,7 @@ POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (60, 3))
         (POINTS, None, None, "with every scan or with none"),
         (POINTS, None, float("nan"), "finite"),
         (POINTS, None, 1_700_000_000_000_000_000, "nanoseconds by 1e-9"),
-        (POINTS, None, "now", "a number of seconds"),
+        (POINTS, None, "now", "stamp must be numbers"),
         (Scan(POINTS, 0.2), None, 0.2, "give it alone"),
     ],
 )
