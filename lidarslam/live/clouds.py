@@ -63,9 +63,10 @@ class CloudDecoder:
             stamp_ns = self._stamp_ns(header_ns, published_ns)
             if not self._is_wanted(stamp_ns, published_ns, frame_id):
                 return None
-            cloud = self._decode(BagMessage(published_ns, header_ns, frame_id, self._type, raw))
-        except (InputError, ValueError) as error:
-            self._faults.unreadable(InputError(str(error)))
+            message = BagMessage(published_ns, header_ns, frame_id, self._type, raw)
+            cloud = decode(message, True, self._config.time_field)
+        except Exception as error:  # of a message that breaks off: an assertion, struct.error, IndexError
+            self._faults.unreadable(InputError(str(error) or type(error).__name__))
             return None
         stamp = stamp_ns / 10**9
         self._learn(cloud, stamp)
@@ -104,15 +105,6 @@ class CloudDecoder:
         if stamp_ns - published_ns < _AHEAD_NS:
             return True
         return before is not None and 0 < stamp_ns - before[0] < published_ns - before[1] + _AHEAD_NS
-
-    def _decode(self, message: BagMessage) -> RawCloud:
-        """Decode the points; InputError where the message is damaged or lacks a field."""
-        try:
-            return decode(message, True, self._config.time_field)
-        except InputError:
-            raise
-        except Exception as error:  # of a message that breaks off: an assertion, struct.error, IndexError
-            raise InputError(f"a message cannot be decoded ({error or type(error).__name__})") from error
 
     def _learn(self, cloud: RawCloud, stamp: float) -> None:
         """Infer unit and reference of the time field, until they are clear."""

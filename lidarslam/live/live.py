@@ -14,9 +14,11 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
+from lidarslam.datasets.ros.bag_imu import IMU_TYPE
+from lidarslam.datasets.ros.bag_message import CLOUD_TYPES
 from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.following import Follower
-from lidarslam.live.receiving import IMU_DEPTH, ImuReceiver, IncomingQueue, find_imu, find_topic
+from lidarslam.live.receiving import IMU_DEPTH, IMU_WITHIN_S, ImuReceiver, IncomingQueue, find_topic
 from lidarslam.live.statistics import LiveCounts
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.pipeline.compile_ahead import made_up_scans
@@ -62,7 +64,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
         show("warming up")
         _warm_up(config)
         show("waiting for clouds")
-        topic = find_topic(node.published, request.topic, request.domain, request.duration_s)
+        topic = find_topic(node.published, request.topic, CLOUD_TYPES, "--topic", request.duration_s)
         imu = _receive_imu(config, node, log)
         show(f"{topic.name}: waiting for the first scan")
         session.show(topic.name, page)
@@ -124,12 +126,12 @@ def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> ImuReceiver |
     stream = make_imu_stream(config, log.warn)
     if stream is None:
         return None
-    topic = find_imu(node.published, config.reader.imu_topic)
+    option = "--set reader.imu_topic=NAME"
+    topic = find_topic(node.published, config.reader.imu_topic, (IMU_TYPE,), option, IMU_WITHIN_S)
     return ImuReceiver(node.subscribe(topic, depth=IMU_DEPTH).take, stream)
 
 
 def _open_node(domain: int) -> "DdsNode":
-    """The participant in the domain; ConfigError where the extra is not installed."""
     try:
         from lidarslam.live.dds import open_node
     except ModuleNotFoundError as error:
