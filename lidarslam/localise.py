@@ -43,8 +43,7 @@ class LocaliseRequest:
 
     def describe(self) -> dict[str, Any]:
         """For config.yaml."""
-        guess = None if self.guess is None else list(self.guess)
-        return describe_run(self.run) | {"map": str(self.map.resolve()), "guess": guess}
+        return describe_run(self.run) | {"map": str(self.map.resolve()), "guess": self.guess and list(self.guess)}
 
 
 def read_map(request: LocaliseRequest) -> tuple[PointCloud, FixedMap]:
@@ -124,7 +123,7 @@ def execute(
         shown = session.viewer
         shown.show_final_map(cloud.points)
         session.viewer = PlacedViewer(shown)
-        session.wait_for_loops(for_first_scan=True)
+        session.wait_for_loops()
         phase("searching for the place")
         tracked = track(session, recording, chosen, progress, mapper=localiser)
         session.end_scans()
@@ -154,7 +153,6 @@ def _write(
 
 
 def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
-    """Update earlier scans by the results of later ones."""
     scans = range(len(log))
     poses = log.trajectory.T_world_lidar.copy()
     for number, T_map_lidar in localiser.corrections.items():

@@ -93,7 +93,6 @@ def _times(point_times: ArrayLike, count: int) -> FloatArray:
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[Any]:
-    """An array of real numbers; InputError where it is none."""
     try:
         array = np.asarray(values)
     except ValueError as error:

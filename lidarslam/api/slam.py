@@ -111,8 +111,12 @@ class Slam:
             scan = self._take(points, point_times, stamp)
             if self._imu is not None:
                 scan = self._imu.take_up(scan)
-            with self._failing(), self._blas.limit(limits=1, user_api="blas"):
-                estimate = self._pipeline.register(scan, started, self._log.add)
+            try:
+                with self._blas.limit(limits=1, user_api="blas"):
+                    estimate = self._pipeline.register(scan, started, self._log.add)
+            except BaseException as error:  # also Ctrl-C leaves the stages in different states
+                self._failure = error
+                raise
             return replace(
                 estimate,
                 T_world_lidar=_read_only(estimate.T_world_lidar),
@@ -214,7 +218,6 @@ class Slam:
         self.close()
 
     def _take(self, points: ArrayLike | Scan, point_times: ArrayLike | None, stamp: float | None) -> Scan:
-        """The next scan, once it is checked."""
         if isinstance(points, Scan):
             if point_times is not None or stamp is not None:
                 raise InputError("a Scan has times and a stamp of its own; give it alone")
@@ -243,7 +246,6 @@ class Slam:
         return self._graph is not None and len(self._graph.scan_poses) == len(self._log)
 
     def _settle(self) -> None:
-        """Wait for the background, and add the last scan to the map."""
         try:
             self._pipeline.settle()
         except Exception as error:
@@ -260,15 +262,6 @@ class Slam:
     def _require_open(self) -> None:
         if self._closed:
             raise LidarSlamError("this Slam is closed; call trajectory(), map() and save() before close()")
-
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        """An error or Ctrl-C in the middle of a scan leaves the stages in different states."""
-        try:
-            yield
-        except BaseException as error:
-            self._failure = error
-            raise
 
     def _require_working(self) -> None:
         if self._failure is not None:

@@ -158,7 +158,6 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
 
 
 def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> None:
-    """Put a value into the tree; a section is merged into the existing one."""
     *sections, last = dotted.split(".")
     for key in sections:
         branch = tree.setdefault(key, {})
@@ -191,14 +190,16 @@ def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str
 def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     location = [str(part) for part in fault["loc"]]
     key = ".".join(location)
+    depth, section, field = _field_at(location, model)
     if fault["type"] == "extra_forbidden":
-        return f"there is no {key}{_suggest(location, model)}"
+        close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(section.model_fields)}"
+        return f"there is no {key}; {hint}"
     if fault["type"] == "model_type":
         return f"{key}={_short(fault['input'])}: expected a section"
     if fault["type"] == "value_error":
         # Keys that contradict each other: the input would be their whole section, the validator names the two.
         return f"{key}: {fault['ctx']['error']}"
-    depth, field = _field_at(location, model)
     bounds = None if field is None else bounds_text(field)
     if bounds is None:
         return f"{key}={_short(fault['input'])}: {fault['msg'].lower()}"
@@ -206,19 +207,18 @@ def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     return f"{'.'.join(location[:depth])}={_short(fault['input'])}: {expected}"
 
 
-def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, FieldInfo | None]:
-    """The setting at a place, None of a section, and the number of keys to it: a kind or an index may follow."""
+def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, type[BaseModel], FieldInfo | None]:
+    """The number of keys to the setting at a place, which a kind or an index may follow; its section; and itself."""
     section, field = model, None
     for depth, key in enumerate(location):
         if key not in section.model_fields:
-            return depth, field
+            return depth, section, field
         field = section.model_fields[key]
         section = _section_of(field) or BaseModel
-    return len(location), field
+    return len(location), section, field
 
 
 def _section_of(field: FieldInfo) -> type[BaseModel] | None:
-    """The type of a section, which may be null; None of a value."""
     kinds = (field.annotation, *get_args(field.annotation))
     return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
 
@@ -226,11 +226,3 @@ def _section_of(field: FieldInfo) -> type[BaseModel] | None:
 def _short(value: object) -> str:
     """A value as one would write it, its beginning if it is long: aliases of YAML can make it endless."""
     return _SHORT.repr(value)
-
-
-def _suggest(location: Sequence[str], model: type[BaseModel]) -> str:
-    section = model
-    for key in location[:-1]:
-        section = _section_of(section.model_fields[key]) or BaseModel
-    close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
-    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(section.model_fields)}"

@@ -153,7 +153,6 @@ def only_writer(directory: Path, patience_s: float = 0.0) -> Iterator[None]:
 
 
 def _is_locked(descriptor: int) -> bool:
-    """Lock a directory; whether it is ours, or cannot be locked."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

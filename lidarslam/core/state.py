@@ -163,7 +163,6 @@ def decode(kind: Any, tree: Any) -> Any:
 
 
 def _made(kind: Any, tree: Any) -> Any:
-    """An object of a class."""
     if hasattr(kind, "restore"):
         if inspect.isabstract(kind):  # the subclass with these attributes
             kind = next(one for one in kind.__subclasses__() if set(_hints(one)) == set(tree))
@@ -205,7 +204,6 @@ def _list(kind: Any, tree: Any) -> list[Any]:
 
 
 def _hints(kind: Any) -> dict[str, Any]:
-    """Names and types of the saved attributes of a class, in the order of their declaration."""
     hints = typing.get_type_hints(kind, include_extras=True)
     if dataclasses.is_dataclass(kind):
         return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
@@ -219,7 +217,6 @@ def _bare(kind: Any) -> tuple[Any, Shape | None]:
 
 
 def _optional(kind: Any) -> Any:
-    """T of `T | None`; None for another type."""
     is_union = typing.get_origin(kind) in (typing.Union, types.UnionType)
     return next(one for one in typing.get_args(kind) if one is not types.NoneType) if is_union else None
 

@@ -86,9 +86,8 @@ def earlier_parts(out: Path) -> set[str]:
 
 
 def read_part(saved: Saved) -> TrackedScans:
-    """The recording of a file; InputError where it is damaged."""
-    part: TrackedScans = decode(TrackedScans, saved.value("part"))
-    return part
+    """The recording of a file."""
+    return decode(TrackedScans, saved.value("part"))  # type: ignore[no-any-return]
 
 
 # A process whose node was lost may run for some more seconds.

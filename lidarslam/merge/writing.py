@@ -128,12 +128,8 @@ def write_merge(
     written, beyond = WrittenMap(0, voxel_size_m, 0), None
     if result is not None and common is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(common.keyframe_poses, common.edges))
-        views = PlacedViews.join(
-            [
-                read_part(parts[index].saved()).views.placed(result.scan_poses(index)[: parts[index].scans])
-                for index in joined
-            ]
-        )
+        tracked = ((index, read_part(parts[index].saved())) for index in joined)
+        views = PlacedViews.join([one.views.placed(result.scan_poses(n)[: len(one.log)]) for n, one in tracked])
         drawn = draw(common.global_map, views, request.config.global_map, directory)
         if drawn.failure is not None:
             raise drawn.failure

@@ -44,7 +44,6 @@ def _commit(folder: Path) -> str | None:
 
 
 def _processor() -> str:
-    """Its name, which the standard library lacks on Linux."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
             key, _, value = line.partition(":")

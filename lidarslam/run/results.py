@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_own_folder
@@ -183,16 +185,12 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFor
 
 
 def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:
-    """Write final poses and odometry, and metrics.json where there is ground truth."""
     log, recording, truth = tracked.scans.log, tracked.recording, tracked.truth
     trajectory = log.trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
-    T_cam_lidar = unless_damaged(
-        lambda: None if recording is None else recording.T_cam_lidar,
-        log,
-        f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame",
-    )
+    consequence = f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame"
+    T_cam_lidar = unless_damaged(lambda: None if recording is None else recording.T_cam_lidar, log, consequence)
     poses = trajectory.T_world_lidar
     if T_cam_lidar is not None:  # the devkit compares camera poses
         poses = T_cam_lidar @ poses @ inverse(T_cam_lidar)
@@ -231,13 +229,8 @@ class TileWriter:
             for entry in self._entries.values():  # to free the space for the other results
                 (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)
             return
-        self._entries[tile] = {
-            "file": name,
-            "tile": list(tile),
-            "points": len(cloud),
-            "min": cloud.points.min(axis=0).round(4).tolist(),
-            "max": cloud.points.max(axis=0).round(4).tolist(),
-        }
+        low, high = (bound(cloud.points, axis=0).round(4).tolist() for bound in (np.min, np.max))
+        self._entries[tile] = {"file": name, "tile": list(tile), "points": len(cloud), "min": low, "max": high}
 
     def finish(self, tiled: TiledMap) -> None:
         """Write the index; OutputError where it could not be written."""

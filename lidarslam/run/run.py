@@ -102,7 +102,7 @@ def execute(
         if request.config.mapping.budget_ms is not None:
             session.log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
         session.show(recording.name, page)
-        session.wait_for_loops(for_first_scan=True)
+        session.wait_for_loops()
         session.request, recording = with_elevations(request, recording, chosen, phase)
         phase("reading the first scans")
         tracked = track(session, recording, chosen, progress, session.graph)
@@ -123,7 +123,6 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
 
 
 def _require_given(given: GivenLoops, scans: int) -> None:
-    """Refuse a loop closure, given or forbidden, of scans that a run lacks."""
     for option, pairs in (("--loop", given.closed), ("--no-loop", given.forbidden)):
         for first, second in pairs:
             if second >= scans:
@@ -183,15 +182,14 @@ class RunSession(Generic[R]):
         if built.global_map is not None and self.viewer.wants_map(index):
             self.viewer.show_map(built.global_map.points())
 
-    def wait_for_loops(self, for_first_scan: bool = False) -> None:
-        """Wait until loops are compiled: all, or those that the first scan needs."""
+    def wait_for_loops(self) -> None:
+        """Wait until loops are compiled."""
         if self.compiling is not None:
-            self.compiling.wait(self.phase, for_first_scan)
+            self.compiling.wait(self.phase)
 
     def end_scans(self) -> None:
         """From here on a request to end the run waits for the results."""
         self.interruptions.protect_results()
-        self.wait_for_loops()
         self.phase("writing the results")
 
     def finish(self, tracked: Tracked, described: dict[str, Any], gnss: "ProjectedTrack | None" = None) -> RunOutcome:

@@ -88,7 +88,6 @@ def _warn_of_earlier(run: Path) -> None:
 
 
 def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
-    """Refuse to resume a run that was begun with another description than is asked for."""
     old, new = _flat(was), _flat(asked)
     names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
     if names:
@@ -100,7 +99,6 @@ def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by their dotted names."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}

@@ -19,8 +19,6 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import read_tum
-from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.directory import FILES, RunDirectory
 
 from ..conftest import lidarslam, succeeds
@@ -126,15 +124,6 @@ def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recordi
     succeeds(*again)
     succeeds("evaluate", out, "--no-report")
     assert summary_of(out)["scans"] == 5
-
-
-def test_a_map_is_whole_or_absent(tmp_path: Path) -> None:
-    cloud = PointCloud(np.ones((1_000, 3)), np.ones((1_000, 3)))
-    for suffix in ("ply", "pcd"):
-        with files_no_longer_than(20_000), pytest.raises(OutputError, match="cannot be written there"):
-            write_cloud(tmp_path / f"map.{suffix}", cloud)
-    write_cloud(tmp_path / "map.ply", cloud)
-    assert len(read_ply(tmp_path / "map.ply")) == 1_000
 
 
 def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:

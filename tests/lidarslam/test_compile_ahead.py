@@ -106,7 +106,7 @@ def test_an_interruption_ends_the_processes() -> None:
 
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt), CompileAhead(parts_of(load_config(None, []))) as compiling:
-        compiling.wait(interrupt, for_first_scan=True)
+        compiling.wait(interrupt)
     assert compiling._running
     assert all(process.poll() is not None for process in compiling._running)
     assert time.monotonic() - started < 50.0  # they would sleep for 60 s
@@ -117,9 +117,8 @@ def test_a_process_that_fails_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(Popen, "code", "raise SystemExit(1)")
     lines: list[str] = []
     with CompileAhead(parts_of(load_config(None, []))) as compiling:
-        compiling.wait(lines.append, for_first_scan=True)
         compiling.wait(lines.append)
-    assert lines[0] == "compiling loops, once on this machine (0 of 5)"
+    assert lines[0] == "compiling loops, once on this machine (0 of 6)"
 
 
 def test_nothing_is_waited_for_once_all_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -281,9 +281,6 @@ def go_on(expected: Whole, out: Path, *more: str) -> None:
     expected.assert_same(out)
 
 
-EVERYWHERE = 24
-
-
 @pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
 @pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10), ("tiles", 5)])
 def test_a_run_may_be_killed_before_anything_it_does_on_disk(
@@ -310,22 +307,6 @@ def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
         (str(path.relative_to(folder)), hashlib.sha256(path.read_bytes()).digest() if path.is_file() else b"")
         for path in sorted(folder.rglob("*"))
     )
-
-
-@pytest.mark.slow  # a fork and two runs for every kill: a minute
-@pytest.mark.parametrize("method", METHODS)
-def test_a_run_may_be_killed_at_any_time(
-    whole: Callable[[str], Whole], tmp_path: Path, rng: np.random.Generator, method: str
-) -> None:
-    expected = whole(method)
-    for number, delay_s in enumerate(rng.uniform(0.0, 1.2 * expected.ended.seconds, EVERYWHERE)):
-        out = tmp_path / str(number)
-        ended = expected.again(out, kill_after_s=float(delay_s))
-        if ended.status == KILLED:
-            go_on(expected, out)
-        else:  # it was done before
-            assert ended.status == expected.ended.status, ended.said
-            expected.assert_same(out)
 
 
 @pytest.mark.long

@@ -66,10 +66,6 @@ def test_the_slowest_stage_is_not_that_of_the_first_scan_which_loads_loops() -> 
     assert SlowestScan.of(stage_ms[:1]) is None
 
 
-def test_percentiles_are_of_all_scans() -> None:
-    assert Milliseconds.of(np.arange(101.0)) == Milliseconds(50.0, 95.0, 99.0)
-
-
 def test_a_warning_is_kept_once_and_a_correction_leaves_the_odometry(log: ScanLog) -> None:
     assert log.warnings == ["twice"]
     log.correct(np.tile(np.eye(4), (2, 1, 1)))
