@@ -18,11 +18,10 @@ from lidarslam.mapping.localization.place_search import FixedMap
 from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest, describe_run, log_choices, require_possible
-from lidarslam.run.results import RunOutcome, Tracked
+from lidarslam.run.results import RunOutcome, Tracked, format_end, format_times
 from lidarslam.run.run import Progress, RunSession, open_session, track
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import WrittenMap, summarise
-from lidarslam.run.summary_text import format_end, format_times
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.finished_run import load_map

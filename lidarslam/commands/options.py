@@ -53,12 +53,12 @@ class ShippedFile(click.ParamType):  # type: ignore[type-arg]
 
     def __init__(self, kind: str, folder: str) -> None:
         self.name = kind
-        self._folder = folder  # a constant of `lidarslam.config.shipped`
+        self._folder = folder  # a constant of `lidarslam.config.settings`
 
     def _files(self) -> dict[str, Path]:
-        from lidarslam.config import shipped
+        from lidarslam.config import settings
 
-        return shipped.shipped_files(getattr(shipped, self._folder))
+        return settings.shipped_files(getattr(settings, self._folder))
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         shipped, path = self._files(), Path(value)

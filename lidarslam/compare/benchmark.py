@@ -19,7 +19,7 @@ from lidarslam.datasets.fetched import fetched, is_url
 from lidarslam.datasets.published.evalio import located
 from lidarslam.evaluation.comparison.quantities import TablePlan
 from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
-from lidarslam.storage.comparison_folder import RECORDINGS
+from lidarslam.storage.finished_run import RECORDINGS
 
 
 class BenchmarkMethod(Settings):

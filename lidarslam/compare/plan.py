@@ -23,7 +23,7 @@ from lidarslam.evaluation.comparison.gates import Gate
 from lidarslam.evaluation.comparison.quantities import TablePlan
 from lidarslam.run.request import RunRequest
 from lidarslam.storage import directory as files
-from lidarslam.storage.comparison_folder import COMPARISON, RESERVED
+from lidarslam.storage.finished_run import COMPARISON, RESERVED
 
 
 class Simulated(Settings):

@@ -12,8 +12,8 @@ from typing import Literal
 
 import psutil
 
-from lidarslam.core.child_processes import bound
 from lidarslam.core.files import open_own
+from lidarslam.core.tasks import bound
 
 # Between two samples of the memory; a sample costs a millisecond or two of a core.
 _PERIOD_S = 0.2

@@ -16,7 +16,7 @@ from lidarslam.evaluation.comparison.comparison import (
 )
 from lidarslam.evaluation.comparison.quantities import QUANTITIES, times_note
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
+from lidarslam.storage.finished_run import COMPARISON, REPORT_HTML, REPORT_MD
 
 _BEST = "*"
 # Columns without a value are left out.

@@ -6,6 +6,7 @@ Defaults are in the code, next to their use; a file or `--set` holds only the di
 import difflib
 import reprlib
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -15,7 +16,6 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.config.yaml_text import YamlError, bounds_text, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.settings import Settings
@@ -226,3 +226,18 @@ def _section_of(field: FieldInfo) -> type[BaseModel] | None:
 def _short(value: object) -> str:
     """A value as one would write it, its beginning if it is long: aliases of YAML can make it endless."""
     return _SHORT.repr(value)
+
+
+CONFIGS = Path(str(files("lidarslam"))) / "configs"
+BENCHMARKS = CONFIGS / "benchmarks"
+
+
+def shipped_files(folder: Path) -> dict[str, Path]:
+    """The YAML files of a folder by their names, without the suffix."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def headline(path: Path) -> str:
+    """The first line of a file, a comment that describes it."""
+    with path.open(encoding="utf-8") as lines:
+        return next(lines).removeprefix("#").strip()

@@ -1,10 +1,14 @@
-"""Independent tasks, one after another, or side by side by Ray, which is loaded where it is used, and only here."""
+"""Independent tasks, one after another or side by side by Ray, and child processes that end with this one.
+
+Ray is loaded where it is used, and only here.
+"""
 
 import contextlib
 import logging
 import os
 import signal
 import socket
+import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -244,3 +248,31 @@ def _require_answer(address: str) -> None:
     host, colon, port = address.rpartition(":")
     if colon and port.isdecimal() and "/" not in host:
         socket.create_connection((host.strip("[]"), int(port)), _ANSWER_S).close()
+
+
+# A shell waits for the end of its standard input, which the system closes with this process, and kills a group.
+_WATCH = 'read -r _; kill -s KILL -- "-$1"'
+
+
+@contextlib.contextmanager
+def bound(process: "subprocess.Popen[Any]") -> Iterator[None]:
+    """End a process and its descendants with the context, or with this process, whichever comes first.
+
+    It was started with `start_new_session=True`; descendants with a session of their own are not covered.
+    """
+    quiet = subprocess.DEVNULL
+    watch = subprocess.Popen(
+        ["/bin/sh", "-c", _WATCH, "sh", str(process.pid)],
+        stdin=subprocess.PIPE,
+        stdout=quiet,
+        stderr=quiet,
+        start_new_session=True,  # neither Ctrl-C nor a closed terminal is meant for it
+    )
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        watch.kill()
+        watch.communicate()

@@ -18,11 +18,10 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from lidarslam.config.settings import Config
-from lidarslam.core.child_processes import bound
 from lidarslam.core.compiled import is_compiled
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.scan import Scan, squared_ranges
-from lidarslam.core.tasks import usable_cores
+from lidarslam.core.tasks import bound, usable_cores
 
 _RINGS, _COLUMNS, _SWEEP_S = 16, 900, 0.1
 _HALF_ROOM_M = np.array([8.0, 6.0, 2.0])

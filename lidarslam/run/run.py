@@ -37,9 +37,8 @@ from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
+from lidarslam.run.calibration import Elevation, imu_samples, open_inertial, with_elevations
 from lidarslam.run.checkpoints import Checkpoints, describe_computed
-from lidarslam.run.elevation import Elevation, with_elevations
-from lidarslam.run.inertial import imu_samples, open_inertial
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible

@@ -18,7 +18,7 @@ from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES
-from lidarslam.run.elevation import Elevation
+from lidarslam.run.calibration import Elevation
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import SCANS_CSV
 from lidarslam.storage.finished_run import is_unconstrained

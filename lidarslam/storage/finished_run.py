@@ -1,4 +1,4 @@
-"""Runs read back from disk."""
+"""Runs and comparisons read back from disk."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.scan import PointAttributes
+from lidarslam.core.text import require_name
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
@@ -21,6 +22,7 @@ from lidarslam.datasets.point_table import coordinates, read_colours, read_inten
 from lidarslam.datasets.registry import absent, choose_reader
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
+from lidarslam.storage.directory import TRAJECTORY_TUM
 from lidarslam.storage.unfinished import require_whole
 
 _LISTED = 5
@@ -202,3 +204,35 @@ def read_summary(path: Path) -> dict[str, Any]:
         return read_json(file, ANY_OBJECT)
     except (OSError, ValueError) as error:
         raise InputError(f"{file}: not a run's summary ({error}); make the run again") from error
+
+
+# Each recording's folder holds its own comparison.json, where there are several.
+COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"
+# Next to the recordings' folders: recordings that a benchmark has made.
+RECORDINGS = "recordings"
+RESERVED = frozenset({COMPARISON, REPORT_HTML, REPORT_MD, RECORDINGS})
+
+
+def run_directories(path: Path) -> list[Path]:
+    """The run directories of a comparison of one recording, in its order; any other path itself.
+
+    InputError where the comparison is of several recordings, has no run, or its file is damaged.
+    """
+    file = path / COMPARISON
+    if not file.is_file() or (path / TRAJECTORY_TUM).is_file():
+        return [path]
+    try:
+        content = read_json(file, ANY_OBJECT)
+        sequences = content.get("sequences")
+        if sequences is not None:
+            names = ", ".join(str(path / sequence["sequence"]) for sequence in sequences)
+            raise InputError(f"{path}: compares several recordings, in worlds of their own; name one of {names}")
+        places = [method["run"] for method in content["methods"].values() if method["run"]]
+        # A recording's name and a method's: a comparison names no runs elsewhere.
+        runs = [Path(*(require_name(part, "run") for part in place.split("/"))) for place in places]
+    except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
+        raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
+    if not runs:
+        raise InputError(f"{path}: none of its methods came to a result")
+    # Next to its methods' folders, or, of one of several recordings, in the same folder as these.
+    return [path / run if (path / run).is_dir() else path.parent / run for run in runs]

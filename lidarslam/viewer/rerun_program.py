@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from lidarslam.core.child_processes import bound
 from lidarslam.core.errors import OutputError
+from lidarslam.core.tasks import bound
 from lidarslam.viewer.web_page import LOCAL, WebPage
 
 # Rerun's own default.

@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.odometry.network.exported import DESCRIPTION, read_exported
-from lidarslam.storage.comparison_folder import run_directories
+from lidarslam.storage.finished_run import run_directories
 
 from ..conftest import succeeds
 from .conftest import refused

@@ -26,9 +26,8 @@ from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import header, point_cloud
-from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.live import bounded
-from lidarslam.live.messages import PosePublisher, serialize_transform
+from lidarslam.live.messages import CloudDecoder, PosePublisher, serialize_transform
 from lidarslam.live.receiving import IncomingQueue, PublishedTopic, Received, find_topic
 from lidarslam.live.statistics import LiveStatistics, count_missing
 from lidarslam.mapping.config import MappingConfig

@@ -27,8 +27,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.merge import parts as tracking
 from lidarslam.merge.merge import merge
-from lidarslam.merge.parts import MergeRequest
-from lidarslam.merge.writing import MergeOutcome
+from lidarslam.merge.parts import MergeOutcome, MergeRequest
 from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam
