@@ -60,10 +60,10 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def written(path: Path, remedy: str = "") -> Iterator[Path]:
+def written(path: Path, remedy: str = "", durable: bool = False) -> Iterator[Path]:
     """As `replacing`; the errors of the system are for the user."""
     try:
-        with replacing(path) as partial:
+        with replacing(path, durable) as partial:
             yield partial
     except OSError as error:
         raise cannot_write(path, error, remedy) from error

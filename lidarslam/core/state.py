@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import ONE_READER, cannot_write, open_own, replacing
+from lidarslam.core.files import ONE_READER, open_own, written
 
 State = dict[str, Any]  # arrays, numbers, texts, None, lists of these, and further trees
 
@@ -230,11 +230,8 @@ def write_state(path: Path, state: State) -> None:
     text = json.dumps(_without_arrays(state, arrays))
     members = {f"{_ARRAY}{number}": array for number, array in enumerate(arrays)}
     members[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
-    try:
-        with replacing(path, durable=True) as partial, partial.open("wb") as out:
-            np.savez(out, allow_pickle=False, **members)
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    with written(path, durable=True) as partial, partial.open("wb") as out:
+        np.savez(out, allow_pickle=False, **members)
 
 
 def read_state(path: Path) -> Saved:

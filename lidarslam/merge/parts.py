@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.files import only_writer
+from lidarslam.core.files import make_own_folder, only_writer
 from lidarslam.core.state import Saved, decode, encode, read_state, write_state
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.core.text import count, joined, safe_name
@@ -148,9 +148,9 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
             )
         interruptions = stack.enter_context(Interruptions())
         recording = open_recording(task.request.source, task.request.config.reader)
-        files = CheckpointFiles(out)
-        files.make_folder()
-        stack.enter_context(only_writer(files.folder, _PATIENCE_S))
+        own = CheckpointFiles(out)
+        make_own_folder(own.folder)
+        stack.enter_context(only_writer(own.folder, _PATIENCE_S))
         description = describe_computed(task.request, recording) | task.merge
         is_begun = About.read(out) is not None
         unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out, files_in(out)), description, is_begun))
@@ -170,9 +170,9 @@ def track_part(task: PartTask, show: Show = lambda _: nullcontext(lambda _number
             return PartDone(0, missing, error.interrupted)
         interruptions.protect_results()
         graph.end_recording()
-        write_state(files.tracked, {"part": encode(scans), "graph": graph.state()})
+        write_state(own.tracked, {"part": encode(scans), "graph": graph.state()})
         if not scans.interrupted:
-            for path in (files.state, files.tiles):  # the state is not resumed any more
+            for path in (own.state, own.tiles):  # the state is not resumed any more
                 path.unlink(missing_ok=True)
         return PartDone(len(scans.log), interrupted=scans.interrupted)
 

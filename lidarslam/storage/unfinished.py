@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
+from lidarslam.core.files import make_own_folder, only_writer, remove_partial_files, written
 from lidarslam.core.json_text import read_json
 from lidarslam.core.state import Saved, read_state
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, describes_run, remove_files
@@ -47,11 +47,8 @@ class About:
 
     def write(self, run: Path) -> None:
         """Write run.json, durably; OutputError where it cannot be written."""
-        with replacing(run / ABOUT, durable=True) as partial:
-            try:
-                partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
-            except OSError as error:
-                raise cannot_write(run / ABOUT, error) from error
+        with written(run / ABOUT, durable=True) as partial:
+            partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
 
     def remedy(self, run: Path) -> str:
         """The remedy, as the end of a sentence that begins with the directory."""
@@ -114,13 +111,6 @@ class CheckpointFiles:
         self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"  # of graph and global map
         self.tracked = self.folder / "tracked.npz"  # a recording of a merge that was tracked
 
-    def make_folder(self) -> None:
-        """Make the folder, unless it exists; a link there is replaced; OutputError where it cannot be made."""
-        try:
-            make_own_folder(self.folder)
-        except OSError as error:
-            raise cannot_write(self.folder, error) from error
-
     def remove(self) -> None:
         """Remove them, and their folder when it is empty then."""
         if self.folder.is_symlink():  # its target is not ours
@@ -175,7 +165,7 @@ class Unfinished:
             _require_same(run, begun.description, description)
             about = begun
         unfinished = cls(run, about, resume)
-        unfinished.files.make_folder()
+        make_own_folder(unfinished.files.folder)
         for folder in (run, unfinished.files.folder):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()
