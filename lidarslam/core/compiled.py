@@ -127,14 +127,14 @@ class _Temporary(InTreeCacheLocator):
     """The temporary folder of the user."""
 
     def __init__(self, function: Any, file: str) -> None:
-        super().__init__(function, file)
-        self._cache_path = str(Path(_temporary_folder()) / self.get_suitable_cache_subpath(file))
+        super().__init__(function, file)  # type: ignore[no-untyped-call]
+        self._cache_path = str(Path(_temporary_folder()) / self.get_suitable_cache_subpath(file))  # type: ignore[no-untyped-call]
 
     def ensure_cache_path(self) -> None:
         """OSError where there is none."""
         if not _temporary_folder():
             raise FileNotFoundError("no temporary folder")
-        super().ensure_cache_path()
+        super().ensure_cache_path()  # type: ignore[no-untyped-call]
 
 
 class _Installed(InTreeCacheLocator):
@@ -162,7 +162,7 @@ class _KeptCode(FunctionCache):
     _impl_class = _Places
 
     def __init__(self, function: Any, source_stamps: tuple[str, ...]) -> None:
-        super().__init__(function)
+        super().__init__(function)  # type: ignore[no-untyped-call]
         own: Any = self._cache_file
         own._source_stamp = source_stamps
         self._is_kept = not isinstance(self._impl.locator, _Installed)
@@ -170,7 +170,7 @@ class _KeptCode(FunctionCache):
         # Made when the program was installed; only read.
         self._installed: Any = None
         if self.cache_path != beside:
-            self._installed = IndexDataCacheFile(beside, self._impl.filename_base, source_stamps)
+            self._installed = IndexDataCacheFile(beside, self._impl.filename_base, source_stamps)  # type: ignore[no-untyped-call]
 
     def has_overloads(self) -> bool:
         """Whether anything is kept; True where nothing can be."""
@@ -187,7 +187,7 @@ class _KeptCode(FunctionCache):
         for file in (own, self._installed):
             self._cache_file = file
             try:
-                if file is not None and (loaded := super().load_overload(*arguments)) is not None:
+                if file is not None and (loaded := super().load_overload(*arguments)) is not None:  # type: ignore[no-untyped-call]
                     return loaded
             except Exception as reason:  # a damaged pickle may raise anything
                 _log.info("compiled code cannot be read, and is made again: %s", reason)
@@ -204,6 +204,6 @@ class _KeptCode(FunctionCache):
             _warn_of_compiling_anew()
             return
         try:
-            super().save_overload(*arguments)
+            super().save_overload(*arguments)  # type: ignore[no-untyped-call]
         except Exception as reason:
             _log.info("compiled code cannot be kept: %s", reason)
