@@ -4,7 +4,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import stat
 import tempfile
 import threading
 import time
@@ -99,18 +98,10 @@ def open_own(path: Path, anew: bool = False) -> BinaryIO:
     """
     if anew:
         path.unlink(missing_ok=True)
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | (os.O_EXCL if anew else 0)
-    try:
-        descriptor = os.open(path, flags, 0o666)
-    except OSError as error:
-        if error.errno != errno.ELOOP:
-            raise
-        raise _linked(path) from None
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-        os.close(descriptor)
-        raise _linked(path)
-    return os.fdopen(descriptor, "r+b")
+    if path.is_symlink() or (path.exists() and (not path.is_file() or path.stat().st_nlink > 1)):
+        raise OutputError(f"{path}: is a link to a file elsewhere, or no ordinary file; remove it, or begin again")
+    path.touch()
+    return path.open("r+b")
 
 
 def make_own_folder(path: Path) -> None:
@@ -125,10 +116,6 @@ def require_no_link(places: Iterable[Path]) -> None:
     link = next((place for place in places if place.is_symlink()), None)
     if link is not None:
         raise OutputError(f"{link}: is a link to another place, where nothing is written; remove it")
-
-
-def _linked(path: Path) -> OutputError:
-    return OutputError(f"{path}: is a link to a file elsewhere, or no ordinary file; remove it, or begin again")
 
 
 @contextlib.contextmanager

@@ -95,7 +95,7 @@ def earlier_parts(out: Path) -> set[str]:
     """The directories of the recordings of an earlier merge, finished or not."""
     names: list[str] = []
     with suppress(InputError):
-        names += [entry["directory"] or "" for entry in read_summary(out).get("recordings", [])]
+        names += [str(entry["directory"]) for entry in read_summary(out).get("recordings", [])]
     with suppress(InputError):
         about = About.read(out)
         names += [] if about is None else about.description.get("parts", [])
