@@ -193,7 +193,7 @@ class _KeptCode(FunctionCache):
                 _log.info("compiled code cannot be read, and is made again: %s", reason)
                 with contextlib.suppress(OSError):
                     if file is own and self._is_kept:
-                        self.flush()
+                        self.flush()  # type: ignore[no-untyped-call]
             finally:
                 self._cache_file = own
         return None
