@@ -28,7 +28,7 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.datasets.config import ReaderConfig
     from lidarslam.datasets.faults import Faults
     from lidarslam.datasets.registry import open_recording
-    from lidarslam.live.clouds import CloudDecoder
+    from lidarslam.live.messages import CloudDecoder
     from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
     from lidarslam.simulation.recorder import Rig, SimulatedScan
     from lidarslam.simulation.writers import FORMATS

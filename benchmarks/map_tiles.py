@@ -25,9 +25,8 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.global_map.voxels import TileStore
-from lidarslam.run.results import draw, write_map
+from lidarslam.run.results import draw, format_map, write_map
 from lidarslam.run.summary import peak_rss_mb
-from lidarslam.run.summary_text import format_map
 from lidarslam.storage.directory import RunDirectory
 
 _STEP_M, _LEG_M, _APART_M = 0.8, 1000.0, 120.0

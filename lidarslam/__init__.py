@@ -6,8 +6,7 @@ The names below are loaded when they are first used; `docs/python.md` shows them
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lidarslam.api.evaluation import evaluate
-    from lidarslam.api.recordings import OpenRecording, open
+    from lidarslam.api.recordings import OpenRecording, evaluate, open
     from lidarslam.api.slam import Slam
     from lidarslam.config.settings import Config
     from lidarslam.core.errors import LidarSlamError
@@ -43,7 +42,7 @@ _MODULES = {
     "Slam": "lidarslam.api.slam",
     "Status": "lidarslam.core.tracking",
     "Trajectory": "lidarslam.core.trajectory",
-    "evaluate": "lidarslam.api.evaluation",
+    "evaluate": "lidarslam.api.recordings",
     "open": "lidarslam.api.recordings",
 }
 

@@ -18,11 +18,10 @@ from lidarslam.mapping.localization.place_search import FixedMap
 from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest, describe_run, log_choices, require_possible
-from lidarslam.run.results import RunOutcome, Tracked
+from lidarslam.run.results import RunOutcome, Tracked, format_end, format_times
 from lidarslam.run.run import Progress, RunSession, open_session, track
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import WrittenMap, summarise
-from lidarslam.run.summary_text import format_end, format_times
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.finished_run import load_map
@@ -43,8 +42,7 @@ class LocaliseRequest:
 
     def describe(self) -> dict[str, Any]:
         """For config.yaml."""
-        guess = None if self.guess is None else list(self.guess)
-        return describe_run(self.run) | {"map": str(self.map.resolve()), "guess": guess}
+        return describe_run(self.run) | {"map": str(self.map.resolve()), "guess": self.guess and list(self.guess)}
 
 
 def read_map(request: LocaliseRequest) -> tuple[PointCloud, FixedMap]:
@@ -124,11 +122,11 @@ def execute(
         shown = session.viewer
         shown.show_final_map(cloud.points)
         session.viewer = PlacedViewer(shown)
-        session.wait_for_loops(for_first_scan=True)
+        session.wait_for_loops()
         phase("searching for the place")
         tracked = track(session, recording, chosen, progress, mapper=localiser)
         session.end_scans()
-        session.close_viewer()
+        session.shown.close()
         return _write(request, session, tracked, localiser)
 
 
@@ -154,7 +152,6 @@ def _write(
 
 
 def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
-    """Update earlier scans by the results of later ones."""
     scans = range(len(log))
     poses = log.trajectory.T_world_lidar.copy()
     for number, T_map_lidar in localiser.corrections.items():

@@ -15,9 +15,8 @@ from hypothesis import settings
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import Saved, State, read_state, write_state
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.storage.state_file import read_state, write_state
 
 # The benchmarks are scripts that import one another from their own folder.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))

@@ -17,8 +17,7 @@ from evalio.pipelines import Pipeline, register_pipeline
 from evalio.types import SE3, ImuMeasurement, ImuParams, LidarMeasurement, LidarParams, Point
 
 from lidarslam.api.slam import Slam
-from lidarslam.config.settings import load_config
-from lidarslam.config.shipped import CONFIGS, shipped_files
+from lidarslam.config.settings import CONFIGS, load_config, shipped_files
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.mounting import transform_of
 

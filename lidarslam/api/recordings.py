@@ -1,8 +1,12 @@
-"""Recordings on disk as sequences of scans."""
+"""Recordings on disk as sequences of scans, and the evaluation of trajectories and maps."""
 
 from collections.abc import Iterator
 from os import PathLike
+from pathlib import Path
+from typing import Any
 
+from lidarslam.assessment.evaluate import EvaluateRequest
+from lidarslam.assessment.evaluate import evaluate as evaluate_request
 from lidarslam.config.settings import make_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
@@ -11,6 +15,9 @@ from lidarslam.datasets.fetched import fetched
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.alignment import AlignmentMethod
+
+Source = str | PathLike[str] | Trajectory
 
 
 class OpenRecording:
@@ -76,3 +83,34 @@ def open(
     config = make_config({"reader": {key: value for key, value in given.items() if value is not None}})
     recording = open_recording(fetched(source), config.reader)
     return OpenRecording(recording, range(len(recording))[start:stop:step])
+
+
+def evaluate(
+    estimate: Source,
+    reference: Source | None = None,
+    *,
+    reference_map: str | PathLike[str] | None = None,
+    alignment: AlignmentMethod = "se3",
+) -> dict[str, Any]:
+    """The errors of a trajectory, and of its map where there is a reference for it: the content of metrics.json.
+
+    Nothing is written. Errors that cannot be computed are None.
+
+    Args:
+        estimate: a trajectory; the path of one in TUM or KITTI text; or a run directory.
+        reference: likewise, or the path of a recording with ground truth; None: the ground truth that came with the
+            recording of the run.
+        reference_map: the path of a point cloud to compare the map with.
+        alignment: of the trajectory, for the absolute errors.
+
+    Raises:
+        InputError: a file is missing or damaged, there is no reference, or the two have no instant in common.
+    """
+    request = EvaluateRequest(
+        estimate if isinstance(estimate, Trajectory) else Path(estimate),
+        reference if reference is None or isinstance(reference, Trajectory) else Path(reference),
+        None if reference_map is None else Path(reference_map),
+        alignment=alignment,
+        write=False,
+    )
+    return evaluate_request(request).to_json()

@@ -1,4 +1,4 @@
-"""SLAM in a program's own loop, one scan after the other."""
+"""SLAM in a program's own loop, one scan after the other, from arrays that are checked before they are used."""
 
 import copy
 import logging
@@ -13,26 +13,27 @@ from threading import RLock
 from typing import Any, Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
-from lidarslam.api.arrays import check_stamp, check_sweep, make_scan, make_vector
 from lidarslam.config.settings import Config, make_config
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
+from lidarslam.datasets.mounting import corrected, transform_of
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline, map_error
-from lidarslam.run.inertial import make_imu_stream
+from lidarslam.run.calibration import make_imu_stream
 from lidarslam.run.loop_closing import GraphOutcome, begin_graph, correct
 from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
-from lidarslam.run.run import draw_report, open_odometry, require_no_trajectory
+from lidarslam.run.run import draw_report, open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 
@@ -68,7 +69,6 @@ class Slam:
 
     def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
         self._config = make_config(config)
-        require_no_trajectory(self._config)
         with CompileAhead(parts_of(self._config)) as compiling:
             self._odometry = open_odometry(self._config, None)
             compiling.wait(logger.info)
@@ -112,8 +112,12 @@ class Slam:
             scan = self._take(points, point_times, stamp)
             if self._imu is not None:
                 scan = self._imu.take_up(scan)
-            with self._failing(), self._blas.limit(limits=1, user_api="blas"):
-                estimate = self._pipeline.register(scan, started, self._log.add)
+            try:
+                with self._blas.limit(limits=1, user_api="blas"):
+                    estimate = self._pipeline.register(scan, started, self._log.add)
+            except BaseException as error:  # also Ctrl-C leaves the stages in different states
+                self._failure = error
+                raise
             return replace(
                 estimate,
                 T_world_lidar=_read_only(estimate.T_world_lidar),
@@ -215,7 +219,6 @@ class Slam:
         self.close()
 
     def _take(self, points: ArrayLike | Scan, point_times: ArrayLike | None, stamp: float | None) -> Scan:
-        """The next scan, once it is checked."""
         if isinstance(points, Scan):
             if point_times is not None or stamp is not None:
                 raise InputError("a Scan has times and a stamp of its own; give it alone")
@@ -244,7 +247,6 @@ class Slam:
         return self._graph is not None and len(self._graph.scan_poses) == len(self._log)
 
     def _settle(self) -> None:
-        """Wait for the background, and add the last scan to the map."""
         try:
             self._pipeline.settle()
         except Exception as error:
@@ -262,15 +264,6 @@ class Slam:
         if self._closed:
             raise LidarSlamError("this Slam is closed; call trajectory(), map() and save() before close()")
 
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        """An error or Ctrl-C in the middle of a scan leaves the stages in different states."""
-        try:
-            yield
-        except BaseException as error:
-            self._failure = error
-            raise
-
     def _require_working(self) -> None:
         if self._failure is not None:
             reason = str(self._failure) or type(self._failure).__name__
@@ -278,3 +271,94 @@ class Slam:
                 f"an earlier scan was broken off ({reason}), and no more can be registered; trajectory(), map() and"
                 " save() give what came before it"
             )
+
+
+# More columns than any point has are many points.
+_MOST_COLUMNS = 32
+# No sweep lasts longer, and no clock reading is smaller.
+_LONGEST_OFFSET_S = 10.0
+# Of a cloud as KITTI stores it: x, y, z, intensity.
+_WITH_INTENSITY = 4
+# Larger numbers, thousands of years, are not in seconds.
+_LATEST_STAMP_S = 1e11
+# Stamps jitter; a sweep that is longer than this many intervals between stamps has other units.
+_MOST_INTERVALS = 4.0
+
+
+def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, config: ReaderConfig) -> Scan:
+    """A scan, of copies, in upright axes, without the invalid points: NaN, at the origin, beyond 10 km.
+
+    Args:
+        points: (N, 3) x, y, z in metres; (N, 4) with the intensity; more columns, of which only x, y, z are taken; or
+            a cloud of Open3D.
+        point_times: (N,) seconds from the stamp.
+        stamp: seconds.
+        config: mounting of the points' axes, of which auto is upright; elevation correction; scale of the times.
+
+    Raises:
+        InputError: an array has another shape, or a time is not in seconds.
+    """
+    table = _numbers("points", getattr(points, "points", points))
+    if not table.size:
+        table = np.empty((0, 3))
+    if table.ndim != 2 or not 3 <= table.shape[1] <= _MOST_COLUMNS:
+        raise InputError(f"points must be (N, 3), x, y, z first, got the shape {table.shape}; give points.T of (3, N)")
+    times = None if point_times is None else _times(point_times, len(table))
+    intensities = np.array(table[:, 3]) if table.shape[1] == _WITH_INTENSITY else None
+    scan = Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times, intensities=intensities)
+    return corrected(scan, transform_of(config.mounting), config.raised_deg(), config.time_scale)
+
+
+def make_vector(name: str, numbers: ArrayLike) -> FloatArray:
+    """Three finite numbers (3,), copied; InputError where they are something else."""
+    vector = np.array(_numbers(name, numbers), dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"{name} must be three finite numbers, got {numbers!r}")
+    return vector
+
+
+def check_stamp(stamp: float, last: float | None) -> float:
+    """The stamp in seconds; InputError where it is no number of seconds, or not after the last one."""
+    seconds = _numbers("stamp", stamp)
+    if seconds.shape or not abs(seconds) <= _LATEST_STAMP_S:
+        raise InputError(f"stamp must be a finite number of seconds, got {stamp!r}; multiply nanoseconds by 1e-9")
+    if last is not None and seconds <= last:
+        raise InputError(
+            f"stamps must increase: {seconds:.9f} s is not after the scan before, {last:.9f} s; leave it out"
+        )
+    return float(seconds)
+
+
+def check_sweep(scan: Scan, interval_s: float) -> None:
+    """Refuse a sweep that is much longer than the longest time between two stamps so far."""
+    if scan.time_offsets is None or not len(scan):
+        return
+    sweep_s = float(np.ptp(scan.time_offsets))
+    if sweep_s > _MOST_INTERVALS * interval_s:
+        raise InputError(
+            f"point_times span {sweep_s:.3g} s, but scans are {interval_s:.3g} s apart; expected are seconds from the"
+            " stamp: multiply times from 0 to 1 by the duration of a sweep"
+        )
+
+
+def _times(point_times: ArrayLike, count: int) -> FloatArray:
+    seconds = np.array(_numbers("point_times", point_times).reshape(-1), dtype=np.float64)
+    if len(seconds) != count:
+        raise InputError(f"point_times must have one entry a point, got {len(seconds)} for {count} points")
+    largest = float(np.abs(seconds[np.isfinite(seconds)]).max(initial=0.0))
+    if largest > _LONGEST_OFFSET_S:
+        raise InputError(
+            f"point_times must be seconds from the stamp, fractions of one; got up to {largest:.6g}: subtract the stamp"
+            " from absolute times, and multiply nanoseconds by 1e-9, microseconds by 1e-6"
+        )
+    return seconds
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[Any]:
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(f"{name} must be numbers: {error}") from None
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} must be numbers, got {array.dtype}")
+    return array

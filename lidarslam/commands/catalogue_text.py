@@ -8,7 +8,7 @@ from dataclasses import asdict
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
-from textwrap import wrap
+from textwrap import fill
 from typing import Any
 
 from lidarslam.core.errors import InputError
@@ -79,36 +79,21 @@ def list_data_sets(on_disk: OnDisk) -> str:
         rows.append((one.name, one.sensor, one.reader, one.truth, "yes" if one.imu else "no", there))
     widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
     lines = ["".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"looked for in {evalio.data_folder()} (EVALIO_DATA) and in folders that are named",
-            "more about one, with its sequences: lidarslam datasets hilti_2022",
-        ]
-    )
+    places = f"looked for in {evalio.data_folder()} (EVALIO_DATA) and in folders that are named"
+    return "\n".join([*lines, "", places, "more about one, with its sequences: lidarslam datasets hilti_2022"])
 
 
 def describe_data_set(one: DataSet, on_disk: OnDisk) -> str:
     """All known facts about one data set."""
     rows = list(_rows(one, on_disk.get(one.name, ())))
-    lines = [
-        f"{label if index == 0 else '':<11}{line}"
-        for label, text in rows
-        for index, line in enumerate(
-            wrap(one_line(text, 8000), _WIDTH - 11, break_long_words=False, break_on_hyphens=False) or [""]
-        )
-    ]
+    wrapped = {"width": _WIDTH, "break_long_words": False, "break_on_hyphens": False, "subsequent_indent": 11 * " "}
+    lines = (fill(f"{label:<11}{one_line(text, 8000)}", **wrapped) for label, text in rows)  # type: ignore[arg-type]
     return "\n".join([one.title, *lines])
 
 
 def _rows(one: DataSet, found: Sequence[Path]) -> Iterator[tuple[str, str]]:
-    yield "name", one.name
-    yield "sensor", one.sensor
-    yield "truth", one.truth
-    yield "IMU", "yes" if one.imu else "no"
-    yield "page", one.url
-    yield "layout", one.layout
+    known = {"name": one.name, "sensor": one.sensor, "truth": one.truth, "IMU": "yes" if one.imu else "no"}
+    yield from (known | {"page": one.url, "layout": one.layout}).items()
     sequences = _sequences(one)
     if sequences:
         yield "sequences", ", ".join(sequences)

@@ -27,7 +27,7 @@ def config(listing: bool, config_file: Path | None, settings: tuple[str, ...]) -
 
 
 def _shipped() -> Iterator[str]:
-    from lidarslam.config.shipped import BENCHMARKS, CONFIGS, headline, shipped_files
+    from lidarslam.config.settings import BENCHMARKS, CONFIGS, headline, shipped_files
     from lidarslam.config.yaml_text import read_yaml
 
     kinds = {"--config NAME": shipped_files(CONFIGS), "compare --benchmark NAME": shipped_files(BENCHMARKS)}

@@ -53,12 +53,12 @@ class ShippedFile(click.ParamType):  # type: ignore[type-arg]
 
     def __init__(self, kind: str, folder: str) -> None:
         self.name = kind
-        self._folder = folder  # a constant of `lidarslam.config.shipped`
+        self._folder = folder  # a constant of `lidarslam.config.settings`
 
     def _files(self) -> dict[str, Path]:
-        from lidarslam.config import shipped
+        from lidarslam.config import settings
 
-        return shipped.shipped_files(getattr(shipped, self._folder))
+        return settings.shipped_files(getattr(settings, self._folder))
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         shipped, path = self._files(), Path(value)
@@ -214,35 +214,29 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
     from lidarslam.config.settings import setting
 
     odometry, weights, prior = options.pop("odometry", None), options.pop("weights", None), options.get("prior")
-    settings = []
-    if weights is not None:
-        if odometry not in (None, "learned", "learned+imu") or prior is not None:
-            raise click.UsageError("--weights belongs to --odometry learned; leave it, or the other odometry, out")
-        odometry = odometry or "learned"
-        settings.append(setting("odometry.learned.weights", str(weights.resolve())))
-    if prior is not None:
-        if odometry is not None:
-            raise click.UsageError("--prior replaces the odometry; leave --odometry out")
-        odometry = "external"
-    if odometry is not None:
-        settings.append(setting("odometry.method", odometry))
-    mapping = options.pop("mapping", None)
-    if options.pop("no_mapping", False):
-        if mapping not in (None, "off"):
-            raise click.UsageError(f"--no-mapping is --mapping off, not --mapping {mapping}; leave one of them out")
-        mapping = "off"
-    if mapping is not None:
-        settings.append(setting("mapping.method", mapping))
+    if weights is not None and (odometry not in (None, "learned", "learned+imu") or prior is not None):
+        raise click.UsageError("--weights belongs to --odometry learned; leave it, or the other odometry, out")
+    if prior is not None and odometry is not None:
+        raise click.UsageError("--prior replaces the odometry; leave --odometry out")
+    mapping, no_mapping = options.pop("mapping", None), options.pop("no_mapping", False)
+    if no_mapping and mapping not in (None, "off"):
+        raise click.UsageError(f"--no-mapping is --mapping off, not --mapping {mapping}; leave one of them out")
     pose_graph, gnss = options.pop("pose_graph", None), options.pop("gnss", None)
-    if gnss or options.get("loops") or options.get("no_loops"):
-        if pose_graph is False:
-            raise click.UsageError("--gnss, --loop and --no-loop are of the pose graph; leave --no-pose-graph out")
-        pose_graph = True
-    if gnss is not None:
-        settings.append(f"pose_graph.gnss={str(gnss).lower()}")
-    if pose_graph is not None:
-        settings.append(f"pose_graph.enabled={str(pose_graph).lower()}")
-    return settings
+    needs_graph = gnss or options.get("loops") or options.get("no_loops")
+    if needs_graph and pose_graph is False:
+        raise click.UsageError("--gnss, --loop and --no-loop are of the pose graph; leave --no-pose-graph out")
+    given = {
+        "odometry.learned.weights": weights and str(weights.resolve()),
+        "odometry.method": "external" if prior is not None else odometry or (weights and "learned"),
+        "mapping.method": "off" if no_mapping else mapping,
+        "pose_graph.gnss": gnss,
+        "pose_graph.enabled": True if needs_graph else pose_graph,
+    }
+    return [
+        f"{key}={str(value).lower()}" if isinstance(value, bool) else setting(key, value)
+        for key, value in given.items()
+        if value is not None
+    ]
 
 
 def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
@@ -267,13 +261,12 @@ def gate_options(with_method: bool) -> _Decorator:
         except ConfigError as error:
             raise click.BadParameter(str(error)) from None
 
-    texts = (
-        ("--max", "maxima", "Upper bound of a figure, such as ate=0.1; may be repeated."),
-        ("--min", "minima", "Lower bound of a figure, such as f_score_0.1=90; may be repeated."),
-    )
     form = f"{'[METHOD:]' if with_method else ''}NAME=VALUE"
     given: dict[str, Any] = {"callback": parse, "multiple": True, "metavar": form}
-    return together(*(click.option(*names, help=text, **given) for *names, text in texts))
+    return together(
+        click.option("--max", "maxima", help="Upper bound of a figure, such as ate=0.1; may be repeated.", **given),
+        click.option("--min", "minima", help="Lower bound, such as f_score_0.1=90; may be repeated.", **given),
+    )
 
 
 def take_where(options: dict[str, Any]) -> "Where":

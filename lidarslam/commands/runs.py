@@ -115,8 +115,8 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
         with _loading(source.name) as progress:
             from lidarslam.run.checkpoints import abandoned, lost_when_finished
             from lidarslam.run.request import RunRequest
+            from lidarslam.run.results import format_outcome, format_stop
             from lidarslam.run.run import execute
-            from lidarslam.run.summary_text import format_outcome, format_stop
             from lidarslam.storage.default_places import source_name, unfinished_run
 
             config, map_formats = opt.take_config(options, source), _take_map_formats(options)
@@ -192,7 +192,7 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
         with _loading(topic or "live") as progress:
             from lidarslam.live.live import execute
             from lidarslam.run.request import LiveRequest
-            from lidarslam.run.summary_text import format_outcome
+            from lidarslam.run.results import format_outcome
 
             options |= {"reader": None, "sequence": None, "topic": topic}  # those of recordings
             config, map_formats = opt.take_config(options), _take_map_formats(options)
@@ -303,8 +303,7 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     to the others is left out of the common map, and the exit status is 1.
     """
     from lidarslam.merge.merge import merge as execute
-    from lidarslam.merge.parts import MergeRequest
-    from lidarslam.merge.writing import format_merge
+    from lidarslam.merge.parts import MergeRequest, format_merge
     from lidarslam.run.progress import show_progress
     from lidarslam.storage.default_places import source_name
 

@@ -112,8 +112,7 @@ def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, An
     from lidarslam.assessment.inputs import truth_of_run
     from lidarslam.config.settings import load_config
     from lidarslam.datasets.registry import is_recording
-    from lidarslam.storage.comparison_folder import run_directories
-    from lidarslam.storage.finished_run import is_run, load_run
+    from lidarslam.storage.finished_run import is_run, load_run, run_directories
 
     if len(places) == 1 and not is_run(places[0]) and is_recording(places[0], options["reader"]):
         return _scans(places[0], options)
@@ -143,7 +142,7 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
 def _drawn(places: tuple[Path, ...], colour: Any, apart: bool) -> list[Any]:
     """The runs that are drawn; their type is not named because that would import scipy."""
     from lidarslam.assessment.inputs import truth_of_run
-    from lidarslam.storage.comparison_folder import run_directories
+    from lidarslam.storage.finished_run import run_directories
     from lidarslam.viewer.picture import load_drawn_runs, require_quantity
 
     first = run_directories(places[0])[0]

@@ -59,9 +59,8 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.machine import machine, versions
 from lidarslam.run.progress import show_count
-from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.finished_run import read_summary
+from lidarslam.storage.finished_run import COMPARISON, REPORT_HTML, REPORT_MD, read_summary
 
 _INTERRUPTED = "the comparison was interrupted before its turn"
 

@@ -17,8 +17,7 @@ from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text import as_typed, command_line
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.record import RecordRequest, record
-from lidarslam.storage.comparison_folder import REPORT_HTML
-from lidarslam.storage.finished_run import load_run
+from lidarslam.storage.finished_run import REPORT_HTML, load_run
 from lidarslam.viewer.picture import draw_apart, fit_frame, load_drawn_runs
 
 RECORDING, REPLAY = "recording", "demo.rrd"

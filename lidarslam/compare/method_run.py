@@ -27,10 +27,10 @@ from lidarslam.compare.peers.estimation import describe_peer, execute_peer
 from lidarslam.compare.peers.registry import peer_named
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
-from lidarslam.core.child_processes import bound
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.files import open_own, remove_partial_files
 from lidarslam.core.json_text import read_json
+from lidarslam.core.tasks import bound
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
 from lidarslam.run.request import RunRequest, describe_run

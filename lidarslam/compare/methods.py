@@ -14,7 +14,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import ODOMETRIES
-from lidarslam.storage.comparison_folder import RESERVED
+from lidarslam.storage.finished_run import RESERVED
 
 # Name for the user -> name of the odometry in the configuration.
 _BASES = {

@@ -27,7 +27,7 @@ from lidarslam.evaluation.comparison.gates import Gate
 from lidarslam.run.request import RunRequest
 from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
 from lidarslam.storage import directory as files
-from lidarslam.storage.comparison_folder import COMPARISON, RECORDINGS, RESERVED
+from lidarslam.storage.finished_run import COMPARISON, RECORDINGS, RESERVED
 
 
 class Simulated(Settings):

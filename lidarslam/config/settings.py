@@ -6,6 +6,7 @@ Defaults are in the code, next to their use; a file or `--set` holds only the di
 import difflib
 import reprlib
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -15,7 +16,6 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.config.yaml_text import YamlError, bounds_text, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.settings import Settings
@@ -158,7 +158,6 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
 
 
 def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> None:
-    """Put a value into the tree; a section is merged into the existing one."""
     *sections, last = dotted.split(".")
     for key in sections:
         branch = tree.setdefault(key, {})
@@ -191,14 +190,16 @@ def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str
 def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     location = [str(part) for part in fault["loc"]]
     key = ".".join(location)
+    depth, section, field = _field_at(location, model)
     if fault["type"] == "extra_forbidden":
-        return f"there is no {key}{_suggest(location, model)}"
+        close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(section.model_fields)}"
+        return f"there is no {key}; {hint}"
     if fault["type"] == "model_type":
         return f"{key}={_short(fault['input'])}: expected a section"
     if fault["type"] == "value_error":
         # Keys that contradict each other: the input would be their whole section, the validator names the two.
         return f"{key}: {fault['ctx']['error']}"
-    depth, field = _field_at(location, model)
     bounds = None if field is None else bounds_text(field)
     if bounds is None:
         return f"{key}={_short(fault['input'])}: {fault['msg'].lower()}"
@@ -206,19 +207,18 @@ def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     return f"{'.'.join(location[:depth])}={_short(fault['input'])}: {expected}"
 
 
-def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, FieldInfo | None]:
-    """The setting at a place, None of a section, and the number of keys to it: a kind or an index may follow."""
+def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, type[BaseModel], FieldInfo | None]:
+    """The number of keys to the setting at a place, which a kind or an index may follow; its section; and itself."""
     section, field = model, None
     for depth, key in enumerate(location):
         if key not in section.model_fields:
-            return depth, field
+            return depth, section, field
         field = section.model_fields[key]
         section = _section_of(field) or BaseModel
-    return len(location), field
+    return len(location), section, field
 
 
 def _section_of(field: FieldInfo) -> type[BaseModel] | None:
-    """The type of a section, which may be null; None of a value."""
     kinds = (field.annotation, *get_args(field.annotation))
     return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
 
@@ -228,9 +228,16 @@ def _short(value: object) -> str:
     return _SHORT.repr(value)
 
 
-def _suggest(location: Sequence[str], model: type[BaseModel]) -> str:
-    section = model
-    for key in location[:-1]:
-        section = _section_of(section.model_fields[key]) or BaseModel
-    close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
-    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(section.model_fields)}"
+CONFIGS = Path(str(files("lidarslam"))) / "configs"
+BENCHMARKS = CONFIGS / "benchmarks"
+
+
+def shipped_files(folder: Path) -> dict[str, Path]:
+    """The YAML files of a folder by their names, without the suffix."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def headline(path: Path) -> str:
+    """The first line of a file, a comment that describes it."""
+    with path.open(encoding="utf-8") as lines:
+        return next(lines).removeprefix("#").strip()

@@ -38,7 +38,7 @@ class YamlError(ConfigError):
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one, and texts with NUL.
+    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one.
 
     Any value that is no decimal number is a text.
     """
@@ -47,11 +47,6 @@ class _StrictLoader(yaml.SafeLoader):
         tag = super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
         is_plain = kind is yaml.ScalarNode and implicit[0] and tag in _NUMBERS
         return self.DEFAULT_SCALAR_TAG if is_plain and not _NUMBERS[tag].fullmatch(value) else tag
-
-    def construct_scalar(self, node: Any) -> Any:
-        if "\0" in node.value:
-            raise yaml.constructor.ConstructorError(None, None, "a text has a NUL character", node.start_mark)
-        return super().construct_scalar(node)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()
@@ -75,10 +70,8 @@ def parse_yaml(text: str) -> Any:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 # a SafeLoader that refuses more
     except yaml.YAMLError as error:
         raise YamlError(f"not YAML: {' '.join(str(error).split())}", is_syntax=True) from error
-    except RecursionError as error:
-        raise YamlError("not YAML: it is nested too deeply") from error
-    except (ValueError, AttributeError) as error:  # PyYAML converts without a check, as 2021-13-45
-        raise YamlError(f"a value looks like a date or a number but is none: {error}") from error
+    except (RecursionError, ValueError, AttributeError) as error:  # too deep, or converted without a check: 2021-13-45
+        raise YamlError(f"not YAML: {error}") from error
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -130,7 +123,6 @@ def _is_section(value: Any) -> bool:
 
 
 def _flow(value: Any) -> str:
-    """A value on one line."""
     text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=float("inf"))
     return text.removesuffix("\n").removesuffix("\n...")
 

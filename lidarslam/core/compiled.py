@@ -18,7 +18,7 @@ from typing import Any, TypeVar, cast
 import numba
 import numba.extending
 from numba.core import cgutils, types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, InTreeCacheLocator
 from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
@@ -44,23 +44,21 @@ def compiled(function: Function) -> Function:
     next to the source when the program was installed is used wherever the rest is kept. Where nothing can be kept (a
     full disk, a damaged file), every process compiles the rest again.
     """
-    dispatcher = _kept_on_disk(function)
-    if hasattr(dispatcher, "_cache"):  # not where numba is switched off
-        _watch_callees(dispatcher)
-        if hasattr(dispatcher._cache, "_cache_file"):
-            dispatcher._cache._cache_file._source_stamp = dispatcher.source_stamps
-        dispatcher._cache = _ForgivingCache(dispatcher._cache)
+    dispatcher = _part(function, no_cpython_wrapper=False)
+    if hasattr(dispatcher, "source_stamps"):
+        with contextlib.suppress(RuntimeError):  # a function without a file
+            dispatcher._cache = cast(Any, _KeptCode)(function, dispatcher.source_stamps)
     return cast(Function, dispatcher)
 
 
 def compiled_part(function: Function) -> Function:
     """A part of compiled functions: compiled and kept along with them, and never called from the interpreter."""
-    return _part(function)
+    return cast(Function, _part(function))
 
 
 def compiled_sums(function: Function) -> Function:
     """As `compiled_part`, with sums in any order, which a processor takes several numbers at once of."""
-    return _part(function, fastmath={"reassoc", "contract", "nsz"})
+    return cast(Function, _part(function, fastmath={"reassoc", "contract", "nsz"}))
 
 
 def _prefetch(_context: Any, array: Any, _row: Any) -> Any:
@@ -91,36 +89,25 @@ def is_compiled(module: ModuleType) -> bool:
     """Whether machine code of all compiled functions of a module is on disk; also where none can be kept there."""
     own = [value for value in vars(module).values() if getattr(value, "__module__", None) == module.__name__]
     caches = [value._cache for value in own if hasattr(value, "_cache")]
-    return all(cache.has_overloads() for cache in caches if isinstance(cache, _ForgivingCache))
+    return all(cache.has_overloads() for cache in caches if isinstance(cache, _KeptCode))
 
 
-def _kept_on_disk(function: Function) -> Any:
-    try:
-        return _njit(function, cache=True, **_OPTIONS)
-    except RuntimeError as reason:  # neither next to the source nor in a cache folder of the user
-        _log.info("%s", reason)
-    configured, _config.CACHE_DIR = _config.CACHE_DIR, _temporary_folder()
-    try:
-        return _njit(function, cache=True, **_OPTIONS)
-    except RuntimeError:
-        return _only_installed(function)
-    finally:
-        _config.CACHE_DIR = configured
-
-
-def _only_installed(function: Function) -> Any:
-    dispatcher = _njit(function, **_OPTIONS)
-    with contextlib.suppress(RuntimeError):  # a function without a file
-        dispatcher._cache = cast(Any, _InstalledCache)(function)
+def _part(function: Callable[..., Any], no_cpython_wrapper: bool = True, **options: Any) -> Any:
+    dispatcher = _njit(function, no_cpython_wrapper=no_cpython_wrapper, **_OPTIONS, **options)
+    if hasattr(dispatcher, "_cache"):  # not where numba is switched off
+        # Numba keeps machine code with the state of the function's file; these are of the functions in it as well.
+        code, names = dispatcher.py_func.__code__, dispatcher.py_func.__globals__
+        callees = [names[name] for name in code.co_names if hasattr(names.get(name), "source_stamps")]
+        stamps = {stamp for callee in callees for stamp in callee.source_stamps}
+        dispatcher.source_stamps = (*sorted({_stamp(code.co_filename), *stamps}),)
     return dispatcher
 
 
-@lru_cache(maxsize=1)
-def _warn_of_compiling_anew() -> None:
-    _log.warning(
-        "compiled loops find no folder to be kept in, so that every start compiles them, for up to a minute;"
-        " set NUMBA_CACHE_DIR to a folder that can be written"
-    )
+def _stamp(file: str) -> str:
+    try:
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    except OSError:  # made up by the program
+        return ""
 
 
 @lru_cache(maxsize=1)
@@ -136,37 +123,18 @@ def _temporary_folder() -> str:
     return str(folder) if is_own and not folder.is_symlink() else ""
 
 
-def _part(function: Function, **options: Any) -> Function:
-    dispatcher: Any = _njit(function, no_cpython_wrapper=True, **_OPTIONS, **options)
-    if hasattr(dispatcher, "_cache"):
-        _watch_callees(dispatcher)
-    return cast(Function, dispatcher)
+class _Temporary(InTreeCacheLocator):
+    """The temporary folder of the user."""
 
+    def __init__(self, function: Any, file: str) -> None:
+        super().__init__(function, file)  # type: ignore[no-untyped-call]
+        self._cache_path = str(Path(_temporary_folder()) / self.get_suitable_cache_subpath(file))  # type: ignore[no-untyped-call]
 
-def _watch_callees(dispatcher: Any) -> None:
-    """Numba keeps machine code with the state of the function's file; add those of the functions compiled into it."""
-    code, names = dispatcher.py_func.__code__, dispatcher.py_func.__globals__
-    callees = [names[name] for name in code.co_names if hasattr(names.get(name), "source_stamps")]
-    stamps = {stamp for callee in callees for stamp in callee.source_stamps}
-    dispatcher.source_stamps = (*sorted({_stamp(code.co_filename), *stamps}),)
-
-
-def _stamp(file: str) -> str:
-    try:
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    except OSError:  # made up by the program
-        return ""
-
-
-def _installed_with(cache: Any) -> Any | None:
-    """The machine code next to a function's source, for a cache that is elsewhere."""
-    if not hasattr(cache, "_cache_file"):
-        return None
-    beside = str(Path(cache._py_func.__code__.co_filename).parent / "__pycache__")
-    if cache.cache_path == beside:
-        return None
-    own: Any = cache._cache_file
-    return type(own)(beside, cache._impl.filename_base, own._source_stamp)
+    def ensure_cache_path(self) -> None:
+        """OSError where there is none."""
+        if not _temporary_folder():
+            raise FileNotFoundError("no temporary folder")
+        super().ensure_cache_path()  # type: ignore[no-untyped-call]
 
 
 class _Installed(InTreeCacheLocator):
@@ -176,73 +144,66 @@ class _Installed(InTreeCacheLocator):
         """Nothing is made."""
 
 
-class _InstalledImpl(CompileResultCacheImpl):
-    _locator_classes: Any = (_Installed,)
+class _Places(CompileResultCacheImpl):
+    _locator_classes: Any = (*CompileResultCacheImpl._locator_classes, _Temporary, _Installed)
 
 
-class _InstalledCache(FunctionCache):
-    """The machine code next to a function's source, where there is no folder for the rest."""
-
-    _impl_class = _InstalledImpl
-
-    def save_overload(self, *_: Any) -> None:
-        """Nothing is kept."""
-        _warn_of_compiling_anew()
-
-    def flush(self) -> None:
-        """Nothing is made again."""
+@lru_cache(maxsize=1)
+def _warn_of_compiling_anew() -> None:
+    _log.warning(
+        "compiled loops find no folder to be kept in, so that every start compiles them, for up to a minute;"
+        " set NUMBA_CACHE_DIR to a folder that can be written"
+    )
 
 
-class _ForgivingCache:
+class _KeptCode(FunctionCache):
     """Numba's store of one function's machine code, whose files may be damaged and whose folder may be full."""
 
-    def __init__(self, cache: Any) -> None:
-        self._cache = cache
-        self._installed = _installed_with(cache)  # only read
+    _impl_class = _Places
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._cache, name)
+    def __init__(self, function: Any, source_stamps: tuple[str, ...]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        own: Any = self._cache_file
+        own._source_stamp = source_stamps
+        self._is_kept = not isinstance(self._impl.locator, _Installed)
+        beside = str(Path(function.__code__.co_filename).parent / "__pycache__")
+        # Made when the program was installed; only read.
+        self._installed: Any = None
+        if self.cache_path != beside:
+            self._installed = IndexDataCacheFile(beside, self._impl.filename_base, source_stamps)  # type: ignore[no-untyped-call]
 
     def has_overloads(self) -> bool:
         """Whether anything is kept; True where nothing can be."""
-        if not hasattr(self._cache, "_cache_file") or isinstance(self._cache, _InstalledCache):
-            return True
         try:
-            installed = self._installed is not None and self._installed._load_index()
-            return bool(installed or self._cache._cache_file._load_index())
+            files = (self._cache_file, self._installed)
+            return not self._is_kept or any(file._load_index() for file in files if file is not None)
         except Exception as reason:  # a damaged pickle may raise anything
             _log.info("compiled code cannot be read: %s", reason)
             return False
 
     def load_overload(self, *arguments: Any) -> Any:
         """The machine code kept for these types; None when there is none that can be read."""
-        loaded = self._load(*arguments)
-        if loaded is None and self._installed is not None:
-            own, self._cache._cache_file = self._cache._cache_file, self._installed
+        own = self._cache_file
+        for file in (own, self._installed):
+            self._cache_file = file
             try:
-                loaded = self._load(*arguments)
+                if file is not None and (loaded := super().load_overload(*arguments)) is not None:  # type: ignore[no-untyped-call]
+                    return loaded
+            except Exception as reason:  # a damaged pickle may raise anything
+                _log.info("compiled code cannot be read, and is made again: %s", reason)
+                with contextlib.suppress(OSError):
+                    if file is own and self._is_kept:
+                        self.flush()  # type: ignore[no-untyped-call]
             finally:
-                self._cache._cache_file = own
-        return loaded
-
-    def _load(self, *arguments: Any) -> Any:
-        try:
-            return self._cache.load_overload(*arguments)
-        except Exception as reason:  # a damaged pickle may raise anything
-            _log.info("compiled code cannot be read, and is made anew: %s", reason)
-            if self._cache._cache_file is not self._installed:
-                self._begin_anew()
-            return None
+                self._cache_file = own
+        return None
 
     def save_overload(self, *arguments: Any) -> None:
         """Keep the compiled code, if that is possible."""
+        if not self._is_kept:
+            _warn_of_compiling_anew()
+            return
         try:
-            self._cache.save_overload(*arguments)
+            super().save_overload(*arguments)  # type: ignore[no-untyped-call]
         except Exception as reason:
-            _log.info("compiled code cannot be kept: %s", reason)
-
-    def _begin_anew(self) -> None:
-        try:
-            self._cache.flush()
-        except OSError as reason:
             _log.info("compiled code cannot be kept: %s", reason)

@@ -4,7 +4,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import stat
 import tempfile
 import threading
 import time
@@ -60,10 +59,10 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def written(path: Path, remedy: str = "") -> Iterator[Path]:
+def written(path: Path, remedy: str = "", durable: bool = False) -> Iterator[Path]:
     """As `replacing`; the errors of the system are for the user."""
     try:
-        with replacing(path) as partial:
+        with replacing(path, durable) as partial:
             yield partial
     except OSError as error:
         raise cannot_write(path, error, remedy) from error
@@ -99,18 +98,10 @@ def open_own(path: Path, anew: bool = False) -> BinaryIO:
     """
     if anew:
         path.unlink(missing_ok=True)
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | (os.O_EXCL if anew else 0)
-    try:
-        descriptor = os.open(path, flags, 0o666)
-    except OSError as error:
-        if error.errno != errno.ELOOP:
-            raise
-        raise _linked(path) from None
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-        os.close(descriptor)
-        raise _linked(path)
-    return os.fdopen(descriptor, "r+b")
+    if path.is_symlink() or (path.exists() and (not path.is_file() or path.stat().st_nlink > 1)):
+        raise OutputError(f"{path}: is a link to a file elsewhere, or no ordinary file; remove it, or begin again")
+    path.touch()
+    return path.open("r+b")
 
 
 def make_own_folder(path: Path) -> None:
@@ -125,10 +116,6 @@ def require_no_link(places: Iterable[Path]) -> None:
     link = next((place for place in places if place.is_symlink()), None)
     if link is not None:
         raise OutputError(f"{link}: is a link to another place, where nothing is written; remove it")
-
-
-def _linked(path: Path) -> OutputError:
-    return OutputError(f"{path}: is a link to a file elsewhere, or no ordinary file; remove it, or begin again")
 
 
 @contextlib.contextmanager
@@ -153,7 +140,6 @@ def only_writer(directory: Path, patience_s: float = 0.0) -> Iterator[None]:
 
 
 def _is_locked(descriptor: int) -> bool:
-    """Lock a directory; whether it is ours, or cannot be locked."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

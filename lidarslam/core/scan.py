@@ -221,7 +221,6 @@ def _column(name: str, values: ArrayLike | None, count: int, dtype: DTypeLike | 
 
 
 def _colours(values: ArrayLike, count: int) -> NDArray[np.uint8]:
-    """Colours (N, 3) of N points."""
     colours = np.asarray(values, dtype=np.uint8)
     if colours.size != 3 * count or (colours.size and colours.shape[-1] != 3):
         raise ValueError(f"colours must be (..., 3) for {count} points, got {colours.shape}")

@@ -1,31 +1,36 @@
 """The state of a computation, saved and restored, to resume a stopped run.
 
-Values become trees of arrays, numbers and texts, driven by type hints; never code. Known are bool, int, float, str,
-enumerations, `T | None`, `NDArray[dtype]` (with `Annotated[..., Shape(None, 3)]` the shape too), `list[T]`,
-`tuple[T, ...]`, `tuple[A, B]`, `dict[K, V]`, dataclasses and `Stateful` classes, nested at will. Lists are stored by
-columns: a list of a thousand (4, 4) arrays is one array (1000, 4, 4), a list of dataclasses a list for each field.
-Arrays that are read back have the types and shapes of their hints; else the file is taken as this program wrote it.
+Values become trees of arrays, numbers and texts, and are made of these again by type hints; never code. Known are bool,
+int, float, str, enumerations, `T | None`, `NDArray[dtype]` (with `Annotated[..., Shape(None, 3)]` the shape too),
+`list[T]`, `tuple[T, ...]`, `tuple[A, B]`, `dict[K, V]`, dataclasses and `Stateful` classes, nested at will. Lists are
+stored by columns: a list of a thousand (4, 4) arrays is one array (1000, 4, 4), a list of dataclasses a list for each
+field. Arrays that are read back have the types and shapes of their hints; else the file is taken as this program wrote
+it.
 """
 
 import dataclasses
 import inspect
+import json
 import os
 import tempfile
 import types
 import typing
 import weakref
-import zlib
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import open_own
+from lidarslam.core.files import ONE_READER, open_own, written
 
 State = dict[str, Any]  # arrays, numbers, texts, None, lists of these, and further trees
+
+# In a file: the member with the tree as JSON, and the key of a reference to an array.
+_TREE, _ARRAY = "tree", "array"
 
 
 class Shape:
@@ -44,11 +49,10 @@ TRANSFORM = Shape(4, 4)
 
 
 class Saved:
-    """A tree read back from a file; the place of the tree and the remedy are for errors."""
+    """A tree read back from a file."""
 
-    def __init__(self, values: Mapping[str, Any], place: str = "the state", remedy: str = "begin again") -> None:
+    def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
-        self.place, self.remedy = place, remedy
 
     def value(self, name: str) -> Any:
         """The tree under a name; InputError where there is none."""
@@ -62,15 +66,12 @@ class Saved:
 
     def part(self, name: str) -> "Saved":
         """The branch under a name."""
-        return self.branch(self.value(name))
+        return Saved(self.value(name))
 
-    def branch(self, tree: Any) -> "Saved":
-        """A branch at this place."""
-        return Saved(tree, self.place, self.remedy)
-
-    def refuse(self, reason: str) -> InputError:
+    @staticmethod
+    def refuse(reason: str) -> InputError:
         """The error for a tree of another version of the program."""
-        return InputError(f"{self.place}: is not what this program saves ({reason}); {self.remedy}")
+        return InputError(f"the checkpoint is not what this program saves ({reason}); begin again with --overwrite")
 
 
 @typing.runtime_checkable
@@ -94,138 +95,115 @@ class Stateful:
 
     def state(self) -> State:
         """The values of all declared attributes; arrays are not copied."""
-        return {name: encode(kind, getattr(self, name)) for name, kind in _hints(type(self)).items()}
+        return {name: encode(getattr(self, name)) for name in _hints(type(self))}
 
     def restore(self, saved: Saved) -> None:
-        """Take over a state; InputError where it lacks an attribute, or a value does not fit its hint."""
+        """Take over a state; InputError where it lacks an attribute, or an array does not fit its hint."""
         for name, kind in _hints(type(self)).items():
             present, tree = getattr(self, name, None), saved.value(name)
             if tree is not None and isinstance(present, Restorable):
                 present.restore(saved.part(name))
             else:
-                setattr(self, name, decode(kind, tree, saved))
+                setattr(self, name, decode(kind, tree))
         self._after_restore()
 
     def _after_restore(self) -> None:
         """Rebuild the attributes that are not saved."""
 
 
-def encode(kind: Any, value: Any) -> Any:
-    """The tree of a value of that type."""
-    kind, _ = _bare(kind)
-    if (inner := _optional(kind)) is not None:
-        return None if value is None else encode(inner, value)
-    origin, items = typing.get_origin(kind) or kind, typing.get_args(kind)
-    if origin is tuple and Ellipsis not in items:
-        return [encode(item, one) for item, one in zip(items, value, strict=True)]
-    if origin in (list, tuple):
-        return _encode_list(items[0], list(value))
-    if origin is dict:
-        return {"keys": _encode_list(items[0], [*value]), "values": _encode_list(items[1], [*value.values()])}
-    return _encode_plain(origin, value)
-
-
-def _encode_plain(kind: Any, value: Any) -> Any:
+def encode(value: Any) -> Any:
+    """The tree of a value."""
     if isinstance(value, Restorable):
         return value.state()
-    if dataclasses.is_dataclass(kind):
-        return {name: encode(hint, getattr(value, name)) for name, hint in _hints(kind).items()}
+    if dataclasses.is_dataclass(value):
+        return {field.name: encode(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {"keys": _column([*value]), "values": _column([*value.values()])}
+    if isinstance(value, list | tuple):
+        return _column(value) if isinstance(value, list) else [encode(one) for one in value]
     if isinstance(value, Enum):
         return value.name
     return value.item() if isinstance(value, np.generic) else value
 
 
-def decode(kind: Any, tree: Any, saved: Saved) -> Any:
-    """The value of that type that a tree of `encode` stands for; InputError where an array of it is another one."""
+def _column(values: list[Any]) -> Any:
+    """One array where the values allow it, columns of columns for dataclasses, else a list of trees."""
+    if any(value is None for value in values):
+        known = np.array([value is not None for value in values])
+        return {"known": known, "values": _column([value for value in values if value is not None])}
+    kinds = {type(value) for value in values}
+    kind = kinds.pop() if len(kinds) == 1 else object
+    if issubclass(kind, bool | int | float | np.generic) and not issubclass(kind, Enum):
+        return np.array(values)
+    if issubclass(kind, np.ndarray) and len({(value.shape, value.dtype) for value in values}) == 1:
+        return np.stack(values)
+    if dataclasses.is_dataclass(kind) and not hasattr(kind, "restore"):
+        names = [field.name for field in dataclasses.fields(kind)]
+        return {name: _column([getattr(value, name) for value in values]) for name in names}
+    return [encode(value) for value in values]
+
+
+def decode(kind: Any, tree: Any) -> Any:
+    """The value of a type that a tree of `encode` stands for; InputError where an array of it is another one."""
     kind, shape = _bare(kind)
     if (inner := _optional(kind)) is not None:
-        return None if tree is None else decode(inner, tree, saved)
+        return None if tree is None else decode(inner, tree)
     origin, items = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin is np.ndarray:
-        return _decode_array(items[1], shape, tree, saved)
+        return _array(items[1], shape, tree)
     if origin is dict:
-        keys, values = (
-            _decode_list(item, tree[name], saved) for item, name in zip(items, ("keys", "values"), strict=True)
+        return dict(
+            zip(*(_list(item, tree[name]) for item, name in zip(items, ("keys", "values"), strict=True)), strict=True)
         )
-        return dict(zip(keys, values, strict=True))
     if origin is list or Ellipsis in items:
-        return origin(_decode_list(items[0], tree, saved))
+        return origin(_list(items[0], tree))
     if origin is tuple:
-        return tuple(decode(item, one, saved) for item, one in zip(items, tree, strict=True))
-    return _decode_plain(origin, tree, saved)
+        return tuple(decode(item, one) for item, one in zip(items, tree, strict=True))
+    return _made(origin, tree)
 
 
-def _decode_plain(kind: Any, tree: Any, saved: Saved) -> Any:
+def _made(kind: Any, tree: Any) -> Any:
     if hasattr(kind, "restore"):
-        kind = _concrete(kind, tree)
+        if inspect.isabstract(kind):  # the subclass with these attributes
+            kind = next(one for one in kind.__subclasses__() if set(_hints(one)) == set(tree))
         made = kind.__new__(kind)
-        made.restore(saved.branch(tree))
+        made.restore(Saved(tree))
         return made
     if dataclasses.is_dataclass(kind):
-        part = saved.branch(tree)
-        return kind(**{name: decode(hint, part.value(name), saved) for name, hint in _hints(kind).items()})  # type: ignore[operator]
+        saved = Saved(tree)
+        return kind(**{name: decode(hint, saved.value(name)) for name, hint in _hints(kind).items()})  # type: ignore[operator]
     return kind[tree] if issubclass(kind, Enum) else kind(tree)
 
 
-def _concrete(kind: Any, tree: Any) -> Any:
-    """The class itself, or of an abstract one the subclass whose attributes a tree has."""
-    if not inspect.isabstract(kind):
-        return kind
-    return next(one for one in kind.__subclasses__() if set(_hints(one)) == set(tree))
-
-
-def _decode_array(dtype: Any, shape: Shape | None, tree: Any, saved: Saved, of_list: bool = False) -> Any:
+def _array(dtype: Any, shape: Shape | None, tree: Any, of_list: bool = False) -> Any:
     """An array, or of a list of arrays the one that they are rows of."""
     (wanted,) = typing.get_args(dtype)
     lengths = tree.shape[1:] if of_list else tree.shape
     if not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted) or not (shape is None or shape.fits(lengths)):
         expected = getattr(wanted, "__name__", wanted)
-        raise saved.refuse(f"expected an array of {expected}, got {tree.dtype} {tree.shape}")
+        raise Saved.refuse(f"expected an array of {expected}, got {tree.dtype} {tree.shape}")
     return tree if tree.flags.writeable and tree.flags.c_contiguous else tree.copy()
 
 
-# Plain values of a list become one array of this type.
-_COLUMNS: dict[Any, type] = {float: np.float64, int: np.int64, bool: np.bool_}
-
-
-def _encode_list(kind: Any, values: list[Any]) -> Any:
-    """A column: one array where the values allow it, columns of columns for dataclasses, else a list of trees."""
-    bare, _ = _bare(kind)
-    if (inner := _optional(bare)) is not None:
-        known = np.array([value is not None for value in values], dtype=np.bool_)
-        return {"known": known, "values": _encode_list(inner, [value for value in values if value is not None])}
-    if bare in _COLUMNS:
-        return np.array(values, dtype=_COLUMNS[bare])
-    if typing.get_origin(bare) is np.ndarray and len({(one.shape, one.dtype) for one in values}) == 1:
-        return np.stack(values)
-    if _is_columnar(bare):
-        columns = {name: (hint, [getattr(one, name) for one in values]) for name, hint in _hints(bare).items()}
-        return {name: _encode_list(*column) for name, column in columns.items()}
-    return [encode(kind, value) for value in values]
-
-
-def _decode_list(kind: Any, tree: Any, saved: Saved) -> Any:
+def _list(kind: Any, tree: Any) -> list[Any]:
+    """The values of a column."""
     bare, shape = _bare(kind)
-    if (inner := _optional(bare)) is not None:
-        present = iter(_decode_list(inner, tree["values"], saved))
+    if (inner := _optional(bare)) is not None and isinstance(tree, dict) and set(tree) == {"known", "values"}:
+        present = iter(_list(inner, tree["values"]))
         return [next(present) if one else None for one in tree["known"]]
-    if bare in _COLUMNS:
-        return tree.tolist()
+    if inner is not None:
+        return _list(inner, tree)
     if isinstance(tree, np.ndarray):
-        return list(_decode_array(typing.get_args(bare)[1], shape, tree, saved, of_list=True))
-    if _is_columnar(bare):
-        part = saved.branch(tree)
-        columns = [_decode_list(hint, part.value(name), saved) for name, hint in _hints(bare).items()]
+        is_rows = typing.get_origin(bare) is np.ndarray
+        return list(_array(typing.get_args(bare)[1], shape, tree, of_list=True)) if is_rows else tree.tolist()
+    if isinstance(tree, dict):
+        saved = Saved(tree)
+        columns = [_list(hint, saved.value(name)) for name, hint in _hints(bare).items()]
         return [bare(*row) for row in zip(*columns, strict=True)]
-    return [decode(kind, one, saved) for one in tree]
-
-
-def _is_columnar(kind: Any) -> bool:
-    return isinstance(kind, type) and dataclasses.is_dataclass(kind) and not hasattr(kind, "restore")
+    return [decode(kind, one) for one in tree]
 
 
 def _hints(kind: Any) -> dict[str, Any]:
-    """Names and types of the saved attributes of a class, in the order of their declaration."""
     hints = typing.get_type_hints(kind, include_extras=True)
     if dataclasses.is_dataclass(kind):
         return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
@@ -239,9 +217,48 @@ def _bare(kind: Any) -> tuple[Any, Shape | None]:
 
 
 def _optional(kind: Any) -> Any:
-    """T of `T | None`; None for another type."""
     is_union = typing.get_origin(kind) in (typing.Union, types.UnionType)
     return next(one for one in typing.get_args(kind) if one is not types.NoneType) if is_union else None
+
+
+def write_state(path: Path, state: State) -> None:
+    """Write a tree to an .npz file, or raise an OutputError.
+
+    After a power failure, the earlier file or the whole new one exists.
+    """
+    arrays: list[NDArray[Any]] = []
+    text = json.dumps(_without_arrays(state, arrays))
+    members = {f"{_ARRAY}{number}": array for number, array in enumerate(arrays)}
+    members[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
+    with written(path, durable=True) as partial, partial.open("wb") as out:
+        np.savez(out, allow_pickle=False, **members)
+
+
+def read_state(path: Path) -> Saved:
+    """Read a file of `write_state`, never a pickle; InputError where there is no such file, or it is damaged."""
+    try:
+        with ONE_READER, np.load(path, allow_pickle=False) as file:
+            return Saved(_with_arrays(json.loads(file[_TREE].tobytes()), file))
+    except Exception as error:  # of nearly any kind
+        raise InputError(f"{path}: is damaged ({error}); begin again with --overwrite") from error
+
+
+def _without_arrays(value: Any, arrays: list[NDArray[Any]]) -> Any:
+    """The tree for JSON; arrays are appended to the list, and referred to by their numbers."""
+    if isinstance(value, np.ndarray):
+        arrays.append(value)
+        return {_ARRAY: len(arrays) - 1}
+    if isinstance(value, dict):
+        return {name: _without_arrays(entry, arrays) for name, entry in value.items()}
+    return [_without_arrays(entry, arrays) for entry in value] if isinstance(value, list) else value
+
+
+def _with_arrays(value: Any, file: Any) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {_ARRAY}:
+            return file[f"{_ARRAY}{value[_ARRAY]}"]
+        return {name: _with_arrays(entry, file) for name, entry in value.items()}
+    return [_with_arrays(entry, file) for entry in value] if isinstance(value, list) else value
 
 
 class BlockFile(Stateful):
@@ -252,12 +269,11 @@ class BlockFile(Stateful):
     """
 
     _ends: list[int]  # bytes
-    _checksums: list[int]
 
     def __init__(self, directory: Path | None = None, file: Path | None = None) -> None:
         self.directory, self._path = directory if file is None else file.parent, file
         self._open = self._is_closed = False
-        self._ends, self._checksums = [0], []
+        self._ends = [0]
 
     def state(self) -> State:
         """Where blocks end; they are on the disk by now; OSError where the disk is full."""
@@ -267,16 +283,14 @@ class BlockFile(Stateful):
         return super().state()
 
     def restore(self, saved: Saved) -> None:
-        """Resume from a state; InputError where the file is damaged."""
+        """Resume from a state; InputError where the file is too short."""
         super().restore(saved)
         self._opened()
-        is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
-        for index, checksum in enumerate(self._checksums):
-            if is_short or zlib.crc32(self.read(index)) != checksum:
-                raise InputError(f"{self._path}: is damaged (block {index}); {saved.remedy}")
+        if self._file.seek(0, os.SEEK_END) < self._ends[-1]:
+            raise InputError(f"{self._path}: is damaged (too short); begin again with --overwrite")
 
     def __len__(self) -> int:
-        return len(self._checksums)
+        return len(self._ends) - 1
 
     @property
     def size_bytes(self) -> int:
@@ -293,7 +307,6 @@ class BlockFile(Stateful):
         self._file.seek(self._ends[-1])
         self._file.write(block)
         self._ends.append(self._ends[-1] + len(block))
-        self._checksums.append(zlib.crc32(block))
 
     def read(self, index: int) -> bytes:
         """One of them."""

@@ -1,10 +1,14 @@
-"""Independent tasks, one after another, or side by side by Ray, which is loaded where it is used, and only here."""
+"""Independent tasks, one after another or side by side by Ray, and child processes that end with this one.
+
+Ray is loaded where it is used, and only here.
+"""
 
 import contextlib
 import logging
 import os
 import signal
 import socket
+import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -101,28 +105,25 @@ def _ray_tasks(where: Where) -> Iterator[Tasks]:
         stack.enter_context(_environment(where))
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarslam-", ignore_cleanup_errors=True))
         stack.callback(ray.shutdown)
+        options: dict[str, Any] = {"address": where.cluster or "local", "log_to_driver": False}
+        if where.cluster is None:
+            options |= {"num_cpus": where.jobs, "object_store_memory": _OBJECT_STORE_BYTES, "_temp_dir": place}
+            options["include_dashboard"] = False
         try:
             with _own_signals():
-                _connect(where, place)
+                _require_answer(where.cluster or "")
+                ray.init(logging_level=logging.CRITICAL, **options)
         except Exception as error:  # Ray raises plain ones, too
-            raise ConfigError(_no_ray(where, error)) from error
+            reason = " ".join(str(error).split())
+            if where.cluster is None:
+                raise ConfigError(f"--jobs {where.jobs}: Ray does not start: {reason}") from error
+            raise ConfigError(
+                f"--ray {where.cluster}: no cluster answers there; this machine has to be one of its nodes ({reason})"
+            ) from error
         slots = int(ray.cluster_resources().get("CPU", 0))
         if not slots:
             raise ConfigError(f"--ray {where.cluster}: the cluster has no CPU; start nodes with ray start")
         yield _RayTasks(slots)
-
-
-def _connect(where: Where, place: str) -> None:
-    """To a cluster, or to a Ray of our own, which keeps its files in a folder."""
-    import ray
-
-    quiet: dict[str, Any] = {"logging_level": logging.CRITICAL, "log_to_driver": False}
-    if where.cluster is not None:
-        _require_answer(where.cluster)
-        ray.init(address=where.cluster, **quiet)
-        return
-    own: dict[str, Any] = {"object_store_memory": _OBJECT_STORE_BYTES, "include_dashboard": False, "_temp_dir": place}
-    ray.init(address="local", num_cpus=where.jobs, **own, **quiet)
 
 
 class _RayTasks(Tasks):
@@ -157,7 +158,6 @@ class _RayTasks(Tasks):
 
 
 def _take(done: list[Any], running: dict[Any, int], results: dict[int, Any], on_done: OnDone | None) -> None:
-    """Take the results of tasks that ended."""
     import ray
 
     for reference in done:
@@ -165,12 +165,12 @@ def _take(done: list[Any], running: dict[Any, int], results: dict[int, Any], on_
         try:
             result = ray.get(reference)
         except ray.exceptions.RayTaskError as error:
-            raise _of_task(error) from None
+            if isinstance(error.cause, ImportError):
+                raise ConfigError(f"a node of the cluster lacks a library: {error.cause}") from None
+            raise (error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))) from None
         except ray.exceptions.RayError as error:
-            name = type(error).__name__
-            raise LidarSlamError(
-                f"a task came to no result in {_RETRIES + 1} attempts ({name}); see Ray's log"
-            ) from error
+            failed = f"a task came to no result in {_RETRIES + 1} attempts"
+            raise LidarSlamError(f"{failed} ({type(error).__name__}); see Ray's log") from error
         if isinstance(result, LidarSlamError):
             raise result
         results[index] = result
@@ -188,13 +188,6 @@ def _end(running: dict[Any, int], results: dict[int, Any], on_done: OnDone | Non
         done = ray.wait([*running], num_returns=1)[0]
         with contextlib.suppress(Exception):  # cancelled, or as it was interrupted
             _take(done, running, results, on_done)
-
-
-def _of_task(error: Any) -> Exception:
-    """The error that a task raised."""
-    if isinstance(error.cause, ImportError):
-        return ConfigError(f"a node of the cluster lacks a library or has another lidarslam: {error.cause}")
-    return error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))
 
 
 def _carry_out(shared: tuple[Callable[[T], R], str], item: T) -> R | LidarSlamError:
@@ -257,8 +250,29 @@ def _require_answer(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), _ANSWER_S).close()
 
 
-def _no_ray(where: Where, error: Exception) -> str:
-    reason = " ".join(str(error).split())
-    if where.cluster is None:
-        return f"--jobs {where.jobs}: Ray does not start: {reason}"
-    return f"--ray {where.cluster}: no cluster answers there; this machine has to be one of its nodes ({reason})"
+# A shell waits for the end of its standard input, which the system closes with this process, and kills a group.
+_WATCH = 'read -r _; kill -s KILL -- "-$1"'
+
+
+@contextlib.contextmanager
+def bound(process: "subprocess.Popen[Any]") -> Iterator[None]:
+    """End a process and its descendants with the context, or with this process, whichever comes first.
+
+    It was started with `start_new_session=True`; descendants with a session of their own are not covered.
+    """
+    quiet = subprocess.DEVNULL
+    watch = subprocess.Popen(
+        ["/bin/sh", "-c", _WATCH, "sh", str(process.pid)],
+        stdin=subprocess.PIPE,
+        stdout=quiet,
+        stderr=quiet,
+        start_new_session=True,  # neither Ctrl-C nor a closed terminal is meant for it
+    )
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        watch.kill()
+        watch.communicate()

@@ -103,8 +103,15 @@ def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
 
     Else a ConfigError, which says `what` has this name; `reserved` are names of other files in the same folder.
     """
-    fault = _name_fault(name, reserved)
-    if fault is not None:
+    is_long = len(name.encode(errors="replace")) > _LONGEST_NAME
+    faults = {
+        "is empty": not name.strip(),
+        "has a separator": _SEPARATORS.search(name) is not None,
+        "begins with a dot": name.startswith("."),
+        "has a control character, or is too long": is_long or one_line(name) != name,
+        "is that of another file there": name in reserved,
+    }
+    for fault in (fault for fault, is_there in faults.items() if is_there):
         raise ConfigError(
             f"{what} {name[:_LONGEST_NAME]!r}: cannot be the name of a folder, as it {fault}; {_NAME_REMEDY}"
         )
@@ -122,17 +129,3 @@ def stays_below(path: str) -> bool:
     """Whether a relative path, with / between its parts, leads to no place outside the folder that it is joined to."""
     parts = PurePosixPath(path)
     return not parts.is_absolute() and ".." not in parts.parts
-
-
-def _name_fault(name: str, reserved: Collection[str]) -> str | None:
-    if not name.strip():
-        return "is empty"
-    if _SEPARATORS.search(name):
-        return "has a separator"
-    if name.startswith("."):
-        return "begins with a dot"
-    if one_line(name) != name:
-        return "has a control character, or is too long"
-    if len(name.encode()) > _LONGEST_NAME:
-        return f"is longer than {_LONGEST_NAME} bytes"
-    return "is that of another file there" if name in reserved else None

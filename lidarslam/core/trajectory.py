@@ -24,17 +24,10 @@ TextFormat = Literal["tum", "kitti"]
 _KITTI_RATE_HZ = 10.0
 # Survey coordinates are far below; squares of much larger numbers overflow.
 _FARTHEST_M = 1e9
+# What the lines of a trajectory hold, by their numbers.
 _FORMATS = {
-    8: "; a TUM trajectory has lines `stamp tx ty tz qx qy qz qw`",
-    12: "; a KITTI trajectory has the first three rows of a pose matrix a line",
-}
-# By the columns that were expected and those that came.
-_OTHER_FORMAT = {
-    (8, 12): (
-        "; it is in KITTI's format, which has no stamps, and often holds the poses of a camera: give the LiDAR's as TUM"
-        " text, a line `stamp tx ty tz qx qy qz qw` for each scan"
-    ),
-    (12, 8): "; it looks like a TUM trajectory, `stamp tx ty tz qx qy qz qw`",
+    8: "; TUM text has lines `stamp tx ty tz qx qy qz qw`, KITTI's twelve numbers, which has no stamps",
+    12: "; KITTI text has the first three rows of a pose matrix a line, TUM's eight numbers",
 }
 
 
@@ -192,15 +185,13 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
         if not words:
             continue
         try:
-            row = [float(word) for word in words]
-        except ValueError:
-            raise InputError(
-                f"{path}:{number}: expected {columns} numbers, got {line.strip()[:60]!r}{_FORMATS.get(columns, '')}"
-            ) from None
-        if len(row) != columns:
-            hint = _OTHER_FORMAT.get((columns, len(row)), _FORMATS.get(columns, ""))
-            raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}{hint}")
-        numbers.extend(row)
+            if len(words) == columns:
+                numbers.extend(map(float, words))
+                continue
+        except ValueError:  # part of the line may have been taken, which no one reads any more
+            pass
+        got, hint = line.strip()[:60], _FORMATS.get(columns, "")
+        raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(words)} words, {got!r}{hint}")
     return np.array(numbers, dtype=np.float64).reshape(-1, columns)
 
 

@@ -125,7 +125,6 @@ def _is_reliable(qos: Any) -> bool:
 
 
 def _ros_type(type_name: str) -> str | None:
-    """The ROS type of a DDS type; None where it is none."""
     package, _, name = type_name.partition("::msg::dds_::")
     return f"{package}/msg/{name[:-1]}" if name.endswith("_") else None
 
@@ -149,7 +148,6 @@ def _struct(message_type: str) -> Any:
 
 
 def _member(kind: int, of: Any) -> Any:
-    """The library's type for a field of a ROS message."""
     match kind:
         case Nodetype.BASE:
             return _BASE_TYPES[of[0]]

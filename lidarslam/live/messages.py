@@ -1,17 +1,139 @@
-"""ROS 2 messages of a live run: their definitions, and odometry and transforms to be published."""
+"""ROS 2 messages of a live run: clouds that become scans, and odometry and transforms to be published."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
+from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting import corrected, transform_of
+from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, BagMessage, decode, read_header
+from lidarslam.datasets.times.azimuth import PointTiming
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
 from lidarslam.pipeline.estimates import ScanEstimate
+
+# Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
+_MOST_LOOKED_AT = 10
+
+# A stamp that is ahead of the time since the scan before by this much is an outlier, unless this many in a row are.
+_AHEAD_NS, _CLOCK_WAS_SET = 10**9, 6
+
+_NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
+_AHEAD = "scans were left out: their stamps are ahead of the time that has passed since the scans before"
+_OTHER_SENSOR = "scans were left out: they come from another sensor; name one with --set reader.frame_id=NAME"
+
+_TIME_FIELD = "time field of the points has a fault"
+
+
+@dataclass(frozen=True, eq=False)
+class LiveScan:
+    """A scan with the header of its message."""
+
+    scan: Scan  # in upright axes
+    stamp_ns: int  # of the header, or of the publication where the header has none
+    frame_id: str  # the sensor's frame
+
+
+class CloudDecoder:
+    """Scans from the messages of one topic, in the order of their stamps.
+
+    The sensor is that of the first message unless `reader.frame_id` names one, and unit and reference of the point
+    times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are.
+    """
+
+    def __init__(self, config: ReaderConfig, message_type: str, faults: Faults) -> None:
+        self._config = config
+        self._type = message_type
+        self._faults = faults
+        self._frame_id = config.frame_id
+        self._last_ns: int | None = None
+        self._doubtful: tuple[int, int] | None = None  # stamp and publication of a first message from the future
+        self._last_published_ns = self._ahead = 0  # and the number of stamps in a row ahead of it
+        self._has_header_stamps = True
+        self._clouds: list[tuple[RawCloud, float]] = []
+        self._timing = PointTiming()
+        self._is_settled = config.time_reference == "none"
+        self.T_upright_recorded = transform_of(config.mounting)
+
+    def scan(self, raw: bytes, published_ns: int) -> LiveScan | None:
+        """The scan of a serialised message; None where it cannot be used, which is counted."""
+        try:
+            header_ns, frame_id = read_header(raw, ros2=True)
+            stamp_ns = self._stamp_ns(header_ns, published_ns)
+            if not self._is_wanted(stamp_ns, published_ns, frame_id):
+                return None
+            message = BagMessage(published_ns, header_ns, frame_id, self._type, raw)
+            cloud = decode(message, True, self._config.time_field)
+        except Exception as error:  # of a message that breaks off: an assertion, struct.error, IndexError
+            self._faults.unreadable(InputError(str(error) or type(error).__name__))
+            return None
+        stamp = stamp_ns / 10**9
+        self._learn(cloud, stamp)
+        self._last_ns, self._last_published_ns, self._frame_id = stamp_ns, published_ns, frame_id
+        self._ahead = 0
+        scan = self._timing.scan(cloud, stamp, self._faults, f"{stamp:.9f}")
+        scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
+        return LiveScan(scan, stamp_ns, frame_id)
+
+    def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
+        """The header's stamp; the time of publication where the first header has none."""
+        if self._last_ns is None:
+            self._has_header_stamps = header_ns != 0
+        return header_ns if self._has_header_stamps else published_ns
+
+    def _is_wanted(self, stamp_ns: int, published_ns: int, frame_id: str) -> bool:
+        if self._frame_id is not None and frame_id != self._frame_id:
+            self._faults.leave_out(_OTHER_SENSOR, f"{frame_id!r} instead of {self._frame_id!r}")
+            return False
+        if self._last_ns is None:
+            return self._begins(stamp_ns, published_ns)
+        step_ns = stamp_ns - self._last_ns
+        if step_ns <= 0:
+            self._faults.leave_out(_NOT_AFTER, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+            return False
+        is_ahead = step_ns > max(0, published_ns - self._last_published_ns) + _AHEAD_NS
+        self._ahead = self._ahead + 1 if is_ahead else 0
+        if 0 < self._ahead < _CLOCK_WAS_SET:
+            self._faults.leave_out(_AHEAD, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+            return False
+        return True
+
+    def _begins(self, stamp_ns: int, published_ns: int) -> bool:
+        """Whether scans begin here; a stamp ahead of its publication is of another clock only if the next one is."""
+        before, self._doubtful = self._doubtful, (stamp_ns, published_ns)
+        if stamp_ns - published_ns < _AHEAD_NS:
+            return True
+        return before is not None and 0 < stamp_ns - before[0] < published_ns - before[1] + _AHEAD_NS
+
+    def _learn(self, cloud: RawCloud, stamp: float) -> None:
+        """Infer unit and reference of the time field, until they are clear."""
+        if self._is_settled:
+            return
+        unit, reference, defined_unit = self._config.time_unit, self._config.time_reference, None
+        if self._type in bag_message.CUSTOM_MESSAGE_TYPES:
+            reference, defined_unit = "absolute", bag_message.TIME_UNIT
+        self._clouds.append((cloud, stamp))
+        before = len(self._clouds) - 1
+        period_s = (stamp - self._clouds[0][1]) / before if before else None
+        learned = learn_point_time(self._clouds, unit, reference, period_s, defined_unit)
+        self._timing = PointTiming(learned.model)
+        is_clear = learned.model is not None and stamp > 2 * CLOCK_LIMIT_S
+        self._is_settled = is_clear or len(self._clouds) == _MOST_LOOKED_AT
+        if self._is_settled:
+            self._clouds.clear()
+            if learned.warning is not None:
+                self._faults.note(_TIME_FIELD, learned.warning)
+
 
 Publish = Callable[[bytes], None]
 

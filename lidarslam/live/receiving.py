@@ -4,21 +4,23 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.ros.bag_imu import ACCELERATION, ANGULAR_VELOCITY, IMU_TYPE, imu_numbers
-from lidarslam.datasets.ros.bag_message import CLOUD_TYPES, read_header
+from lidarslam.datasets.ros.bag_imu import ACCELERATION, ANGULAR_VELOCITY, imu_numbers
+from lidarslam.datasets.ros.bag_message import read_header
 from lidarslam.pipeline.imu_stream import ImuStream
 
 logger = logging.getLogger(__name__)
 
 # Discovery of a running system is done within a second or two; after the second span the topics seen are printed.
 _SETTLED_S, _PATIENCE_S, _POLL_S = 2.0, 5.0, 0.1
+# How long the publisher of an IMU may take to appear, beside that of the clouds.
+IMU_WITHIN_S = 5.0
 # How long to wait for a message before checking for the end of the run.
 _RECEIVE_S = 0.2
 # Samples of an IMU that may be queued in a reader: a second of a fast one.
@@ -42,46 +44,38 @@ Published = Callable[[], Iterable[PublishedTopic]]
 """The topics that are published now."""
 
 
-def find_topic(published: Published, wanted: str | None, domain: int, within_s: float | None = None) -> PublishedTopic:
-    """Wait for the publisher of a topic of clouds, for a limited time; without a name, for the only one.
+def find_topic(
+    published: Published, wanted: str | None, kinds: Collection[str], option: str, within_s: float | None = None
+) -> PublishedTopic:
+    """Wait for the publisher of a topic of some message types, for a limited time; without a name, for the only one.
 
-    InputError where there are several and none is named, the named one holds no clouds, or none appeared in time.
+    InputError where there are several and none is named, the named one is of another type, or none appeared in time.
     """
-    begin = time.monotonic()
-    is_told = False
+    begin, is_told = time.monotonic(), False
     while True:
         topics = list(published())
         waited_s = time.monotonic() - begin
-        clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES]
+        fitting = [topic for topic in topics if topic.message_type in kinds]
+        names = ", ".join(topic.name for topic in fitting)
         for topic in topics:
-            if topic.name == wanted:
-                if topic not in clouds:
-                    kinds = ", ".join(CLOUD_TYPES)
-                    raise InputError(f"{topic.name}: holds {topic.message_type}, not one of {kinds}")
+            if wanted is not None and topic.name.lstrip("/") == wanted.lstrip("/"):
+                if topic not in fitting:
+                    raise InputError(f"{topic.name}: holds {topic.message_type}, not {' or '.join(kinds)}")
                 return topic
-        if wanted is None and clouds and waited_s > _SETTLED_S:
-            if len(clouds) > 1:
-                raise InputError(f"clouds are published on {_names(clouds)}; choose one with --topic")
-            return clouds[0]
-        seen = f"waiting for {wanted or 'clouds'} in domain {domain}; {_what_is_seen(clouds, len(topics))}"
+        if wanted is None and fitting and waited_s > _SETTLED_S:
+            if len(fitting) > 1:
+                raise InputError(f"several are published, {names}; choose one with {option}")
+            return fitting[0]
+        seen = (
+            f"waiting for {wanted or ' or '.join(kinds)}; {len(topics)} topics are seen, of that type"
+            f" {names or 'none: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)'}"
+        )
+        if within_s is not None and waited_s > within_s:
+            raise InputError(f"{within_s:g} s are over, {seen}")
         if waited_s > _PATIENCE_S and not is_told:
             logger.warning(seen)
             is_told = True
-        if within_s is not None and waited_s > within_s:
-            raise InputError(f"{within_s:g} s are over, {seen}")
         time.sleep(_POLL_S)
-
-
-def _names(topics: Iterable[PublishedTopic]) -> str:
-    return ", ".join(topic.name for topic in topics)
-
-
-def _what_is_seen(clouds: Iterable[PublishedTopic], topics: int) -> str:
-    if names := _names(clouds):
-        return f"clouds are published on {names}"
-    if topics:
-        return f"{topics} topics are published, none of them with clouds"
-    return "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
 
 
 @dataclass(frozen=True)
@@ -175,27 +169,6 @@ class IncomingQueue:
         times = [self._taken_ns, *(message.published_ns for message in self._waiting)]
         gaps = [after - before for before, after in zip(times, times[2:], strict=False)]
         return min(range(len(gaps)), key=gaps.__getitem__, default=0)
-
-
-def find_imu(published: Published, wanted: str | None) -> PublishedTopic:
-    """Wait briefly for the publisher of an IMU; without a name, for the only one.
-
-    InputError where there is none, or there are several and none is named.
-    """
-    end = time.monotonic() + _PATIENCE_S
-    while True:
-        imus = [topic for topic in published() if topic.message_type == IMU_TYPE]
-        found = imus if wanted is None else [topic for topic in imus if topic.name.lstrip("/") == wanted.lstrip("/")]
-        if len(found) == 1:
-            return found[0]
-        if len(found) > 1:
-            raise InputError(f"IMUs are published on {_names(imus)}; choose one with --set reader.imu_topic=NAME")
-        if time.monotonic() > end:
-            what = f"no {IMU_TYPE} is published{'' if wanted is None else f' on {wanted}'}"
-            raise InputError(
-                f"{what}; published: {_names(imus) or 'none'}. Choose --odometry learned, which needs none"
-            )
-        time.sleep(_POLL_S)
 
 
 class ImuReceiver:

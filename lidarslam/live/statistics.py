@@ -48,30 +48,21 @@ class LiveCounts:
 
     def text(self) -> str:
         """Lines for its end."""
-        lines = [
-            f"{count(self.received, 'message')} received, {self.missing} missing between their stamps,"
-            f" {self.dropped} dropped because registration was behind"
-        ]
-        latencies = {"arrival": self.from_arrival, "stamp": self.from_stamp}
-        lines += [
-            f"latency from the {of} of a scan to its pose: {ms}" for of, ms in latencies.items() if ms is not None
-        ]
-        return "\n".join(lines)
+        received = f"{count(self.received, 'message')} received, {self.missing} missing between their stamps"
+        latencies = (("arrival", self.from_arrival), ("stamp", self.from_stamp))
+        lines = (f"latency from the {of} of a scan to its pose: {ms}" for of, ms in latencies if ms is not None)
+        return "\n".join([f"{received}, {self.dropped} dropped because registration was behind", *lines])
 
     def warnings(self) -> list[str]:
         """Sentences about losses."""
-        found = []
-        if self.missing:
-            found.append(
-                f"{count(self.missing, 'scan')} missing between the stamps of those received: the network or the"
-                " publisher lost them; net.core.rmem_max bounds what the network may hold"
-            )
-        if self.dropped:
-            found.append(
-                f"{count(self.dropped, 'scan')} dropped: registration was slower than the sensor; leave it more of the"
-                " processor, or take --odometry constant-velocity"
-            )
-        return found
+        losses = (
+            (
+                self.missing,
+                "missing between the stamps of those received; net.core.rmem_max bounds the network",
+            ),
+            (self.dropped, "dropped, as registration was slower than the sensor: take --odometry constant-velocity"),
+        )
+        return [f"{count(number, 'scan')} {remedy}" for number, remedy in losses if number]
 
 
 class LiveStatistics:

@@ -20,15 +20,18 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.global_map import voxel_size_for
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.merge.parts import (
+    MergeOutcome,
     MergeRequest,
+    Part,
     PartDone,
     PartTask,
     Show,
     earlier_parts,
+    missing,
     open_parts,
     track_part,
+    write_merge,
 )
-from lidarslam.merge.writing import MergeOutcome, Part, missing, write_merge
 from lidarslam.pipeline.threads import BackgroundWorker
 from lidarslam.run.checkpoints import WITHOUT_EFFECT
 from lidarslam.run.interruption import Interruptions

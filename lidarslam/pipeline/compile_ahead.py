@@ -10,20 +10,18 @@ import sys
 from collections.abc import Callable
 from concurrent import futures
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from lidarslam.config.settings import Config
-from lidarslam.core.child_processes import bound
 from lidarslam.core.compiled import is_compiled
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.scan import Scan, squared_ranges
-from lidarslam.core.tasks import usable_cores
+from lidarslam.core.tasks import bound, usable_cores
 
 _RINGS, _COLUMNS, _SWEEP_S = 16, 900, 0.1
 _HALF_ROOM_M = np.array([8.0, 6.0, 2.0])
@@ -118,16 +116,14 @@ def _checks() -> None:
     shift_profile(surfels, surfels, np.eye(4), np.array([1.0, 0.0, 0.0]))
 
 
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """A part of the pipeline."""
 
     rehearse: Callable[[], None]  # run it
     modules: tuple[str, ...]  # that hold its loops, below lidarslam
-    is_late: bool = False  # whether the first scan's result needs none of them
 
 
-# In the order in which they are compiled: the longest first, late ones last.
+# In the order in which they are compiled: the longest first.
 PARTS = {
     "surfels": Part(
         _surfels,
@@ -148,7 +144,7 @@ PARTS = {
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.mounting")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),
-    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.consistency"), is_late=True),
+    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.consistency")),
 }
 """The parts whose loops are compiled."""
 
@@ -178,11 +174,10 @@ class CompileAhead:
     """
 
     def __init__(self, parts: list[str]) -> None:
-        self._parts = uncompiled(parts)
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_closed = False
         self._pool = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="compile")
-        self._done: dict[str, Future[None]] = {part: self._pool.submit(self._compile, part) for part in self._parts}
+        self._done: list[Future[None]] = [self._pool.submit(self._compile, part) for part in uncompiled(parts)]
 
     def __enter__(self) -> Self:
         return self
@@ -194,12 +189,11 @@ class CompileAhead:
             process.kill()
         self._pool.shutdown()
 
-    def wait(self, report: Callable[[str], None], for_first_scan: bool = False) -> None:
-        """Wait for all loops, or those that the first scan needs; `report` is called with a line about them."""
-        parts = [part for part in self._parts if not (for_first_scan and PARTS[part].is_late)]
-        pending = {self._done[part] for part in parts}
+    def wait(self, report: Callable[[str], None]) -> None:
+        """Wait for all loops; `report` is called with a line about them."""
+        pending = set(self._done)
         while pending:
-            report(f"compiling loops, once on this machine ({len(parts) - len(pending)} of {len(parts)})")
+            report(f"compiling loops, once on this machine ({len(self._done) - len(pending)} of {len(self._done)})")
             _, pending = futures.wait(pending, return_when=FIRST_COMPLETED)
 
     def _compile(self, part: str) -> None:

@@ -43,23 +43,13 @@ class ImuStream(Stateful):
         self._lever_sigma_m = KNOWN_LEVER_M
         self.is_placed = T_lidar_imu is not None  # whether its extrinsic calibration is given, or given as unknown
         self._rows: deque[FloatArray] = deque()
-        self._last_s, self._lock = -np.inf, Lock()
-        self._offset_s = 0.0
+        self.last_s, self._lock = -np.inf, Lock()  # the stamp of the last sample; minus infinity before the first
+        self.offset_s = 0.0  # the estimated delay of the samples' stamps, seconds
         self._inertial: Inertial | None = None
         self._comparison: Comparison | None = None
         self._corrections_left = MOST_CORRECTIONS
         self._scans, self._late, self._is_wrong = 0, 0, False
         self._said: set[str] = set()
-
-    @property
-    def last_s(self) -> float:
-        """The stamp of the last sample, seconds; minus infinity before the first."""
-        return self._last_s
-
-    @property
-    def offset_s(self) -> float:
-        """The estimated delay of the samples' stamps, seconds."""
-        return self._offset_s
 
     @property
     def direction(self) -> GravityDirection | None:
@@ -89,9 +79,9 @@ class ImuStream(Stateful):
         InputError where the stamp is not after the last one.
         """
         with self._lock:
-            if not stamp > self._last_s:
-                raise InputError(f"stamps must increase: {stamp:.9f} s is not after the last, {self._last_s:.9f} s")
-            self._last_s = stamp
+            if not stamp > self.last_s:
+                raise InputError(f"stamps must increase: {stamp:.9f} s is not after the last, {self.last_s:.9f} s")
+            self.last_s = stamp
             self._rows.append(np.concatenate([[stamp], angular_velocity, acceleration]))
             while self._rows[0][0] < stamp - _KEPT_S:
                 self._rows.popleft()
@@ -152,7 +142,7 @@ class ImuStream(Stateful):
             self._corrections_left = self._corrections_left - 1 if sentences else 0
             for sentence in sentences:
                 self._warn(sentence)
-            self._offset_s += found.significant_offset_s
+            self.offset_s += found.significant_offset_s
             if sentences:
                 self._begin_anew(found.corrected(T_lidar_imu))
             if not self._corrections_left:
@@ -171,7 +161,7 @@ class ImuStream(Stateful):
             rows = np.array(self._rows)
         if len(rows) < _FEWEST_SAMPLES:
             return None
-        samples = usable_samples(rows[:, 0] - self._offset_s, rows[:, 1:4], rows[:, 4:], None)
+        samples = usable_samples(rows[:, 0] - self.offset_s, rows[:, 1:4], rows[:, 4:], None)
         for note in samples.notes if samples is not None else ():
             kind = "".join(character for character in note if not character.isdigit())
             if kind not in self._said:

@@ -209,7 +209,6 @@ class Pipeline(Stateful):
         return replace(estimate, stage_ms=estimate.stage_ms | {"deskew": deskew_ms, "map": _ms_since(started)})
 
     def _add_pending(self, following: ScanEstimate | None = None) -> None:
-        """Add the last scan to the map, unless it is in it already."""
         added = self.map.add_pending(following)
         if added is not None and self._graph is not None:
             self._graph_worker.submit(self._graph.draw, *added)

@@ -14,7 +14,7 @@ from lidarslam.config.settings import CheckpointConfig, Config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved
+from lidarslam.core.state import Saved, write_state
 from lidarslam.core.text import count
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
@@ -25,7 +25,6 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RERUN
 from lidarslam.storage.finished_run import is_unconstrained, read_summary
-from lidarslam.storage.state_file import write_state
 from lidarslam.storage.unfinished import About, Unfinished
 
 logger = logging.getLogger(__name__)

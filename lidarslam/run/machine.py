@@ -26,34 +26,24 @@ def versions() -> dict[str, str]:
 def machine() -> dict[str, str]:
     """Processor, cores of this process, memory and system; unknown entries are left out."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    described = {
-        "processor": _processor(),
-        "cores": str(usable_cores()),
-        "memory": f"{memory:.1f} GiB",
-        "system": f"{platform.system()} {platform.release()} ({platform.machine()})",
-    }
-    return {name: text for name, text in described.items() if text}
+    system = f"{platform.system()} {platform.release()} ({platform.machine()})"
+    described = {"processor": _processor(), "cores": str(usable_cores()), "memory": f"{memory:.1f} GiB"}
+    return {name: text for name, text in (described | {"system": system}).items() if text}
 
 
 def _commit(folder: Path) -> str | None:
     """The commit of a checkout, marked where files differ from it; None without git or checkout."""
     if not (folder / ".git").exists():
         return None
+    command = ["git", "--no-optional-locks", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        head = _git(folder, "rev-parse", "--short=12", "HEAD")
-        changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+        done = subprocess.run([*command, "--exclude=*"], capture_output=True, text=True, timeout=10.0, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    return f"{head} and changes" if changed else head
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True).stdout.strip()
+    return done.stdout.strip()
 
 
 def _processor() -> str:
-    """Its name, which the standard library lacks on Linux."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
             key, _, value = line.partition(":")

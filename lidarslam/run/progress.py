@@ -26,28 +26,14 @@ class _RateColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:5.1f} scans/s")
 
 
-class _CountColumn(MofNCompleteColumn):
-    """Scans done of the total; nothing before the total is known."""
-
-    def render(self, task: Task) -> Text:
-        return Text() if task.total is None else super().render(task)
-
-
-class _RemainingColumn(TimeRemainingColumn):
-    """The time to the end; nothing before the number of scans is known."""
-
-    def render(self, task: Task) -> Text:
-        return Text() if task.total is None else super().render(task)
-
-
 def _bar(*more: ProgressColumn) -> Progress:
     """A bar on standard error; silent where no terminal is attached."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),  # so that all columns fit into a terminal of 80 characters
-        _CountColumn(),
+        MofNCompleteColumn(),
         _RateColumn(),
-        _RemainingColumn(),
+        TimeRemainingColumn(),
     )
     return Progress(*columns, *more, console=Console(stderr=True), disable=not sys.stderr.isatty())
 

@@ -1,15 +1,18 @@
-"""The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
+"""The results of a run: files in its directory, and the text that `lidarslam run` prints."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_own_folder
 from lidarslam.core.geometry import inverse
-from lidarslam.core.text import count
+from lidarslam.core.text import as_typed, command_line, count, joined, scan_span, small_length, up_to
 from lidarslam.core.trajectory import Trajectory, format_kitti, format_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording
@@ -24,12 +27,12 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.voxels import Tile
 from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.pipeline.map_building import MapBuilder
-from lidarslam.run.elevation import Elevation
+from lidarslam.run.calibration import Elevation
 from lidarslam.run.loop_closing import GraphOutcome
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import RunSummary, WrittenMap, summarise
+from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap, summarise
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import MAP_INDEX, MAP_TILES, RunDirectory
+from lidarslam.storage.directory import MAP_INDEX, MAP_PLY, MAP_TILES, REPORT, SCANS_CSV, SUMMARY, RunDirectory
 
 logger = logging.getLogger(__name__)
 
@@ -183,16 +186,12 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFor
 
 
 def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:
-    """Write final poses and odometry, and metrics.json where there is ground truth."""
     log, recording, truth = tracked.scans.log, tracked.recording, tracked.truth
     trajectory = log.trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
-    T_cam_lidar = unless_damaged(
-        lambda: None if recording is None else recording.T_cam_lidar,
-        log,
-        f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame",
-    )
+    consequence = f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame"
+    T_cam_lidar = unless_damaged(lambda: None if recording is None else recording.T_cam_lidar, log, consequence)
     poses = trajectory.T_world_lidar
     if T_cam_lidar is not None:  # the devkit compares camera poses
         poses = T_cam_lidar @ poses @ inverse(T_cam_lidar)
@@ -231,13 +230,8 @@ class TileWriter:
             for entry in self._entries.values():  # to free the space for the other results
                 (self._directory.path / MAP_TILES / entry["file"]).unlink(missing_ok=True)
             return
-        self._entries[tile] = {
-            "file": name,
-            "tile": list(tile),
-            "points": len(cloud),
-            "min": cloud.points.min(axis=0).round(4).tolist(),
-            "max": cloud.points.max(axis=0).round(4).tolist(),
-        }
+        low, high = (bound(cloud.points, axis=0).round(4).tolist() for bound in (np.min, np.max))
+        self._entries[tile] = {"file": name, "tile": list(tile), "points": len(cloud), "min": low, "max": high}
 
     def finish(self, tiled: TiledMap) -> None:
         """Write the index; OutputError where it could not be written."""
@@ -260,3 +254,109 @@ class TileWriter:
             raise OutputError(f"{folder}: a file is in the way; name another directory") from error
         except OSError as error:
             self.failure = cannot_write(folder, error)
+
+
+# A speed that differs by less is that of the recording.
+_ALIKE = 1.05
+# Stretches of lost scans that are listed; summary.json has them all.
+_LISTED = 3
+
+
+def format_outcome(out: Path, outcome: RunOutcome) -> str:
+    """A run in a few lines: size, speed, map, loops, accuracy, warnings, and where the files are."""
+    return joined(_lines(out, outcome))
+
+
+def format_stop(out: Path, outcome: RunOutcome) -> str:
+    """A line about a run that ended before its last scan."""
+    done = f"stopped after {count(outcome.summary.scans, 'scan')}: {outcome.stopped}"
+    if outcome.is_resumable:
+        return f"{done}; continue with --resume"
+    return f"{done}; {out} holds the results so far, but no checkpoint to continue from; --overwrite begins again"
+
+
+def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
+    summary = outcome.summary
+    yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
+    yield from format_times(summary)
+    if summary.odometry_asked < summary.scans:
+        yield f"odometry asked at {summary.odometry_asked:,} of {count(summary.scans, 'scan')}"
+    yield format_map(summary.map)
+    if summary.graph is not None:
+        yield _loops(summary.graph)
+    if outcome.metrics is not None:
+        yield from _accuracy(outcome.metrics)
+    yield from format_end(out, summary)
+    yield f"next: {command_line(as_typed('lidarslam'), 'view', str(out))}"
+    if outcome.metrics is not None:
+        yield f"      {command_line(as_typed('lidarslam'), 'evaluate', str(out))}"
+
+
+def format_times(summary: RunSummary) -> Iterator[str]:
+    """Lines about elapsed time and memory, and about the latency of one scan."""
+    elapsed = f"{summary.elapsed_s:.1f} s for all scans, {summary.elapsed_ms_per_scan:.1f} ms per scan"
+    yield f"{elapsed}{_speed(summary.realtime_factor)}; {summary.peak_rss_mb:,.0f} MB of memory"
+    latency, slowest = summary.latency_ms, summary.slowest
+    worst = "" if slowest is None else f"; slowest: scan {slowest.scan:,}, {slowest.ms:.0f} ms of {slowest.stage}"
+    yield f"latency of one scan: median {latency.median:.0f} ms, 99 % under {latency.p99:.0f} ms{worst}"
+
+
+def _speed(realtime_factor: float | None) -> str:
+    """By the time of all scans, the first one included, which waits for loops to be compiled and loaded."""
+    if realtime_factor is None or realtime_factor <= 0.0:
+        return ""
+    times = max(realtime_factor, 1.0 / realtime_factor)
+    if times < _ALIKE:
+        return ", as fast as recorded"
+    return f", {times:.1f} times {'faster' if realtime_factor > 1.0 else 'slower'} than recorded"
+
+
+def format_map(written: WrittenMap) -> str:
+    """A line about a map."""
+    if written.voxel_size_m is None:
+        return "no map: no scan was registered"
+    voxel = small_length(written.voxel_size_m)
+    fields = f", with {' and '.join(written.fields)}" if written.fields else ""
+    moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
+    entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
+    if written.tiled is not None:
+        return f"{_tiles(written.tiled)}{fields}{moved}; {MAP_PLY}: {count(written.points, 'point')}, one per {voxel}"
+    return f"map of {count(written.points, 'point')}, voxels of {voxel}{fields}{moved}{entropy}"
+
+
+def _tiles(tiled: TiledMap) -> str:
+    voxel, tiles = small_length(tiled.tiling.voxel_size_m), count(len(tiled.points), "tile")
+    return f"map of {count(tiled.total, 'point')} in {tiles}, {MAP_TILES}/, voxels of {voxel}"
+
+
+def _loops(graph: GraphSummary) -> str:
+    moved = f", poses corrected by {up_to(graph.largest_correction_m)}" if graph.closed else ""
+    rejected = len(graph.loops) - graph.closed
+    candidates = f" ({count(rejected, 'candidate')} rejected; {SUMMARY} gives the reasons)" if rejected else ""
+    return f"{count(graph.keyframes, 'keyframe')}, {count(graph.closed, 'loop')} closed{moved}{candidates}"
+
+
+def _accuracy(metrics: TrajectoryMetrics) -> Iterator[str]:
+    errors = metrics.errors
+    steps = ""
+    if errors.rpe_translation_rmse_m is not None and errors.rpe_rotation_rmse_deg is not None:
+        steps = f"; from scan to scan {errors.rpe_translation_rmse_m:.3f} m, {errors.rpe_rotation_rmse_deg:.2f} deg"
+    yield f"against ground truth: ATE {errors.ate_rmse_m:.3f} m, {errors.ate_rotation_rmse_deg:.2f} deg{steps}"
+    if metrics.kitti is not None:
+        drift = metrics.kitti.overall
+        yield f"KITTI drift {drift.translation_percent:.2f} %, {100.0 * drift.rotation_deg_per_m:.2f} deg per 100 m"
+    yield from (f"{name}: {text}" for name, text in metrics.plugin_lines())
+
+
+def format_end(out: Path, summary: RunSummary) -> Iterator[str]:
+    """Warnings, lost scans, and where the files are."""
+    for warning in summary.warnings:
+        yield f"warning: {warning}"
+    for stretch in summary.lost[:_LISTED]:
+        yield f"LOST on {scan_span(stretch.first, stretch.last)}: {stretch.reason}"
+    if more := max(0, len(summary.lost) - _LISTED):
+        yield f"LOST on {more} more {'stretch' if more == 1 else 'stretches'}"
+    if summary.lost_scans:
+        share = f"{summary.lost_scans:,} of {count(summary.scans, 'scan')}"
+        yield f"tracking was lost on {share}; {SUMMARY} and {SCANS_CSV} list them"
+    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"

@@ -37,9 +37,8 @@ from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
+from lidarslam.run.calibration import Elevation, imu_samples, open_inertial, with_elevations
 from lidarslam.run.checkpoints import Checkpoints, describe_computed
-from lidarslam.run.elevation import Elevation, with_elevations
-from lidarslam.run.inertial import imu_samples, open_inertial
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible
@@ -56,9 +55,6 @@ if TYPE_CHECKING:  # GTSAM and SciPy take a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
-
-# The folder of a run's results in UTM.
-UTM_FOLDER = "utm"
 
 R = TypeVar("R", RunRequest, LiveRequest)
 Progress = Callable[[int, int, ScanEstimate], None]
@@ -99,12 +95,13 @@ def execute(
     gnss = gnss_track(request)
     with open_session(request, phase, recording) as session:
         if request.resumable:
-            session.claim(describe_computed(request, recording), request.resume)
+            claim = Unfinished.claim(session.directory, describe_computed(request, recording), request.resume)
+            session.unfinished = session.opened.enter_context(claim)
         session.begin_graph(request.given, takes_gnss=True)
         if request.config.mapping.budget_ms is not None:
             session.log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
         session.show(recording.name, page)
-        session.wait_for_loops(for_first_scan=True)
+        session.wait_for_loops()
         session.request, recording = with_elevations(request, recording, chosen, phase)
         phase("reading the first scans")
         tracked = track(session, recording, chosen, progress, session.graph)
@@ -125,7 +122,6 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
 
 
 def _require_given(given: GivenLoops, scans: int) -> None:
-    """Refuse a loop closure, given or forbidden, of scans that a run lacks."""
     for option, pairs in (("--loop", given.closed), ("--no-loop", given.forbidden)):
         for first, second in pairs:
             if second >= scans:
@@ -149,14 +145,7 @@ class RunSession(Generic[R]):
     interruptions: Interruptions = field(default_factory=Interruptions)
     compiling: CompileAhead | None = None
     opened: ExitStack = field(default_factory=ExitStack)  # closed before the directory
-    _shown: ExitStack = field(default_factory=ExitStack)  # closed with the last that is shown
-
-    def claim(self, description: dict[str, Any], resume: bool) -> None:
-        """Save checkpoints of the run with that description, or resume it.
-
-        InputError where there is nothing to resume, it is damaged, or it is another run.
-        """
-        self.unfinished = self.opened.enter_context(Unfinished.claim(self.directory, description, resume))
+    shown: ExitStack = field(default_factory=ExitStack)  # closed with the last that is shown, before the summary
 
     def begin_graph(self, given: GivenLoops | None = None, takes_gnss: bool = False) -> None:
         """Begin the pose graph, where there is one, or resume that of the checkpoint."""
@@ -170,7 +159,7 @@ class RunSession(Generic[R]):
     def show(self, name: str, page: WebPage | None) -> None:
         """Open the viewer; a Rerun recording that cannot be written is a warning."""
         if self.request.rerun != "off":
-            self.viewer = self._shown.enter_context(self._viewing(name, page))
+            self.viewer = self.shown.enter_context(self._viewing(name, page))
 
     @contextmanager
     def _viewing(self, name: str, page: WebPage | None) -> Iterator[Viewer]:
@@ -183,10 +172,6 @@ class RunSession(Generic[R]):
         except IncompleteRecordingError as error:
             self.log.warn(f"no {RERUN}: {error}")
 
-    def close_viewer(self) -> None:
-        """End the viewer; a warning is added to the summary."""
-        self._shown.close()
-
     def take(self, estimate: ScanEstimate, total_ms: float, built: MapBuilder) -> None:
         """Log and show a scan, and at intervals the map."""
         self.log.add(estimate, total_ms)
@@ -195,15 +180,14 @@ class RunSession(Generic[R]):
         if built.global_map is not None and self.viewer.wants_map(index):
             self.viewer.show_map(built.global_map.points())
 
-    def wait_for_loops(self, for_first_scan: bool = False) -> None:
-        """Wait until loops are compiled: all, or those that the first scan needs."""
+    def wait_for_loops(self) -> None:
+        """Wait until loops are compiled."""
         if self.compiling is not None:
-            self.compiling.wait(self.phase, for_first_scan)
+            self.compiling.wait(self.phase)
 
     def end_scans(self) -> None:
         """From here on a request to end the run waits for the results."""
         self.interruptions.protect_results()
-        self.wait_for_loops()
         self.phase("writing the results")
 
     def finish(self, tracked: Tracked, described: dict[str, Any], gnss: "ProjectedTrack | None" = None) -> RunOutcome:
@@ -220,28 +204,16 @@ class RunSession(Generic[R]):
     def _show_final(self, drawn: DrawnMap) -> None:
         if drawn.cloud is not None:
             self.viewer.show_final_map(drawn.cloud.points)
-        self.close_viewer()
-
-    def conclude(self) -> None:
-        """Once the directory is closed: leave no checkpoint of a finished run, draw the report, and write in UTM."""
-        if self.outcome is None:
-            return
-        if self.unfinished is not None:
-            self.unfinished.end(self.outcome.stopped is not None)
-        if self.request.report:
-            draw_report(self.request.out, self.outcome, self.phase)
-        if self.gnss is not None:
-            self.phase("writing the results in UTM")
-            write_in_utm(self.request.out)
+        self.shown.close()
 
 
 @contextmanager
 def open_session(
     request: R, phase: Callable[[str], None], recording: Recording | None = None
 ) -> Iterator[RunSession[R]]:
-    """Load the odometry and lock the directory; after the block, everything is closed and the report is drawn.
+    """Load the odometry, which has to overlap with the recording where it is external, and lock the directory.
 
-    An external odometry has to overlap with the recording.
+    After the block, everything is closed, a finished run has no checkpoint, and report and UTM files are written.
     """
     prior, resume = (request.prior, request.resume) if isinstance(request, RunRequest) else (None, False)
     with Interruptions() as interruptions:
@@ -256,55 +228,49 @@ def open_session(
             session = RunSession(
                 request, directory, odometry, phase, interruptions=interruptions, compiling=compiling, opened=stack
             )
-            with session._shown:
+            with session.shown:
                 yield session
-        session.conclude()
+        if session.outcome is None:
+            return
+        if session.unfinished is not None:
+            session.unfinished.end(session.outcome.stopped is not None)
+        if request.report:
+            phase("drawing the report")
+            draw_report(request.out, session.outcome)
+        if session.gnss is not None:
+            phase("writing the results in UTM")
+            write_in_utm(request.out)
 
 
-def draw_report(out: Path, outcome: RunOutcome, phase: Callable[[str], None] = lambda _: None) -> None:
+def draw_report(out: Path, outcome: RunOutcome) -> None:
     """Draw report.html and its pictures; a failure is a warning."""
     from lidarslam.evaluation.comparison.comparison import MethodResult
     from lidarslam.viewer.run_report import leave_report
 
-    phase("drawing the report")
     leave_report(out, MethodResult(out.name, "ok", metrics=outcome.metrics))
 
 
 def write_in_utm(run: Path) -> None:
-    """Write map and trajectory of a finished run in UTM, in a folder of its own; see `lidarslam.exports.geo`.
-
-    Positions that do not determine the heading are a warning only: the run is written already.
-    """
+    """Write the results in UTM, too; positions that do not determine the heading are a warning."""
     from lidarslam.exports.geo import export_geo
 
     try:
-        for line in export_geo(run, run / UTM_FOLDER, overwrite=True):
+        for line in export_geo(run, run / "utm", overwrite=True):
             logger.info(line)
     except InputError as error:
         logger.warning("not written in UTM: %s", error)
 
 
-def require_no_trajectory(config: Config) -> None:
-    """Refuse an odometry that needs more of a recording than its scans one by one."""
-    if config.odometry.method == "external":
-        raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
-
-
 def open_odometry(config: Config, prior: Path | None) -> Odometry:
     """The configured odometry, which the caller closes; ConfigError where it does not go with the mapping."""
     method = config.odometry.method
-    if method == "constant-velocity" and not config.mapping.enabled:
+    if (method == "constant-velocity" or config.odometry.uses_imu) and not config.mapping.enabled:
         raise ConfigError(
-            "constant-velocity only predicts the motion, and needs scan-to-map registration. Choose --odometry learned,"
-            " give a trajectory with --prior, or a mapping with --mapping surfels or --mapping loam"
-        )
-    if config.odometry.uses_imu and not config.mapping.enabled:
-        raise ConfigError(
-            f"{method}: the IMU takes part in scan-to-map registration. Choose --odometry learned, or a mapping with"
-            " --mapping surfels or --mapping loam"
+            f"odometry.method={method} needs scan-to-map registration, which it gives a prediction. Choose --odometry"
+            " learned, give a trajectory with --prior, or a mapping with --mapping surfels or --mapping loam"
         )
     if method == "external" and prior is None:
-        raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
+        raise ConfigError("odometry.method=external needs a whole trajectory: give it with lidarslam run --prior FILE")
     if config.mapping.method not in MAPPINGS.built_in:
         MAPPINGS.load(config.mapping.method, Callable)  # so that nothing is written if it cannot be
     return where_needed(make_odometry(config.odometry, None if prior is None else read_tum(prior)), config)

@@ -15,19 +15,8 @@ from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.storage.directory import SIGMAS
 
 COLUMNS = (
-    "index",
-    "stamp",
-    "status",
-    "points",
-    "points_dropped",
-    "points_used",
-    "residual_m",
-    "inlier_ratio",
-    "degenerate_directions",
-    *SIGMAS,
-    "odometry_asked",
-    *(f"ms_{stage}" for stage in STAGES),
-    "message",
+    *("index", "stamp", "status", "points", "points_dropped", "points_used", "residual_m", "inlier_ratio"),
+    *("degenerate_directions", *SIGMAS, "odometry_asked", *(f"ms_{stage}" for stage in STAGES), "message"),
 )
 
 _STATUSES = tuple(Status)
@@ -149,10 +138,10 @@ class ScanLog(Stateful):
         return out.getvalue()
 
     def state(self) -> State:
-        """All of it."""
+        """See `Stateful`."""
         return super().state() | {"rows": self.table}
 
     def restore(self, saved: Saved) -> None:
-        """Resume from a state, before the first scan."""
+        """See `Stateful`."""
         super().restore(saved)
         self._rows = bytearray(saved.value("rows").tobytes())

@@ -18,7 +18,7 @@ from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES
-from lidarslam.run.elevation import Elevation
+from lidarslam.run.calibration import Elevation
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import SCANS_CSV
 from lidarslam.storage.finished_run import is_unconstrained
@@ -35,7 +35,7 @@ class Milliseconds:
     @classmethod
     def of(cls, values: Sequence[float] | FloatArray) -> "Milliseconds":
         """Of at least one time."""
-        return cls(*(float(np.percentile(values, share)) for share in (50.0, 95.0, 99.0)))
+        return cls(*np.percentile(values, [50.0, 95.0, 99.0]).tolist())
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,9 @@ class WrittenMap:
 
     def to_json(self) -> dict[str, Any]:
         """Its keys of summary.json."""
-        return {
-            "map_points": self.points,
-            "map_voxel_size_m": self.voxel_size_m,
-            "map_points_moved": self.moved,
-            "map_entropy": self.entropy,
-            "map_fields": list(self.fields),
-            "map_tiles": None if self.tiled is None else self.tiled.to_json(),
-        }
+        named = {f"map_{name}": getattr(self, name) for name in ("points", "voxel_size_m", "entropy")}
+        tiles = None if self.tiled is None else self.tiled.to_json()
+        return named | {"map_points_moved": self.moved, "map_fields": list(self.fields), "map_tiles": tiles}
 
 
 @dataclass(frozen=True)
@@ -101,20 +96,23 @@ class LoopReport:
 
     def to_json(self) -> dict[str, Any]:
         """An entry of summary.json."""
-        closure, of = self.closure, self.recordings
+        closure, of, T = self.closure, self.recordings, self.closure.T_first_second
         outlier = closure.accepted and not self.accepted
+        numbers = {
+            "overlap": closure.overlap,
+            "residual_m": closure.residual_m,
+            "inlier_ratio": closure.inlier_ratio,
+            "distance_m": float(np.linalg.norm(T[:3, 3])),
+            "turn_deg": float(np.rad2deg(rotation_angle(T))),
+        }
         return {
             "first_scan": self.scans[0],
             "second_scan": self.scans[1],
             "accepted": self.accepted,
             "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
             "found_by": "given" if closure.given else "appearance" if closure.by_appearance else "nearby",
-            "overlap": round(closure.overlap, 4),
-            "residual_m": round(closure.residual_m, 4) if np.isfinite(closure.residual_m) else None,
-            "inlier_ratio": round(closure.inlier_ratio, 4),
             "consistent": closure.consistent,
-            "distance_m": round(float(np.linalg.norm(closure.T_first_second[:3, 3])), 4),
-            "turn_deg": round(float(np.rad2deg(rotation_angle(closure.T_first_second))), 4),
+            **{name: round(number, 4) if np.isfinite(number) else None for name, number in numbers.items()},
             **({} if of is None else {"first_recording": of[0], "second_recording": of[1]}),
         }
 

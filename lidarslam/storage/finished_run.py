@@ -1,21 +1,20 @@
-"""Runs read back from disk."""
+"""Runs and comparisons read back from disk."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, with_config
-from typing_extensions import TypedDict
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.json_text import read_json
+from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.scan import PointAttributes
+from lidarslam.core.text import require_name
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
@@ -23,6 +22,7 @@ from lidarslam.datasets.point_table import coordinates, read_colours, read_inten
 from lidarslam.datasets.registry import absent, choose_reader
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
+from lidarslam.storage.directory import TRAJECTORY_TUM
 from lidarslam.storage.unfinished import require_whole
 
 _LISTED = 5
@@ -34,20 +34,12 @@ def not_a_run(path: Path) -> str:
     """Why nothing can be read from a path that should be a run directory."""
     if not path.exists():
         return absent(path)
-    if path.is_file():
-        if path.name in files.FILES and (path.parent / files.TRAJECTORY_TUM).is_file():
-            return f"{path}: is a file of the run {path.parent}; name the directory"
-        what = "is a file, expected a run directory"
-    else:
-        for pattern in _PATTERNS:
-            if found := sorted(str(file.parent) for file in path.glob(pattern)):
-                more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
-                return f"{path}: is no run, but holds some; name them: {', '.join(found[:_LISTED])}{more}"
-        what = f"not a run directory (no {files.TRAJECTORY_TUM})"
     with suppress(InputError):
         choose_reader(path)
-        return f"{path}: is a recording, {what}; make one with lidarslam run {path} --out RUN"
-    return f"{path}: {what}; lidarslam run makes one from a recording"
+        return f"{path}: is a recording, not a run directory; make one with lidarslam run {path} --out RUN"
+    runs = sorted(str(file.parent) for pattern in _PATTERNS for file in path.glob(pattern))
+    hint = f"it holds the runs {', '.join(runs[:_LISTED])}" if runs else "lidarslam run makes one from a recording"
+    return f"{path}: is not a run directory (no {files.TRAJECTORY_TUM}); {hint}"
 
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
@@ -194,54 +186,6 @@ def read_scans(path: Path, poses: int) -> ScanTable:
     return ScanTable(file, rows, statuses)
 
 
-class _Stretch(TypedDict):
-    first: NonNegativeInt
-    last: NonNegativeInt
-
-
-class _LostStretch(_Stretch):
-    reason: str
-
-
-class _Loop(TypedDict):
-    first_scan: int
-    second_scan: int
-    accepted: bool
-
-
-class _PoseGraph(TypedDict):
-    loops: list[_Loop]
-
-
-class _Localisation(TypedDict):
-    map: str
-
-
-class _Recording(TypedDict):
-    directory: str | None
-
-
-@with_config(ConfigDict(extra="allow"))  # at all depths
-class _Summary(TypedDict, total=False):
-    """The content that is read back, of any version; other keys are kept as they are."""
-
-    scans: NonNegativeInt
-    lost_scans: NonNegativeInt
-    lost: list[_LostStretch]
-    map_contradictions: list[_Stretch]
-    length_m: float
-    unconstrained_m: float
-    map_voxel_size_m: Annotated[float, Field(gt=0.0)] | None
-    map_entropy: float | None
-    ms_per_scan: dict[str, dict[str, float | None]]
-    pose_graph: _PoseGraph | None
-    localisation: _Localisation | None
-    recordings: list[_Recording]
-    warnings: list[str]
-
-
-_SHAPE = TypeAdapter(_Summary)
-
 # Share of the path, of a metre at least, that may be unconstrained.
 _MOST_UNCONSTRAINED, _SHORTEST_M = 0.1, 1.0
 
@@ -257,6 +201,38 @@ def read_summary(path: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        return cast(dict[str, Any], read_json(file, _SHAPE))
+        return read_json(file, ANY_OBJECT)
     except (OSError, ValueError) as error:
         raise InputError(f"{file}: not a run's summary ({error}); make the run again") from error
+
+
+# Each recording's folder holds its own comparison.json, where there are several.
+COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"
+# Next to the recordings' folders: recordings that a benchmark has made.
+RECORDINGS = "recordings"
+RESERVED = frozenset({COMPARISON, REPORT_HTML, REPORT_MD, RECORDINGS})
+
+
+def run_directories(path: Path) -> list[Path]:
+    """The run directories of a comparison of one recording, in its order; any other path itself.
+
+    InputError where the comparison is of several recordings, has no run, or its file is damaged.
+    """
+    file = path / COMPARISON
+    if not file.is_file() or (path / TRAJECTORY_TUM).is_file():
+        return [path]
+    try:
+        content = read_json(file, ANY_OBJECT)
+        sequences = content.get("sequences")
+        if sequences is not None:
+            names = ", ".join(str(path / sequence["sequence"]) for sequence in sequences)
+            raise InputError(f"{path}: compares several recordings, in worlds of their own; name one of {names}")
+        places = [method["run"] for method in content["methods"].values() if method["run"]]
+        # A recording's name and a method's: a comparison names no runs elsewhere.
+        runs = [Path(*(require_name(part, "run") for part in place.split("/"))) for place in places]
+    except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
+        raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
+    if not runs:
+        raise InputError(f"{path}: none of its methods came to a result")
+    # Next to its methods' folders, or, of one of several recordings, in the same folder as these.
+    return [path / run if (path / run).is_dir() else path.parent / run for run in runs]

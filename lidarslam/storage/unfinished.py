@@ -12,11 +12,10 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
+from lidarslam.core.files import make_own_folder, only_writer, remove_partial_files, written
 from lidarslam.core.json_text import read_json
-from lidarslam.core.state import Saved
+from lidarslam.core.state import Saved, read_state
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, describes_run, remove_files
-from lidarslam.storage.state_file import read_state
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +39,7 @@ class About:
         """Of the run in a directory; None where none is unfinished; InputError where the file is damaged."""
         path = run / ABOUT
         try:
-            return read_json(path, _SHAPE, any_path=True)
+            return read_json(path, _SHAPE)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError) as error:
@@ -48,11 +47,8 @@ class About:
 
     def write(self, run: Path) -> None:
         """Write run.json, durably; OutputError where it cannot be written."""
-        with replacing(run / ABOUT, durable=True) as partial:
-            try:
-                partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
-            except OSError as error:
-                raise cannot_write(run / ABOUT, error) from error
+        with written(run / ABOUT, durable=True) as partial:
+            partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
 
     def remedy(self, run: Path) -> str:
         """The remedy, as the end of a sentence that begins with the directory."""
@@ -89,7 +85,6 @@ def _warn_of_earlier(run: Path) -> None:
 
 
 def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
-    """Refuse to resume a run that was begun with another description than is asked for."""
     old, new = _flat(was), _flat(asked)
     names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
     if names:
@@ -101,7 +96,6 @@ def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by their dotted names."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
@@ -116,18 +110,6 @@ class CheckpointFiles:
         self.state = run / STATE  # after the last scans
         self.submaps, self.tiles = self.folder / "submaps.bin", self.folder / "tiles.bin"  # of graph and global map
         self.tracked = self.folder / "tracked.npz"  # a recording of a merge that was tracked
-
-    def require_own(self) -> None:
-        """Before anything is resumed from them, or locked; InputError where their folder is a link."""
-        if self.folder.is_symlink():
-            raise InputError(f"{self.folder}: is a link to another place; begin again with --overwrite")
-
-    def make_folder(self) -> None:
-        """Make the folder, unless it exists; a link there is replaced; OutputError where it cannot be made."""
-        try:
-            make_own_folder(self.folder)
-        except OSError as error:
-            raise cannot_write(self.folder, error) from error
 
     def remove(self) -> None:
         """Remove them, and their folder when it is empty then."""
@@ -178,13 +160,12 @@ class Unfinished:
         run = directory.path
         about = About(description)
         if resume:
-            CheckpointFiles(run).require_own()
             if (begun := About.read(run)) is None:
                 raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
             _require_same(run, begun.description, description)
             about = begun
         unfinished = cls(run, about, resume)
-        unfinished.files.make_folder()
+        make_own_folder(unfinished.files.folder)
         for folder in (run, unfinished.files.folder):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()

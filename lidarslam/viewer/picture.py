@@ -21,9 +21,8 @@ from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.association import common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.storage.comparison_folder import run_directories
 from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
-from lidarslam.storage.finished_run import read_scans, read_trajectory, shown_map
+from lidarslam.storage.finished_run import read_scans, read_trajectory, run_directories, shown_map
 from lidarslam.viewer import annotations as notes
 from lidarslam.viewer.annotations import UNKNOWN, Colour, ColourScale, Entry, Quantity, fit_scale
 from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view, turning_views

@@ -23,8 +23,8 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 from urllib.request import ProxyHandler, build_opener
 
-from lidarslam.core.child_processes import bound
 from lidarslam.core.errors import OutputError
+from lidarslam.core.tasks import bound
 
 LOCAL = "127.0.0.1"
 # The first free one of these; Rerun's own default comes first.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.core.child_processes import bound
+from lidarslam.core.tasks import bound
 
 ROOT = Path(__file__).parents[2]
 SLEEP = "import time; time.sleep(60)"

@@ -1,6 +1,5 @@
 """Files are whole or absent, a directory has one writer, texts are bounded, arrays are read on several threads."""
 
-import os
 import threading
 from pathlib import Path
 
@@ -73,14 +72,6 @@ def test_what_is_no_text_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "text").write_bytes(content)
     with pytest.raises(InputError, match="text: cannot be read as text"):
         list(bounded_lines(tmp_path / "text"))
-
-
-def test_a_file_of_nothing_is_refused_at_once(tmp_path: Path) -> None:
-    """Twenty gigabytes that take no room on the disk."""
-    (tmp_path / "sparse").touch()
-    os.truncate(tmp_path / "sparse", 20 << 30)
-    with pytest.raises(InputError, match="a line has more than 65,536 bytes"):
-        list(bounded_lines(tmp_path / "sparse"))
 
 
 def test_a_text_has_a_bounded_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

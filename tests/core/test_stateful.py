@@ -1,17 +1,18 @@
-"""Saved state by type hints: what was saved comes back equal, and a tree of other types or shapes is refused."""
+"""Saved state: what was saved comes back equal, other types and shapes are refused, a file is whole or absent."""
 
+import os
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, Shape, Stateful
-from lidarslam.storage.state_file import read_state, write_state
+from lidarslam.core.state import Saved, Shape, Stateful, read_state, write_state
 
 
 class Colour(Enum):
@@ -94,6 +95,35 @@ def test_other_types_and_shapes_are_refused(change, message):
     change(tree)
     with pytest.raises(InputError, match=message):
         Everything(False).restore(Saved(tree))
+
+
+@pytest.mark.parametrize("flips", [True, False])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.7])
+def test_a_damaged_file_is_told(tmp_path, share, flips):
+    path = tmp_path / "state.npz"
+    write_state(path, {"poses": np.linspace(0.0, 1.0, 1600)})
+    content = bytearray(path.read_bytes())
+    at = int(share * len(content))
+    content[at] ^= 0xFF
+    path.write_bytes(content if flips else content[:at])
+    with pytest.raises(InputError, match="is damaged"):
+        read_state(path)
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_failed_write_leaves_the_earlier_state(tmp_path, monkeypatch, step):
+    path = tmp_path / "state.npz"
+    write_state(path, {"number": 1})
+
+    def fail(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os if step == "fsync" else Path, step, fail)
+    with pytest.raises(OutputError, match="No space left"):
+        write_state(path, {"number": 2})
+    monkeypatch.undo()
+    assert read_state(path).value("number") == 1
+    assert [entry.name for entry in tmp_path.iterdir()] == ["state.npz"]
 
 
 def assert_equal(one: Any, other: Any) -> None:

@@ -76,15 +76,6 @@ def test_chain_inverts_relative_motions(random_trajectory):
     np.testing.assert_array_equal(chain(np.eye(4), np.zeros((0, 4, 4))), [np.eye(4)])
 
 
-def test_another_world_changes_no_motion(random_trajectory):
-    trajectory = random_trajectory()
-    T_new_world = exp([0.5, -1.0, 2.0, 10.0, 20.0, 30.0])
-    moved = trajectory.transformed(T_new_world)
-    np.testing.assert_allclose(moved.relative_motions(), trajectory.relative_motions(), atol=1e-9)
-    np.testing.assert_allclose(moved.T_world_lidar[3], T_new_world @ trajectory.T_world_lidar[3])
-    assert moved.length_m == pytest.approx(trajectory.length_m)
-
-
 def test_interpolation_is_exact_for_constant_body_velocity():
     trajectory = moving([0.0, 0.1, 0.35, 0.4, 1.0])
     stamps = np.array([0.72, 0.0, 0.05, 1.0, 0.1, 0.39])
@@ -172,14 +163,18 @@ def test_tum_dialects(text, written):
 @pytest.mark.parametrize(
     ("read", "text", "words"),
     [
-        (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got 7"),
-        (read_tum, "# header\n1 0 0 0 zero 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got '1 0 0 0 zero 0 0 1'"),
+        (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r"poses\.txt:2: expected 8 numbers, got 7 words"),
+        (
+            read_tum,
+            "# header\n1 0 0 0 zero 0 0 1\n",
+            r"poses\.txt:2: expected 8 numbers, got 8 words, .1 0 0 0 zero",
+        ),
         (read_tum, "1 0 0 0 0 0 0 nan\n", r"poses\.txt.*no poses"),
         (read_tum, "1 0 0 0 0 0 0 0\n", r"poses\.txt.*no poses"),
         (read_tum, "1 0 0 0 90 0 45 1\n", r"poses\.txt.*no poses"),
         (read_tum, "# only a header\n", r"poses\.txt: holds no pose; expected"),
         (read_tum, b"\xff\xfe\x00\x01", r"poses\.txt: cannot be read as text"),
-        (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt:1: expected 12 numbers, got 11"),
+        (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt:1: expected 12 numbers, got 11 words"),
         (read_kitti_poses, "2 0 0 0 0 2 0 0 0 0 2 0\n", r"poses\.txt.*no poses"),
         (read_kitti_poses, "1 0 0 0 0 1 0 0 0 0 -1 0\n", r"poses\.txt.*no poses"),
         (read_kitti_poses, "", r"poses\.txt: holds no pose; expected twelve"),

@@ -14,7 +14,7 @@ import pytest
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import Saved, State, read_state
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.interface import ConstantVelocity
@@ -27,7 +27,6 @@ from lidarslam.run.checkpoints import Checkpoints, scans_left
 from lidarslam.run.results import TileWriter
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import CONFIG, RunDirectory
-from lidarslam.storage.state_file import read_state
 from lidarslam.storage.unfinished import About, Unfinished, require_whole
 
 

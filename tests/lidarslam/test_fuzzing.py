@@ -179,7 +179,6 @@ def damage(folder: Path, patterns: tuple[str, ...], which: float, made: list[Cha
 
 
 DEEP = "[" * 100_000
-_PLY = "ply\nformat ascii 1.0\nelement face 99999999999999999999\nproperty int a\nelement vertex 1\nproperty float x\n"
 # Faults of earlier days: the pattern of the file, as a share of them, and its content.
 SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
     "ply": [(0.4, seed("1e999\n" * 4))],
@@ -207,29 +206,6 @@ def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pyte
     for which, made in SEEDS.get(kind, []):
         check = example(which, made)(check)
     fuzzed(given(st.floats(0.0, 1.0, exclude_max=True), changes)(check))()
-
-
-RUN_FILES = ("summary.json", "trajectory.tum", "map.ply", "config.yaml", "scans.csv", "metrics.json")
-
-
-@fuzzed
-@given(st.sampled_from([f"run/{name}" for name in RUN_FILES]), changes)
-@example("run/config.yaml", seed("run: " + DEEP))
-@example("run/map.ply", seed(_PLY + "end_header\n1\n2\n3.0\n"))
-def test_a_damaged_run(
-    tmp_path: Path, small_recording: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch, name: str, made: list
-) -> None:
-    shutil.rmtree(tmp_path / "run", ignore_errors=True)
-    shutil.copytree(whole_run, tmp_path / "run")
-    path = tmp_path / name
-    path.write_bytes(changed(path.read_bytes(), made))
-    with nothing_else_changes(tmp_path, monkeypatch):
-        ends_well("info", tmp_path / "run")
-        ends_well("view", tmp_path / "run", "--picture", tmp_path / "out" / "picture.png")
-        ends_well("evaluate", tmp_path / "run/trajectory.tum", "--reference", small_recording / "ground_truth.tum")
-        ends_well("run", small_recording, "--out", tmp_path / "out", "--overwrite", "--config", path, *FAST)
-    ends_well("evaluate", tmp_path / "run", "--reference-map", whole_run / "map.ply")
-    assert {path.name for path in tmp_path.iterdir()} <= {"run", "out", "here"}
 
 
 @pytest.fixture(scope="session")

@@ -104,7 +104,7 @@ def test_a_recording_without_an_imu_is_refused_in_one_line(method: str, small_re
 
 def test_an_imu_needs_a_map(recording: Path, tmp_path: Path) -> None:
     said = refused(*run(recording, tmp_path / "run", "--no-mapping"))
-    assert "the IMU takes part in scan-to-map registration" in said
+    assert "odometry.method=imu needs scan-to-map registration" in said
 
 
 @pytest.mark.long

@@ -26,10 +26,9 @@ from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import header, point_cloud
-from lidarslam.live.clouds import CloudDecoder
 from lidarslam.live.live import bounded
-from lidarslam.live.messages import PosePublisher, serialize_transform
-from lidarslam.live.receiving import IncomingQueue, PublishedTopic, Received, find_imu, find_topic
+from lidarslam.live.messages import CloudDecoder, PosePublisher, serialize_transform
+from lidarslam.live.receiving import IncomingQueue, PublishedTopic, Received, find_topic
 from lidarslam.live.statistics import LiveStatistics, count_missing
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
@@ -291,20 +290,19 @@ def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock() -> None
     assert "3 scans dropped" in other.counts(dropped=3).warnings()[0]
 
 
-def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_only_topic_of_a_type_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lidarslam.live.receiving._SETTLED_S", 0.0)
     clouds, other = PublishedTopic("/points", CLOUD), PublishedTopic("/scan", "sensor_msgs/msg/LaserScan")
+    several = [PublishedTopic("/a", CLOUD), PublishedTopic("/b", CLOUD), other]
     seen = iter([[], [other], [clouds]])
-    assert find_topic(lambda: next(seen, [clouds]), None, 0) is clouds
-    with pytest.raises(InputError, match="clouds are published on /a, /b; choose one with --topic"):
-        find_topic(lambda: [PublishedTopic("/a", CLOUD), PublishedTopic("/b", CLOUD)], None, 0)
+    assert find_topic(lambda: next(seen, [clouds]), None, [CLOUD], "--topic") is clouds
+    assert find_topic(lambda: several, "b", [CLOUD], "--topic") is several[1]
+    with pytest.raises(InputError, match="several are published, /a, /b; choose one with --topic"):
+        find_topic(lambda: several, None, [CLOUD], "--topic")
     with pytest.raises(InputError, match="/scan: holds sensor_msgs/msg/LaserScan"):
-        find_topic(lambda: [other], "/scan", 0)
-
-
-def test_it_waits_no_longer_than_it_is_told() -> None:
-    with pytest.raises(InputError, match=r"0.3 s are over, waiting for /points in domain 3; no ROS 2 topic"):
-        find_topic(lambda: [], "/points", 3, 0.3)
+        find_topic(lambda: [other], "/scan", [CLOUD], "--topic")
+    with pytest.raises(InputError, match=r"0.3 s are over, waiting for /points; 0 topics are seen"):
+        find_topic(lambda: [], "/points", [CLOUD], "--topic", 0.3)
 
 
 VELOCITY, COVARIANCE = np.array([0.0, 0.0, 0.5, 2.0, 0.0, 0.0]), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-4
@@ -409,14 +407,3 @@ def test_an_imu_beside_the_clouds_takes_part(tmp_path: Path, domain: int, starte
         turns = log(inverse(found.relative_motions()) @ true)[:, :3]
         errors[method] = float(np.rad2deg(np.sqrt((turns**2).sum(axis=1).mean())))
     assert 3.0 * errors["imu"] < errors["constant-velocity"], errors
-
-
-def test_the_only_imu_is_chosen() -> None:
-    def topics(*names: str) -> Callable[[], list[PublishedTopic]]:
-        imus = [PublishedTopic(name, "sensor_msgs/msg/Imu") for name in names]
-        return lambda: [PublishedTopic("/points", CLOUD), *imus]
-
-    assert find_imu(topics("/imu"), None).name == "/imu"
-    assert find_imu(topics("/a/imu", "/b/imu"), "b/imu").name == "/b/imu"
-    with pytest.raises(InputError, match=r"published on /a, /b; choose one with --set reader.imu_topic"):
-        find_imu(topics("/a", "/b"), None)

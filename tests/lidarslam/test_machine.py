@@ -31,4 +31,4 @@ def test_a_checkout_has_a_commit_and_says_that_files_differ(tmp_path: Path, monk
     commit = versions()["commit"]
     assert len(commit) == 12
     (tmp_path / "a").write_text("2")
-    assert versions()["commit"] == f"{commit} and changes"
+    assert versions()["commit"] == f"{commit}-dirty"

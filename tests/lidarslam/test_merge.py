@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -22,8 +21,7 @@ from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_tum
 from lidarslam.merge.merge import merge
-from lidarslam.merge.parts import MergeRequest
-from lidarslam.merge.writing import MergeOutcome, format_merge
+from lidarslam.merge.parts import MergeOutcome, MergeRequest, format_merge
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.run import Progress
 from lidarslam.simulation.motion import Motion
@@ -339,34 +337,6 @@ def test_a_killed_merge_is_refused_and_resumed_or_made_again(
     merge(request(reversed_out, *rooms[::-1], overwrite=True, settings=FAST), quiet)
     assert not list(reversed_out.rglob("unfinished"))
     assert folders(reversed_out) == ["01_in_room_1", "02_in_room_0"]
-
-
-@pytest.mark.slow
-def test_what_a_killed_overwrite_of_a_merge_was_to_replace_is_given_back(
-    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
-) -> None:
-    """Killed on its way, and among its final results."""
-    rooms, root, counted = rooms[:2], tmp_path / "killed", tmp_path / "counted" / "1000000"
-    merge(request(counted, *rooms, settings=(*FAST, "global_map.voxel_size_m=0.5")), quiet)
-    shutil.copytree(counted, tmp_path / "earlier")
-    things = int(killed_merges(counted.parent, [1_000_000], rooms, "--overwrite").splitlines()[-1])
-    kills = [round(share * things) for share in (0.5, 0.9)]
-    for kill_at in kills:
-        shutil.copytree(tmp_path / "earlier", root / str(kill_at))
-    killed_merges(root, kills, rooms, "--overwrite")
-    for kill_at in kills:
-        out, parts = root / str(kill_at), sorted((root / str(kill_at)).glob("0*"))
-        assert (out / "unfinished" / "run.json").exists()
-        if kill_at == kills[0]:
-            earlier = timeless(tmp_path / "earlier")
-            assert {name: content for name, content in timeless(out).items() if name in earlier} == earlier
-            assert len(load_map(out).points)
-            assert [len(load_run(part).trajectory) for part in parts] == [5, 5]
-        else:
-            with pytest.raises(InputError, match="did not finish"):
-                load_map(out)
-        merge(request(out, *rooms, resume=True, settings=FAST), quiet)
-        assert timeless(out) == timeless(counted)
 
 
 @pytest.mark.long

@@ -20,4 +20,3 @@ def test_before_the_first_scan_the_bar_says_what_goes_on(monkeypatch: pytest.Mon
         progress.phase("compiling loops")
     assert "compiling loops" in terminal.getvalue()
     assert "a[red]b[/nothing]" in terminal.getvalue()
-    assert "0/?" not in terminal.getvalue()

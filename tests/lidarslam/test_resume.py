@@ -282,9 +282,6 @@ def go_on(expected: Whole, out: Path, *more: str) -> None:
     expected.assert_same(out)
 
 
-EVERYWHERE = 24
-
-
 @pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
 @pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10), ("tiles", 5)])
 def test_a_run_may_be_killed_before_anything_it_does_on_disk(
@@ -311,22 +308,6 @@ def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
         (str(path.relative_to(folder)), hashlib.sha256(path.read_bytes()).digest() if path.is_file() else b"")
         for path in sorted(folder.rglob("*"))
     )
-
-
-@pytest.mark.slow  # a fork and two runs for every kill: a minute
-@pytest.mark.parametrize("method", METHODS)
-def test_a_run_may_be_killed_at_any_time(
-    whole: Callable[[str], Whole], tmp_path: Path, rng: np.random.Generator, method: str
-) -> None:
-    expected = whole(method)
-    for number, delay_s in enumerate(rng.uniform(0.0, 1.2 * expected.ended.seconds, EVERYWHERE)):
-        out = tmp_path / str(number)
-        ended = expected.again(out, kill_after_s=float(delay_s))
-        if ended.status == KILLED:
-            go_on(expected, out)
-        else:  # it was done before
-            assert ended.status == expected.ended.status, ended.said
-            expected.assert_same(out)
 
 
 @pytest.mark.long
@@ -394,19 +375,6 @@ def test_another_recording_is_not_taken_for_it(expected: Whole, source: Path, ki
         table["x"] += 0.01
         np.save(path, table)
     assert_refused(expected.again(killed, "--resume", source=other), "the recording has changed")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["state.npz", "run.json"])
-def test_damage_is_told_in_one_line(expected: Whole, killed: Path, name: str) -> None:
-    path = killed / "unfinished" / name
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    ended = expected.again(killed, "--resume")
-    assert_refused(ended, f"{name}: is damaged")
-    assert "--overwrite" in ended.said
-    expected.assert_finishes(killed, "--overwrite")
 
 
 @pytest.mark.long

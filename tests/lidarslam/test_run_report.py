@@ -14,7 +14,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.evaluation.comparison.comparison import MethodResult
-from lidarslam.storage.comparison_folder import run_directories
+from lidarslam.storage.finished_run import run_directories
 from lidarslam.viewer.run_report import leave_report
 
 from ..conftest import succeeds

@@ -9,9 +9,9 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
+from lidarslam.run.results import format_times
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import Milliseconds, SlowestScan, WrittenMap, summarise
-from lidarslam.run.summary_text import format_times
 
 from .conftest import scan_estimate
 
@@ -64,10 +64,6 @@ def test_the_slowest_stage_is_not_that_of_the_first_scan_which_loads_loops() -> 
     stage_ms[0], stage_ms[2, STAGES.index("refine")] = 900.0, 77.0
     assert SlowestScan.of(stage_ms) == SlowestScan(2, "refine", 77.0)
     assert SlowestScan.of(stage_ms[:1]) is None
-
-
-def test_percentiles_are_of_all_scans() -> None:
-    assert Milliseconds.of(np.arange(101.0)) == Milliseconds(50.0, 95.0, 99.0)
 
 
 def test_a_warning_is_kept_once_and_a_correction_leaves_the_odometry(log: ScanLog) -> None:

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.config.settings import Config, dump_yaml, load_config
-from lidarslam.config.shipped import BENCHMARKS, CONFIGS, headline, shipped_files
+from lidarslam.config.settings import BENCHMARKS, CONFIGS, Config, dump_yaml, headline, load_config, shipped_files
 
 from ..conftest import lidarslam
 

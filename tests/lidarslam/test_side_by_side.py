@@ -27,8 +27,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.merge import parts as tracking
 from lidarslam.merge.merge import merge
-from lidarslam.merge.parts import MergeRequest
-from lidarslam.merge.writing import MergeOutcome
+from lidarslam.merge.parts import MergeOutcome, MergeRequest
 from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam
@@ -39,19 +38,6 @@ pytest.importorskip("ray")
 METHODS = "constant-velocity+map,learned+map,prior"
 # The files of a run that hold times, or the memory that was taken.
 TIMED = {"summary.json", "scans.csv", "process.json", "process.log"}
-
-# Each start of a method is a line in the file; what it does then depends on its name and on how often it was started.
-COUNTED = """
-import json, os, signal, sys, time
-from pathlib import Path
-signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-log, request = Path(sys.argv[1]), json.loads(sys.argv[-1])["request"]
-name = Path(request["out"]).name
-with log.open("a") as file: file.write(f"{name} {os.getppid()} {os.getpid()}\\n")
-starts = sum(line.startswith(f"{name} ") for line in log.read_text().splitlines())
-if name.startswith("learned") and starts == 1 and sys.argv[2] == "wait": time.sleep(120)
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_run", *sys.argv[3:]])
-"""
 
 
 def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str, **changes: Any) -> CompareOutcome:
@@ -83,19 +69,6 @@ def serial(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> d
     out = tmp_path_factory.mktemp("compared") / "serial"
     _compare(small_recording, out, SERIAL, Told())
     return _contents(out)
-
-
-@pytest.fixture
-def counted(tmp_path: Path) -> tuple[str, str, str]:
-    """The process of a method, whose starts are lines in `starts`."""
-    file = tmp_path / "counted.py"
-    file.write_text(COUNTED)
-    return sys.executable, str(file), str(tmp_path / "starts")
-
-
-def _starts(tmp_path: Path) -> list[list[str]]:
-    file = tmp_path / "starts"
-    return [line.split() for line in file.read_text().splitlines()] if file.exists() else []
 
 
 def _wait_for(condition: Any, seconds: float = 60.0) -> None:
@@ -133,51 +106,6 @@ def test_side_by_side_is_the_same_as_one_after_another(
     _compare(small_recording, tmp_path / "out", Where(2), again, *none, reuse=True)
     assert all("in an earlier comparison" in line for line in again.lines)
     assert _contents(tmp_path / "out") == serial
-
-
-@pytest.mark.slow
-def test_a_node_that_dies_costs_only_its_tasks(
-    small_recording: Path, tmp_path: Path, serial: dict[str, Any], counted: tuple[str, ...]
-) -> None:
-    """That with `learned+map` at work is killed."""
-    died: list[int] = []
-
-    def doomed(nodes: list[Any]) -> Any:
-        """The node whose raylet is the parent of the worker that started the method."""
-        import psutil
-
-        _wait_for(lambda: any(name == "learned+map" for name, *_ in _starts(tmp_path)))
-        _, worker, process = next(start for start in _starts(tmp_path) if start[0] == "learned+map")
-        raylet = psutil.Process(int(worker)).ppid()
-        _wait_for(lambda: len({name for name, *_ in _starts(tmp_path)}) == 3)
-        died.append(int(process))
-        return next(n for n in nodes if any(p.process.pid == raylet for p in n.all_processes["raylet"]))
-
-    with _two_nodes(doomed) as where:
-        _compare(small_recording, tmp_path / "out", where, Told(), *counted, "wait")
-    assert died
-    assert sorted(name for name, *_ in _starts(tmp_path)) == sorted([*METHODS.split(","), "learned+map"])
-    assert _contents(tmp_path / "out") == serial
-    assert not Path(f"/proc/{died[0]}").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_ends_all_methods_and_writes_what_there_is(
-    small_recording: Path, tmp_path: Path, counted: tuple[str, ...], told: Told
-) -> None:
-    def interrupt() -> None:
-        _wait_for(lambda: any("prior" in line for line in told.lines) and len(_starts(tmp_path)) == 3)
-        time.sleep(0.5)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    threading.Thread(target=interrupt, daemon=True).start()
-    outcome = _compare(small_recording, tmp_path / "out", Where(2), told, *counted, "wait")
-    assert outcome.interrupted
-    rows = {row.name: row.status for row in outcome.comparison.sequences[0].methods}
-    assert rows == {"constant-velocity+map": "ok", "learned+map": "not run", "prior": "ok"}
-    assert json.loads((tmp_path / "out" / "comparison.json").read_text())["notes"][0].startswith("interrupted")
-    assert not any(Path(f"/proc/{process}").exists() for _, _, process in _starts(tmp_path))
 
 
 @pytest.mark.slow
