@@ -293,12 +293,11 @@ class VoxelGrid(Stateful):
         """Insert points (N, 3) of the world."""
         keys = point_keys(points, self.cell_m)
         rows = self._hash.insert(keys)
-        new = np.flatnonzero(rows >= len(self._keys))
-        if len(new):
-            grown = np.empty(len(self._hash), dtype=np.int64)
-            grown[: len(self._keys)], grown[rows[new]] = self._keys, keys[new]
-            self._sums = np.concatenate([self._sums, np.zeros((len(grown) - len(self._keys), 10))])
-            self._keys = grown
+        new = len(self._hash) - len(self._keys)
+        if new:
+            self._keys = np.concatenate([self._keys, np.empty(new, dtype=np.int64)])
+            self._keys[rows] = keys
+            self._sums = np.concatenate([self._sums, np.zeros((new, 10))])
         add_moments(np.ascontiguousarray(points), rows, self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:

@@ -97,14 +97,9 @@ class MotionState:
         """The mean of two states, weighted by their information."""
         gain = np.linalg.solve(self.covariance + other.covariance, self.covariance).T
         away = np.concatenate([log(inverse(self.T_world_lidar) @ other.T_world_lidar), other.velocity - self.velocity])
-        step, covariance = gain @ away, self.covariance - gain @ self.covariance
-        T_world_lidar = self.T_world_lidar @ exp(step[:6])
-        return replace(
-            self,
-            T_world_lidar=T_world_lidar,
-            velocity=self.velocity + step[6:],
-            covariance=0.5 * (covariance + covariance.T),
-        )
+        step, P = gain @ away, self.covariance - gain @ self.covariance
+        T, velocity = self.T_world_lidar @ exp(step[:6]), self.velocity + step[6:]
+        return replace(self, T_world_lidar=T, velocity=velocity, covariance=0.5 * (P + P.T))
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,10 +52,7 @@ class Optimised:
 
 
 def relax(
-    poses: FloatArray,
-    edges: Sequence[RelativePose],
-    loops: Sequence[RelativePose],
-    attitudes: Sequence[Attitude] = (),
+    poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[RelativePose], attitudes: Sequence[Attitude] = ()
 ) -> FloatArray:
     """Poses (N, 4, 4) optimised from where they are, loop closures under Cauchy's kernel.
 

@@ -44,10 +44,6 @@ class SampledScan:
     elevations: Annotated[FloatArray, Shape(None)]
     keypoints: Sweep  # the subset that is registered
 
-    def __post_init__(self) -> None:
-        if len(self.elevations) != len(self.sweep):
-            raise ValueError(f"{len(self.elevations)} elevations of {len(self.sweep)} points")
-
     def __len__(self) -> int:
         return len(self.sweep)
 

@@ -10,8 +10,7 @@ from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
 from lidarslam.mapping.loam.features import EDGE, PLANE
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.registration.large_surfaces import are_large
-from lidarslam.mapping.registration.registration import Registration, register
+from lidarslam.mapping.registration.registration import Registration, are_large, register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 

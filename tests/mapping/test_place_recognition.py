@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
-from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from lidarslam.mapping.loops.birds_eye_view import BirdsEyeView, align, compare
 from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, SubmapFile, _level_rotation
 
 from .runs import assert_near
@@ -33,8 +33,8 @@ def submap(points_world: FloatArray, T_world_lidar: FloatArray):
 
 
 def similarity(first, second) -> tuple[float, float]:
-    descriptor = BirdEyeView.of(second).descriptor(RADIUS_M)
-    found, turn = compare(descriptor, BirdEyeView.of(first).descriptor(RADIUS_M)[None])
+    descriptor = BirdsEyeView.of(second).descriptor(RADIUS_M)
+    found, turn = compare(descriptor, BirdsEyeView.of(first).descriptor(RADIUS_M)[None])
     return float(found[0]), float(turn[0])
 
 
@@ -56,8 +56,8 @@ def test_the_turn_is_found_whatever_it_is(hall, yaw_deg):
 
 def test_a_place_is_found_among_others(hall):
     places = [scene(seed) for seed in range(2, 30)] + [hall]
-    descriptors = np.stack([BirdEyeView.of(submap(place, HOME)).descriptor(RADIUS_M) for place in places])
-    query = BirdEyeView.of(submap(hall, pose(2.0, -0.9, 130.0))).descriptor(RADIUS_M)
+    descriptors = np.stack([BirdsEyeView.of(submap(place, HOME)).descriptor(RADIUS_M) for place in places])
+    query = BirdsEyeView.of(submap(hall, pose(2.0, -0.9, 130.0))).descriptor(RADIUS_M)
     scores, _ = compare(query, descriptors)
     assert scores.argmax() == 28
     assert descriptors[0].nbytes < 6_500
@@ -69,7 +69,7 @@ def test_laid_over_one_another(hall, T_target_source):
     true[2, 3] = 0.4
     target, source = submap(hall, HOME), submap(hall, HOME @ true)
     _, turn = similarity(target, source)
-    T, score = align(BirdEyeView.of(target), BirdEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
+    T, score = align(BirdsEyeView.of(target), BirdsEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
     assert_near(T, true, 0.6, 4.0)
     assert 0.5 < score <= 1.0
 
@@ -78,7 +78,7 @@ def test_of_repeated_places_the_expected_one_counts():
     pillars = np.concatenate([[[4.0 * i, s * 3.0, 0.0]] for i in range(-6, 7) for s in (-1, 1)])
     points = pillars.repeat(80, axis=0)
     points += np.random.default_rng(0).uniform(-0.2, 0.2, points.shape) * [1, 1, 8]
-    target = source = BirdEyeView(points[:, :2], points[:, 2], np.eye(3))
+    target = source = BirdsEyeView(points[:, :2], points[:, 2], np.eye(3))
     for x in (-4.0, 0.0, 4.0):
         T, _ = align(target, source, np.zeros(1), RADIUS_M, np.array([x + 0.5, 0.0]), 3.0)
         assert T[0, 3] == pytest.approx(x, abs=0.6)
@@ -130,9 +130,9 @@ def test_points_out_of_range_or_not_finite_are_left_out():
 @pytest.mark.parametrize("count", [0, 1, 8])
 def test_nearly_empty_submaps_have_a_descriptor(count):
     tiny = SparseSubmap.of(np.random.default_rng(0).uniform(-4, 4, (count, 3)), 60.0)
-    descriptor = BirdEyeView.of(tiny).descriptor(RADIUS_M)
+    descriptor = BirdsEyeView.of(tiny).descriptor(RADIUS_M)
     assert np.isfinite(descriptor).all()
-    T, _ = align(BirdEyeView.of(tiny), BirdEyeView.of(tiny), np.zeros(1), RADIUS_M)
+    T, _ = align(BirdsEyeView.of(tiny), BirdsEyeView.of(tiny), np.zeros(1), RADIUS_M)
     assert np.isfinite(T).all()
 
 

@@ -25,7 +25,7 @@ _HEIGHT_BIN_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class BirdEyeView:
+class BirdsEyeView:
     """A submap from above: `structure` (M, 2) of its upright points, `heights` (N,) of all."""
 
     structure: FloatArray
@@ -33,7 +33,7 @@ class BirdEyeView:
     R_level_lidar: FloatArray
 
     @classmethod
-    def of(cls, submap: SparseSubmap, upside_down: bool = False) -> "BirdEyeView":
+    def of(cls, submap: SparseSubmap, upside_down: bool = False) -> "BirdsEyeView":
         """View a submap; upside down where its sensor is mounted the other way up than that of the others."""
         R = np.diag([1.0, -1.0, -1.0]) @ submap.R_level_lidar if upside_down else submap.R_level_lidar
         level = submap.points.astype(np.float64) @ R.T
@@ -65,8 +65,8 @@ def compare(descriptor: NDArray[np.complex64], others: NDArray[np.complex64]) ->
 
 
 def align(
-    target: BirdEyeView,
-    source: BirdEyeView,
+    target: BirdsEyeView,
+    source: BirdsEyeView,
     yaws: FloatArray,
     radius_m: float,
     expected_xy: FloatArray | None = None,
