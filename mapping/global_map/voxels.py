@@ -175,13 +175,12 @@ def row_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @compiled
-def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Rows) -> int:
+def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Rows) -> None:
     """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame.
 
-    Returns the number of points beyond the reach of the voxels, whose keys are `EMPTY`.
+    Keys of points beyond the reach of the voxels are `EMPTY`.
     """
-    T, sensor = T_world_lidar, T_world_lidar[:3, 3]
-    reach, beyond = _reach_m(voxel_size_m), 0
+    T, sensor, reach = T_world_lidar, T_world_lidar[:3, 3], _reach_m(voxel_size_m)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
@@ -189,7 +188,6 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
         if not (abs(x) < reach and abs(y) < reach and abs(z) < reach):
             keys[n] = EMPTY
-            beyond += 1
             continue
         u, v, w = sensor[0] - x, sensor[1] - y, sensor[2] - z
         distance = math.sqrt(u * u + v * v + w * w)
@@ -198,7 +196,6 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
         # Within the voxel float32 is exact enough.
         sums[n, 0], sums[n, 1], sums[n, 2] = x - i * voxel_size_m, y - j * voxel_size_m, z - k * voxel_size_m
         sums[n, 3], sums[n, 4], sums[n, 5], sums[n, 6] = u / distance, v / distance, w / distance, 1.0
-    return beyond
 
 
 @compiled

@@ -167,7 +167,6 @@ class SurfelMatcher(Matcher):
         self.surfaces = Surfaces.none(count)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
-        """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
         points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
         cells = point_keys(points, self._grids[0].cell_m)
         unmatched = np.flatnonzero(cells != self._cells)
@@ -203,7 +202,6 @@ class SurfelMap(LocalMap):
 
     @property
     def grids(self) -> list[SurfelGrid]:
-        """See `LocalMap`."""
         return self._grids
 
     @classmethod
@@ -224,7 +222,6 @@ class SurfelMap(LocalMap):
         return surfel_map
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
-        """See `LocalMap`."""
         self.insert(points, scan.elevations, sensor)
 
     def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
@@ -248,17 +245,14 @@ class SurfelMap(LocalMap):
             grid.insert(points, elevations, views, weight)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
-        """See `LocalMap`."""
         return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
 
     def level_normals(self) -> FloatArray:
-        """See `LocalMap`."""
         grid = self._grids[-1]
         surfels = grid.surfels(np.arange(len(grid), dtype=np.int32))
         return np.asarray(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL], dtype=np.float64)
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `LocalMap`."""
         grid = self._grids[-1]
         rows = grid.find(points, np.array(sensor))
         planes = grid.refreshed(rows)[rows]
@@ -266,11 +260,9 @@ class SurfelMap(LocalMap):
         return planes[:, NORMAL], np.where(is_plane, planes[:, SPREADS.start], np.inf)
 
     def means(self) -> FloatArray:
-        """See `LocalMap`."""
         return self._grids[1].means()
 
     def resample(self, other: "SurfelMap") -> None:
-        """See `LocalMap`; from the finest cells."""
         samples = other.grids[0].samples()
         for grid in self._grids:
             grid.insert_samples(*samples)
