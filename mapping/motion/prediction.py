@@ -307,13 +307,9 @@ class _Joint:
         S = H @ PH + noise
         gain = np.linalg.solve(S, PH.T).T
         step = gain @ innovation
-        covariance = self.covariance - gain @ PH.T
-        joint = _Joint(
-            self.T_world_last @ exp(step[:6]),
-            self.T_world_next @ exp(step[12:18]),
-            self.next_velocity + step[18:],
-            0.5 * (covariance + covariance.T),
-        )
+        P = self.covariance - gain @ PH.T
+        T_world_last, T_world_next = self.T_world_last @ exp(step[:6]), self.T_world_next @ exp(step[12:18])
+        joint = _Joint(T_world_last, T_world_next, self.next_velocity + step[18:], 0.5 * (P + P.T))
         return joint, float(innovation @ np.linalg.solve(S, innovation))
 
 
