@@ -384,10 +384,10 @@ def turn_to_sensor(
     double = np.flatnonzero(others != ABSENT)
     refresh(rows[double], cells, surfels, counts)
     refresh(others[double], cells, surfels, counts)
-    for n in double:
-        x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
-        if _facing(others[n], x, y, z, cells, surfels) > _facing(rows[n], x, y, z, cells, surfels):
-            rows[n] = others[n]
+    for m in double:
+        x, y, z = sensor[0] - points[m, 0], sensor[1] - points[m, 1], sensor[2] - points[m, 2]
+        if _facing(others[m], x, y, z, cells, surfels) > _facing(rows[m], x, y, z, cells, surfels):
+            rows[m] = others[m]
 
 
 @compiled_part
