@@ -12,7 +12,7 @@ from loop_closures import is_false
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
 from lidarslam.mapping.config import LoopConfig
-from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from lidarslam.mapping.loops.birds_eye_view import BirdsEyeView, align, compare
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.loops.verification import register, verify
@@ -134,7 +134,7 @@ def alignment_rows(k: Keyframes) -> Rows:
         true, target, source = k.true_pose(first, second), k.database.cloud(first), k.database.cloud(second)
 
         def views() -> FloatArray:
-            there, here = (BirdEyeView.of(k.database.submaps[index]) for index in (first, second))
+            there, here = (BirdsEyeView.of(k.database.submaps[index]) for index in (first, second))
             _, turn = compare(here.descriptor(radius_m), there.descriptor(radius_m)[None])
             return align(there, here, turn[0] + np.array([0.0, np.pi]), radius_m)[0]
 

@@ -37,10 +37,7 @@ class MappingConfig(Settings):
         "surfels", description="surfels, loam (LOAM's mapping), off (the odometry alone), or another package's"
     )
     cell_m: float | None = Field(
-        None,
-        ge=0.02,
-        le=10.0,
-        description="edge of the finest surfel cells, spacing of LOAM's maps; null: a thirtieth of the median range",
+        None, ge=0.02, le=10.0, description="edge of the finest cells, LOAM's spacing; null: 1/30 of the median range"
     )
     radius_m: float = Field(100.0, ge=1.0, le=10_000.0, description="radius of the local map around the sensor")
     min_range_m: float = Field(
@@ -52,16 +49,10 @@ class MappingConfig(Settings):
     )
     continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
     prior_rotation_deg: float = Field(
-        3.0,
-        ge=0.01,
-        le=180.0,
-        description="standard deviation of an odometry's rotation about each axis, where it gives none",
+        3.0, ge=0.01, le=180.0, description="deviation of an odometry's rotation about each axis, if it gives none"
     )
     prior_translation_m: float = Field(
-        0.15,
-        ge=1e-3,
-        le=100.0,
-        description="standard deviation of an odometry's translation along each axis, where it gives none",
+        0.15, ge=1e-3, le=100.0, description="deviation of an odometry's translation along each axis, if it gives none"
     )
     budget_ms: BudgetMs = Field(
         None,
@@ -85,9 +76,6 @@ class MappingConfig(Settings):
     def _ranges_leave_points(self) -> Self:
         require_range_left(self.min_range_m, self.max_range_m)
         return self
-
-
-# The global map, keyframes, loop closures.
 
 
 class GlobalMapConfig(Settings):
@@ -135,10 +123,7 @@ class LoopConfig(Settings):
 
     max_range_m: float = Field(60.0, ge=1.0, le=10_000.0, description="farther points of a keyframe are left out")
     drift_percent: float = Field(
-        1.0,
-        ge=0.01,
-        le=100.0,
-        description="standard deviation of the drift; in attitude 2 degrees in 100 m for each percent",
+        1.0, ge=0.01, le=100.0, description="deviation of the drift; in attitude 2 degrees in 100 m for each percent"
     )
     min_way_m: float | None = Field(
         None, ge=0.0, le=1e6, description="shorter ways back are no loops; null: three median ranges, at least 10 m"

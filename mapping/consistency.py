@@ -77,8 +77,7 @@ class Surfels:
     def of(cls, points: FloatArray) -> "Surfels":
         """Surfels of motion-compensated points (N, 3), at most one for each degree of azimuth and elevation."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        image = np.empty((ROWS, COLUMNS), dtype=np.int64)
-        draw_indices(points, _MIN_RANGE_M, image)
+        image = _draw_indices(points)
         pixels = np.argwhere(image >= 0)
         means, normals, variances = np.empty((3, len(pixels), 3))
         counts = np.empty(len(pixels), dtype=np.int64)
@@ -121,18 +120,15 @@ def shift_profile(
     return np.asarray(np.minimum(votes, _MOST_OF_BLOCK).sum(axis=0), dtype=np.float64)
 
 
-@compiled
-def draw_indices(points: FloatArray, min_range_m: float, image: NDArray[np.int64]) -> None:
-    """Write the index of one of the points (N, 3) into every pixel (ROWS, COLUMNS) that has any, -1 elsewhere."""
-    image[:, :] = -1
-    for n in range(len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        across = np.sqrt(x * x + y * y)
-        if not (across * across + z * z >= min_range_m * min_range_m):
-            continue
-        column = int((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * COLUMNS) % COLUMNS
-        row = int((np.arctan2(z, across) + 0.5 * np.pi) / np.pi * ROWS)
-        image[min(max(row, 0), ROWS - 1), column] = n
+def _draw_indices(points: FloatArray) -> NDArray[np.int64]:
+    """(ROWS, COLUMNS) the index of the last of the points (N, 3) in every pixel, -1 where there is none."""
+    far = np.flatnonzero(np.einsum("ij,ij->i", points, points) >= _MIN_RANGE_M**2)
+    x, y, z = points[far].T
+    column = ((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * COLUMNS).astype(np.int64) % COLUMNS
+    row = ((np.arctan2(z, np.sqrt(x * x + y * y)) + 0.5 * np.pi) / np.pi * ROWS).astype(np.int64).clip(0, ROWS - 1)
+    image = np.full((ROWS, COLUMNS), -1, dtype=np.int64)
+    image[row, column] = far
+    return image
 
 
 @compiled
@@ -246,15 +242,6 @@ class _Kept:
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidate:
-    """The latest scan."""
-
-    number: int
-    T_world_lidar: Annotated[FloatArray, TRANSFORM]
-    points: Annotated[FloatArray, Shape(None, 3)]
-
-
-@dataclass(frozen=True, eq=False)
 class PairTest:
     """Votes of a pair of scans for shifts along a direction."""
 
@@ -299,7 +286,8 @@ class ConsistencyCheck(Stateful):
 
     tests: list[PairTest]
     _kept: list[_Kept]
-    _latest: _Candidate | None  # unless it was kept
+    # number, pose (4, 4) and points (N, 3) of the latest scan, unless it was kept
+    _latest: tuple[int, Annotated[FloatArray, TRANSFORM], Annotated[FloatArray, Shape(None, 3)]] | None
     _since_due: int
     _due: int
     _T_due: Annotated[FloatArray, TRANSFORM] | None
@@ -312,7 +300,7 @@ class ConsistencyCheck(Stateful):
     def add(self, points: FloatArray, number: int, T_world_lidar: FloatArray) -> None:
         """Add the next scan of the map, compensated points (N, 3); some are kept and paired with the ones before."""
         self._since_due += 1
-        self._latest = _Candidate(number, T_world_lidar, points)
+        self._latest = number, T_world_lidar, points
         if self._T_due is not None and self._since_due < _EVERY_SCANS:
             way = T_world_lidar[:3, 3] - self._T_due[:3, 3]
             if float(np.linalg.norm(way)) < _EVERY_M:
@@ -328,7 +316,8 @@ class ConsistencyCheck(Stateful):
         latest, self._latest = self._latest, None
         if latest is None:
             return
-        new = _Kept(latest.number, latest.T_world_lidar, Surfels.of(latest.points))
+        number, T_world_lidar, points = latest
+        new = _Kept(number, T_world_lidar, Surfels.of(points))
         for kept in self._kept:
             self.tests += _tests(kept, new)
         self._kept = [*self._kept, new][-_PARTNERS:]

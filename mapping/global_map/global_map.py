@@ -93,10 +93,9 @@ class GlobalMap(Stateful):
         attributes = attributes or PointAttributes()
         layout = Layout.of(attributes)
         keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
-        T = np.ascontiguousarray(T_world_lidar)
-        beyond = write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
+        write_sums(np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar), self.voxel_size_m, keys, sums)
         layout.write(attributes, sums)
-        self._wait(Voxels(keys, sums, layout), keys == EMPTY if beyond else None)
+        self._wait(Voxels(keys, sums, layout), keys == EMPTY)
 
     def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
         """Add the voxels of another map, as if its points were added here."""
@@ -108,7 +107,7 @@ class GlobalMap(Stateful):
         sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
         sums[:, :COUNT] *= means.rows[:, COUNT, None]
         is_beyond = np.abs(world).max(axis=1, initial=0.0) >= reach_m(self.voxel_size_m)
-        self._wait(Voxels(keys, sums, means.layout), is_beyond if is_beyond.any() else None)
+        self._wait(Voxels(keys, sums, means.layout), is_beyond)
 
     def means(self, left_out: NDArray[np.bool_] | None = None) -> VoxelMeans:
         """The voxels so far, but for some (M,)."""
@@ -177,9 +176,9 @@ class GlobalMap(Stateful):
             normals[rows] = estimate_normals(part.points())[part.lies_in(tile)]
         return normals
 
-    def _wait(self, voxels: Voxels, is_beyond: NDArray[np.bool_] | None = None) -> None:
+    def _wait(self, voxels: Voxels, is_beyond: NDArray[np.bool_]) -> None:
         with self._lock:
-            if is_beyond is not None:
+            if is_beyond.any():
                 self.beyond += int(np.count_nonzero(is_beyond))
                 voxels = voxels.chosen(~is_beyond)
             self._pending.append(voxels)

@@ -175,15 +175,9 @@ def draw(points: FloatArray, grid: FloatArray, image: Ranges) -> None:
 
 @compiled
 def judge(
-    points: FloatArray,
-    T_lidar_world: FloatArray,
-    images: Ranges,
-    grids: FloatArray,
-    reach_m: float,
-    voxel_size_m: float,
-    least_through: int,
-    moved: NDArray[np.bool_],
-) -> None:
+    points: FloatArray, T_lidar_world: FloatArray, images: Ranges, grids: FloatArray, reach_m: float,
+    voxel_size_m: float, least_through: int, moved: NDArray[np.bool_],
+) -> None:  # fmt: skip
     """Write which points (M, 3), in the world, moved, as images (V, rows, columns) in random order see them."""
     views = len(images)
     for m in range(len(points)):
@@ -206,16 +200,9 @@ def judge(
 
 @compiled_part
 def _vote(
-    a: float,
-    b: float,
-    c: float,
-    v: int,
-    T: FloatArray,
-    images: Ranges,
-    grids: FloatArray,
-    reach_m: float,
+    a: float, b: float, c: float, v: int, T: FloatArray, images: Ranges, grids: FloatArray, reach_m: float,
     voxel_size_m: float,
-) -> int:
+) -> int:  # fmt: skip
     """The vote of view v on the point (a, b, c); whole arrays, because slicing one costs more than all else."""
     _, rows, columns = images.shape
     x = T[v, 0, 0] * a + T[v, 0, 1] * b + T[v, 0, 2] * c + T[v, 0, 3]

@@ -200,13 +200,9 @@ def along_path(positions: FloatArray, spacing_m: float) -> FloatArray:
 
 @compiled
 def grow_ground(
-    z: FloatArray,
-    starts: NDArray[np.int64],
-    seeds: NDArray[np.int64],
-    seed_heights: FloatArray,
-    heights: FloatArray,
+    z: FloatArray, starts: NDArray[np.int64], seeds: NDArray[np.int64], seed_heights: FloatArray, heights: FloatArray,
     observed: NDArray[np.bool_],
-) -> None:
+) -> None:  # fmt: skip
     """Write heights (rows, columns), NaN before, and where they were observed: the ground, grown breadth first.
 
     Points have heights z (N,) by cell and then ascending; those of a cell begin at its start (cells + 1,).

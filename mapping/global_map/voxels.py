@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,21 +141,16 @@ class Voxels:
             layout,
         )
 
-    def reduced(self) -> "Voxels":
-        """Rows of equal keys added up, in the order of keys."""
+    def reduced(self, kind: Literal["quicksort", "stable"] = "quicksort") -> "Voxels":
+        """Rows of equal keys added up, in the order of keys, which are sorted by an algorithm of NumPy."""
         unique, totals = np.empty_like(self.keys), np.empty_like(self.sums)
-        order = np.argsort(self.keys)
+        order = np.argsort(self.keys, kind=kind)
         count = add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
         return Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
 
     def united(self, other: "Voxels") -> "Voxels":
-        """Both of them, reduced; both are reduced already."""
-        layout = Layout.union([self.layout, other.layout])
-        sums = [part.layout.widened(part.sums, layout) for part in (self, other)]
-        unique = np.empty(len(self) + len(other), dtype=np.int64)
-        totals = np.empty((len(unique), layout.width), dtype=np.float32)
-        count = unite(self.keys, sums[0], other.keys, sums[1], layout.summed, unique, totals)
-        return Voxels(unique[:count].copy(), totals[:count].copy(), layout)
+        """Both of them, reduced; both are reduced already, and a stable sort merges sorted parts in linear time."""
+        return Voxels.join([self, other]).reduced("stable")
 
     def chosen(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Voxels":
         """Some of them."""
@@ -180,13 +175,12 @@ def row_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @compiled
-def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Rows) -> int:
+def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Rows) -> None:
     """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame.
 
-    Returns the number of points beyond the reach of the voxels, whose keys are `EMPTY`.
+    Keys of points beyond the reach of the voxels are `EMPTY`.
     """
-    T, sensor = T_world_lidar, T_world_lidar[:3, 3]
-    reach, beyond = _reach_m(voxel_size_m), 0
+    T, sensor, reach = T_world_lidar, T_world_lidar[:3, 3], _reach_m(voxel_size_m)
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
@@ -194,7 +188,6 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
         if not (abs(x) < reach and abs(y) < reach and abs(z) < reach):
             keys[n] = EMPTY
-            beyond += 1
             continue
         u, v, w = sensor[0] - x, sensor[1] - y, sensor[2] - z
         distance = math.sqrt(u * u + v * v + w * w)
@@ -203,7 +196,6 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
         # Within the voxel float32 is exact enough.
         sums[n, 0], sums[n, 1], sums[n, 2] = x - i * voxel_size_m, y - j * voxel_size_m, z - k * voxel_size_m
         sums[n, 3], sums[n, 4], sums[n, 5], sums[n, 6] = u / distance, v / distance, w / distance, 1.0
-    return beyond
 
 
 @compiled
@@ -230,28 +222,6 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Rows, summed: int, unique:
             if summed < columns and _is_earlier(sums[row], totals[count - 1], summed):
                 for column in range(summed, columns):
                     totals[count - 1, column] = sums[row, column]
-    return count
-
-
-@compiled
-def unite(
-    first_keys: Keys, first_sums: Rows, second_keys: Keys, second_sums: Rows, summed: int, unique: Keys, totals: Rows
-) -> int:  # fmt: skip
-    """As `add_up` for two tables, each with its keys (N,) sorted and unique."""
-    count, a, b, columns = 0, 0, 0, first_sums.shape[1]
-    while a < len(first_keys) or b < len(second_keys):
-        from_first = b >= len(second_keys) or (a < len(first_keys) and first_keys[a] <= second_keys[b])
-        from_second = a >= len(first_keys) or (b < len(second_keys) and second_keys[b] <= first_keys[a])
-        unique[count] = first_keys[a] if from_first else second_keys[b]
-        for column in range(columns):
-            totals[count, column] = first_sums[a, column] if from_first else second_sums[b, column]
-        if from_first and from_second:
-            for column in range(summed):
-                totals[count, column] += second_sums[b, column]
-            if summed < columns and _is_earlier(second_sums[b], totals[count], summed):
-                for column in range(summed, columns):
-                    totals[count, column] = second_sums[b, column]
-        a, b, count = a + from_first, b + from_second, count + 1
     return count
 
 

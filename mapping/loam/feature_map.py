@@ -293,12 +293,11 @@ class VoxelGrid(Stateful):
         """Insert points (N, 3) of the world."""
         keys = point_keys(points, self.cell_m)
         rows = self._hash.insert(keys)
-        new = np.flatnonzero(rows >= len(self._keys))
-        if len(new):
-            grown = np.empty(len(self._hash), dtype=np.int64)
-            grown[: len(self._keys)], grown[rows[new]] = self._keys, keys[new]
-            self._sums = np.concatenate([self._sums, np.zeros((len(grown) - len(self._keys), 10))])
-            self._keys = grown
+        new = len(self._hash) - len(self._keys)
+        if new:
+            self._keys = np.concatenate([self._keys, np.empty(new, dtype=np.int64)])
+            self._keys[rows] = keys
+            self._sums = np.concatenate([self._sums, np.zeros((new, 10))])
         add_moments(np.ascontiguousarray(points), rows, self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:
@@ -341,7 +340,6 @@ class FeatureMatcher(Matcher):
         self.surfaces = Surfaces.none(len(sweep))
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
-        """See `Matcher`."""
         points, sensor = np.ascontiguousarray(points), np.array(T_world_lidar[:3, 3])
         moved = np.abs(points - self._matched).max(axis=1) > _SAME_CELLS * self._planes[0].cell_m
         self._matched[moved] = points[moved]
@@ -367,11 +365,9 @@ class FeatureMap(LocalMap):
 
     @property
     def grids(self) -> list[VoxelGrid]:
-        """See `LocalMap`."""
         return [*self._edges, *self._planes]
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
-        """See `LocalMap`."""
         is_edge = _edges_of(scan.sweep)
         for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
             for grid in grids:
@@ -379,26 +375,21 @@ class FeatureMap(LocalMap):
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
-        """See `LocalMap`."""
         return FeatureMatcher(self._edges[level:], self._planes[level:], sweep)
 
     def resample(self, other: "FeatureMap") -> None:
-        """See `LocalMap`."""
         for grids, finest in ((self._edges, other._edges[0]), (self._planes, other._planes[0])):
             for grid in grids:
                 grid.insert_means(finest)
 
     def means(self) -> FloatArray:
-        """See `LocalMap`."""
         return np.concatenate([self._edges[1].means, self._planes[1].means])
 
     def level_normals(self) -> FloatArray:
-        """See `LocalMap`."""
         normals, spread_m = self.coarse_planes(self._planes[-1].means, np.zeros(3))
         return normals[np.isfinite(spread_m)]
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `LocalMap`."""
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))
         voxels = self._planes[-1].voxels
         match_features(np.ascontiguousarray(points), unmatched, False, voxels, np.array(sensor), found)

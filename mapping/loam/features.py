@@ -148,7 +148,8 @@ def _squared_distance(p: FloatArray, q: FloatArray) -> float:
 class FeatureSampler(Sampler):
     """Edges and planar points."""
 
-    def _spacing_m(self, cell_m: float) -> float:
+    def _cell_m(self, squared: FloatArray) -> float:
+        cell_m = super()._cell_m(squared)
         return cell_m if self._config.cell_m is not None else min(cell_m, _MOST_SPACING_M)
 
     def _choose(self, scan: Scan, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8]]:

@@ -141,11 +141,8 @@ class Track:
         by_links = inverse(a.T_first_second) @ self.between(a.first, b.first) @ b.T_first_second
         xi = log(inverse(self.between(a.second, b.second)) @ by_links)
         of_a, of_way = adjoint(inverse(by_links)), adjoint(inverse(b.T_first_second))
-        covariance = (
-            of_a @ a.covariance @ of_a.T
-            + b.covariance
-            + of_way @ self.drift_covariance(a.first, b.first) @ of_way.T
-            + self.drift_covariance(a.second, b.second)
-        )
+        covariance = of_a @ a.covariance @ of_a.T + b.covariance
+        covariance = covariance + of_way @ self.drift_covariance(a.first, b.first) @ of_way.T
+        covariance = covariance + self.drift_covariance(a.second, b.second)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
         return float(xi @ np.linalg.solve(covariance, xi)), sigma_m

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import LoopConfig
-from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from lidarslam.mapping.loops.birds_eye_view import BirdsEyeView, align, compare
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose, Track
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap, SubmapFile
 from lidarslam.mapping.loops.verification import GUESS_SIGMAS, MIN_INLIERS, SubmapCloud, Verification, verify
@@ -96,7 +96,7 @@ class KeyframeDatabase(Stateful):
         self._config = config
         self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
         self.submaps = SubmapFile(directory)
-        self._descriptors = np.empty((0, 1, 1), dtype=np.complex64)  # (N, ...), with room for more keyframes
+        self._descriptors: list[NDArray[np.complex64]] = []
 
     def __len__(self) -> int:
         return len(self.submaps)
@@ -109,20 +109,14 @@ class KeyframeDatabase(Stateful):
 
     def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> None:
         """Add a keyframe: its submap (N, 3), path length and segment, and the present estimates (K, 4, 4) of all."""
-        track = self.track
         self.keep(points)
-        way_m_all, segments = np.append(track.way_m, way_m), np.append(track.segment, segment)
-        self.track = Track(poses, way_m_all, segments, track.drift_rates)
+        ways_m, segments = np.append(self.track.way_m, way_m), np.append(self.track.segment, segment)
+        self.track = Track(poses, ways_m, segments, self.track.drift_rates)
 
     def keep(self, points: FloatArray) -> None:
         """Keep the submap (N, 3) of the next keyframe, whose estimate is known or follows."""
         self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))
-        descriptor = BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m)
-        if len(self) > len(self._descriptors):
-            room = np.zeros((max(64, 2 * len(self)), *descriptor.shape), dtype=np.complex64)
-            room[: len(self) - 1] = self._descriptors[: len(self) - 1].reshape(-1, *descriptor.shape)
-            self._descriptors = room
-        self._descriptors[len(self) - 1] = descriptor
+        self._descriptors.append(BirdsEyeView.of(self.submaps[-1]).descriptor(self.radius_m))
 
     def cloud(self, index: int) -> SubmapCloud:
         """A keyframe with those before and after it in its segment."""
@@ -150,10 +144,8 @@ class KeyframeDatabase(Stateful):
             yield from self._nearby(index, others)
             yield from self._alike(index, others)
 
-    def _compare(self, view: BirdEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        is_run = others[-1] - others[0] == len(others) - 1  # as within one segment: a view of them is no copy
-        chosen = self._descriptors[slice(others[0], others[-1] + 1) if is_run else others]
-        return compare(view.descriptor(self.radius_m), chosen)
+    def _compare(self, view: BirdsEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        return compare(view.descriptor(self.radius_m), np.stack([self._descriptors[other] for other in others]))
 
     def _nearby(self, index: int, others: NDArray[np.intp]) -> Iterator[Candidate]:
         """Earlier keyframes of the segment within reach of the estimate."""
@@ -165,7 +157,7 @@ class KeyframeDatabase(Stateful):
         if not within.any():
             return
         others, translation, distance = others[within], translation[within], distance[within]
-        similarity, _ = self._compare(BirdEyeView.of(submap), others)
+        similarity, _ = self._compare(BirdsEyeView.of(submap), others)
         # The nearest while drift is small, the most similar once it is large.
         cost = distance / (submap.range_m + translation) - similarity
         for k in _spread(others, cost, _NEARBY_CANDIDATES):
@@ -175,7 +167,7 @@ class KeyframeDatabase(Stateful):
         """`T_first_second` (4, 4) by aligning the views, within standard deviations of the drift."""
         estimate = self.track.between(first, second)
         rotation, translation = (float(sigma[0]) for sigma in self.track.drift(np.array([first]), second))
-        target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
+        target, source = (BirdsEyeView.of(self.submaps[index]) for index in (first, second))
         level = target.R_level_lidar @ estimate[:3, :3] @ source.R_level_lidar.T
         half = max(_YAW_MIN, _YAW_SIGMAS * rotation)
         yaws = np.arctan2(level[1, 0], level[0, 0]) + np.linspace(-half, half, _YAW_TRIES)
@@ -184,7 +176,7 @@ class KeyframeDatabase(Stateful):
 
     def starts(self, first: int, second: int) -> list[FloatArray]:
         """`T_first_second` (4, 4) to begin with: estimated, of views aligned within the drift, and in each sector."""
-        target, source = (BirdEyeView.of(self.submaps[index]) for index in (first, second))
+        target, source = (BirdsEyeView.of(self.submaps[index]) for index in (first, second))
         sectors = np.linspace(-np.pi, np.pi, _ALL_YAWS, endpoint=False).reshape(_SECTORS, -1)
         return [
             self.track.between(first, second),
@@ -211,12 +203,12 @@ class KeyframeDatabase(Stateful):
         """The most similar keyframes, aligned by their views, with the scores of these alignments."""
         if not len(others):
             return
-        source = BirdEyeView.of(self.submaps[index], upside_down)
+        source = BirdsEyeView.of(self.submaps[index], upside_down)
         similarity, turn = self._compare(source, others)
         for k in _spread(others, -similarity, 2 * _APPEARANCE_CANDIDATES):
             if similarity[k] < _MIN_SIMILARITY:
                 break
-            target = BirdEyeView.of(self.submaps[others[k]])
+            target = BirdsEyeView.of(self.submaps[others[k]])
             guess, score = align(target, source, turn[k] + np.array([0.0, np.pi]), self.radius_m)
             yield score, Candidate(int(others[k]), True, guess)
 
@@ -257,12 +249,7 @@ class LoopDetector(Stateful):
         self._accepted, self._pending = [], []
 
     def add(
-        self,
-        points: FloatArray,
-        way_m: float,
-        segment: int,
-        poses: FloatArray,
-        barred: NDArray[np.bool_] | None = None,
+        self, points: FloatArray, way_m: float, segment: int, poses: FloatArray, barred: NDArray[np.bool_] | None = None
     ) -> list[LoopClosure]:
         """Add the next keyframe, and return the closures that are accepted or rejected by now.
 

@@ -73,30 +73,24 @@ class SubmapCloud:
 
     @classmethod
     def join(
-        cls,
-        submap: SparseSubmap,
-        neighbours: Sequence[tuple[FloatArray, SparseSubmap]] = (),
-        ways_m: Sequence[float] = (),
-        drift_rates: tuple[float, float] = (0.0, 0.0),
-    ) -> "SubmapCloud":
+        cls, submap: SparseSubmap, neighbours: Sequence[tuple[FloatArray, SparseSubmap]] = (),
+        ways_m: Sequence[float] = (), drift_rates: tuple[float, float] = (0.0, 0.0),
+    ) -> "SubmapCloud":  # fmt: skip
         """Unite with neighbours, each with `T_keyframe_neighbour` (4, 4) and the path to it; back is negative."""
-        points, axes, tilt, is_line, ahead_m = [], [], [], [], []
+        parts = []
         for (T, part), way_m in zip([(np.eye(4), submap), *neighbours], [0.0, *ways_m], strict=True):
             used = part.kinds > 0
-            points.append(transform_points(T, part.points[used].astype(float)))
-            axes.append(part.axes[used].astype(float) @ T[:3, :3].T)
-            tilt.append(part.tilt[used].astype(float))
-            is_line.append(part.kinds[used] == LINE)
-            ahead_m.append(np.full(len(points[-1]), way_m))
-        together, unit = np.concatenate(points), np.concatenate(axes)
-        kept = one_per_cell(together, 1.5 * submap.cell_m)
-        together, unit = together[kept], unit[kept]
-        unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+            points = transform_points(T, part.points[used].astype(float))
+            axes, tilt = part.axes[used].astype(float) @ T[:3, :3].T, part.tilt[used].astype(float)
+            parts.append((points, axes, tilt, part.kinds[used] == LINE, np.full(len(points), way_m)))
+        points, axes, *others = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        kept = one_per_cell(points, 1.5 * submap.cell_m)
+        points, axes = points[kept], axes[kept]
+        axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
         middle_m = 0.5 * min((abs(way_m) for way_m in ways_m), default=0.0)
-        return cls(
-            submap, together, unit, np.concatenate(tilt)[kept], np.concatenate(is_line)[kept],
-            np.concatenate(ahead_m)[kept], drift_rates, middle_m, cKDTree(together, balanced_tree=False),
-        )  # fmt: skip
+        tilt, is_line, ahead_m = (values[kept] for values in others)
+        tree = cKDTree(points, balanced_tree=False)
+        return cls(submap, points, axes, tilt, is_line, ahead_m, drift_rates, middle_m, tree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +135,9 @@ def register(target: SubmapCloud, source: SubmapCloud, guess: FloatArray) -> Flo
 
 
 def _linearise(
-    target: SubmapCloud,
-    source: SubmapCloud,
-    chosen: NDArray[np.intp],
-    reach_m: float,
-    scale_m: float,
+    target: SubmapCloud, source: SubmapCloud, chosen: NDArray[np.intp], reach_m: float, scale_m: float,
     T_target_source: FloatArray,
-) -> NormalEquations | None:
+) -> NormalEquations | None:  # fmt: skip
     found = correspondences(target, source, T_target_source, chosen, reach_m)
     if len(found.points) < _MIN_POINTS:
         return None

@@ -28,11 +28,6 @@ class Sweep:
     # (N,) of features; None where points are of one kind
     kinds: Annotated[NDArray[np.int8], Shape(None)] | None = None
 
-    def __post_init__(self) -> None:
-        for what, values in (("times", self.times), ("kinds", self.kinds)):
-            if values is not None and len(values) != len(self.points):
-                raise ValueError(f"{len(values)} {what} of {len(self.points)} points")
-
     def __len__(self) -> int:
         return len(self.points)
 

@@ -97,14 +97,9 @@ class MotionState:
         """The mean of two states, weighted by their information."""
         gain = np.linalg.solve(self.covariance + other.covariance, self.covariance).T
         away = np.concatenate([log(inverse(self.T_world_lidar) @ other.T_world_lidar), other.velocity - self.velocity])
-        step, covariance = gain @ away, self.covariance - gain @ self.covariance
-        T_world_lidar = self.T_world_lidar @ exp(step[:6])
-        return replace(
-            self,
-            T_world_lidar=T_world_lidar,
-            velocity=self.velocity + step[6:],
-            covariance=0.5 * (covariance + covariance.T),
-        )
+        step, P = gain @ away, self.covariance - gain @ self.covariance
+        T, velocity = self.T_world_lidar @ exp(step[:6]), self.velocity + step[6:]
+        return replace(self, T_world_lidar=T, velocity=velocity, covariance=0.5 * (P + P.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,13 +314,9 @@ class _Joint:
         S = H @ PH + noise
         gain = np.linalg.solve(S, PH.T).T
         step = gain @ innovation
-        covariance = self.covariance - gain @ PH.T
-        joint = _Joint(
-            self.T_world_last @ exp(step[:6]),
-            self.T_world_next @ exp(step[12:18]),
-            self.next_velocity + step[18:],
-            0.5 * (covariance + covariance.T),
-        )
+        P = self.covariance - gain @ PH.T
+        T_world_last, T_world_next = self.T_world_last @ exp(step[:6]), self.T_world_next @ exp(step[12:18])
+        joint = _Joint(T_world_last, T_world_next, self.next_velocity + step[18:], 0.5 * (P + P.T))
         return joint, float(innovation @ np.linalg.solve(S, innovation))
 
 

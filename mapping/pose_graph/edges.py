@@ -80,13 +80,9 @@ class MotionSinceKeyframe:
 
 
 def trajectory_edges(
-    key: int,
-    T_first_second: FloatArray,
-    motion: MotionSinceKeyframe,
-    before: FloatArray | None,
-    now: FloatArray | None,
-    one_map: bool = True,
-) -> list[RelativePose]:
+    key: int, T_first_second: FloatArray, motion: MotionSinceKeyframe, before: FloatArray | None,
+    now: FloatArray | None, one_map: bool = True,
+) -> list[RelativePose]:  # fmt: skip
     """Edges to a keyframe from the one before: of the registered trajectory, and of the odometry where it has a motion.
 
     Covariances (6, 6) of the poses before and now are in the LiDAR frame, None without registration to a map; with
@@ -182,8 +178,6 @@ class ProjectedTrack:
         """The positions within the time of a trajectory (M poses), assigned to the keyframes among its scans."""
         track, scans = self.track, np.asarray(keyframe_scans)
         rows = np.flatnonzero(track.is_within(trajectory, self.projected))
-        if not len(rows):
-            return []
         keys = np.abs(trajectory.stamps[scans][None, :] - track.stamps[rows, None]).argmin(axis=1)
         antennas = trajectory.at(track.stamps[rows]) @ np.append(track.lidar_antenna, 1.0)
         T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])

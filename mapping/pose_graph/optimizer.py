@@ -52,10 +52,7 @@ class Optimised:
 
 
 def relax(
-    poses: FloatArray,
-    edges: Sequence[RelativePose],
-    loops: Sequence[RelativePose],
-    attitudes: Sequence[Attitude] = (),
+    poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[RelativePose], attitudes: Sequence[Attitude] = ()
 ) -> FloatArray:
     """Poses (N, 4, 4) optimised from where they are, loop closures under Cauchy's kernel.
 
@@ -71,12 +68,9 @@ def relax(
 
 
 def optimise(
-    poses: FloatArray,
-    edges: Sequence[RelativePose],
-    loops: Sequence[RelativePose],
-    attitudes: Sequence[Attitude] = (),
+    poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[RelativePose], attitudes: Sequence[Attitude] = (),
     positions: Sequence[AntennaPosition] = (),
-) -> Optimised:
+) -> Optimised:  # fmt: skip
     """All poses (N, 4, 4) together, and which loop closures and positions are inliers; others are never rejected.
 
     Poses are those of the map where there are positions, which hold it; else the first one of each component is held.
@@ -108,12 +102,9 @@ def optimise(
 
 
 def _graph(
-    poses: FloatArray,
-    edges: Sequence[RelativePose],
-    loops: Sequence[RelativePose],
-    attitudes: Sequence[Attitude],
+    poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[RelativePose], attitudes: Sequence[Attitude],
     is_placed: bool = False,
-) -> gtsam.NonlinearFactorGraph:
+) -> gtsam.NonlinearFactorGraph:  # fmt: skip
     """The edges and attitudes, and a prior on the first pose of each component that they and the loops make."""
     graph = gtsam.NonlinearFactorGraph()
     held = gtsam.noiseModel.Diagonal.Sigmas(_ALIGNED if is_placed else _HELD)
@@ -132,8 +123,6 @@ def _graph(
 def _factor(edge: RelativePose) -> gtsam.BetweenFactorPose3:
     """GTSAM's residual is the logarithm of the error in `T_first_second`, so covariances are the same."""
     if edge not in _factors:
-        if not (np.isfinite(edge.covariance).all() and np.isfinite(edge.T_first_second).all()):
-            raise ValueError(f"edge {edge.first} to {edge.second} must be finite, got {edge.T_first_second.tolist()}")
         noise = gtsam.noiseModel.Gaussian.Covariance(bounded(edge.covariance))
         _factors[edge] = gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise)
     return _factors[edge]

@@ -63,13 +63,9 @@ class SlamGraph(KeyframeGraph):
     _is_map_due: bool  # whether closures have been refined since the local map was compared with them
 
     def __init__(
-        self,
-        config: PoseGraphConfig,
-        directory: Path | None = None,
-        file: Path | None = None,
-        local_radius_m: float = 0.0,
-        given: GivenLoops | None = None,
-    ) -> None:
+        self, config: PoseGraphConfig, directory: Path | None = None, file: Path | None = None,
+        local_radius_m: float = 0.0, given: GivenLoops | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(config.keyframes, directory, file)
         self._config, self.given = config, given or GivenLoops()
         self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
@@ -169,13 +165,9 @@ class SlamGraph(KeyframeGraph):
         return drawn
 
     def _placed(
-        self,
-        poses: FloatArray,
-        edges: Sequence[RelativePose],
-        loops: Sequence[LoopClosure],
-        stamps: FloatArray,
+        self, poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[LoopClosure], stamps: FloatArray,
         track: ProjectedTrack,
-    ) -> Optimised:
+    ) -> Optimised:  # fmt: skip
         """Optimise the keyframes' poses (K, 4, 4) in the projection, with GNSS positions; the result is of the run."""
         scans = [keyframe.scan for keyframe in self.keyframes]
         registered = Trajectory(stamps, np.array(self.scan_poses))

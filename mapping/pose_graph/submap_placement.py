@@ -74,13 +74,9 @@ class SubmapPlacement(Stateful):
         self._held = [key for key, is_near in zip(self._held, near, strict=True) if is_near]
 
     def redrawn(
-        self,
-        targets: FloatArray,
-        members: NDArray[np.bool_],
-        cell_m: float,
-        submap: Callable[[int], VoxelMeans],
+        self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans],
         scan: int,
-    ) -> SurfelMap | None:
+    ) -> SurfelMap | None:  # fmt: skip
         """The rebuilt map; None unless a submap near the sensor is missing, or lies elsewhere than it should.
 
         Args:

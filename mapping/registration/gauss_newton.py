@@ -51,14 +51,9 @@ class NormalEquations:
 
 
 def gauss_newton(
-    linearise: Callable[[FloatArray], NormalEquations | None],
-    T: FloatArray,
-    prior: FloatArray,
-    prior_information: FloatArray,
-    most_steps: int,
-    lever_m: float,
-    settled_m: float,
-) -> tuple[FloatArray, FloatArray] | None:
+    linearise: Callable[[FloatArray], NormalEquations | None], T: FloatArray, prior: FloatArray,
+    prior_information: FloatArray, most_steps: int, lever_m: float, settled_m: float,
+) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
     """Minimise from T (4, 4), with a prior (4, 4) of the given information (6, 6).
 
     Returns:

@@ -9,13 +9,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.core.tracking import Degeneracy, lever_scale
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
-from lidarslam.mapping.registration.gauss_newton import DEGENERATE_INFORMATION, degenerate_directions
-from lidarslam.mapping.registration.large_surfaces import INFLATION, inflation_of_small
+from lidarslam.mapping.registration.gauss_newton import (
+    DEGENERATE_INFORMATION,
+    degenerate_directions,
+    geman_mcclure,
+    point_to_plane_jacobian,
+)
 from lidarslam.mapping.registration.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
@@ -42,6 +47,16 @@ _INFORMATION_SHARE = 0.25
 _FREEDOM = 4.0
 # A velocity that differs by less than this over the interval needs no second compensation.
 _SAME_ROTATION, _SAME_TRANSLATION_M = np.deg2rad(0.1), 0.01
+
+# The plane of a point is part of a large one, as a wall or floor, where the coarsest cell has a plane of nearly its
+# normal, no thicker than this share of that cell.
+_SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
+# Large surfaces suffice where they constrain every direction this many times as well as the noise of their normals.
+_SUFFICIENT, _FEWEST_LARGE = 15.0, 100
+# They contradict a pose from which they alone would move this many cells away. On recordings without crowds: below 0.1.
+_CONTRADICTION_CELLS = 0.2
+# Factor by which small surfaces are less certain then.
+_INFLATION = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +133,7 @@ def register(
                     if found is None:
                         break
                     # An odometry saw the same small surfaces.
-                    inflation, unknown, prior = found, prediction.covariance, prior / INFLATION**2
+                    inflation, unknown, prior = found, prediction.covariance, prior / _INFLATION**2
         covariance = solution.covariance(_INFORMATION_SHARE)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
@@ -151,6 +166,46 @@ def with_mean_velocity(
         [pose / interval_s, (pose + last.covariance[:6, :6]) / interval_s**2],
     ])  # fmt: skip
     return replace(registration, velocity=velocity, covariance=covariance)
+
+
+def are_large(local_map: LocalMap, points: FloatArray, normals: FloatArray, sensor: FloatArray) -> NDArray[np.bool_]:
+    """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), are part of large ones."""
+    coarse, spread_m = local_map.coarse_planes(points, sensor)
+    is_thin = spread_m < _MOST_THICKNESS * local_map.cell_m * LEVELS[-1]
+    return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > _SAME_COSINE))
+
+
+def inflation_of_small(
+    points: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, local_map: LocalMap
+) -> FloatArray | None:
+    """Factors (N,) on the standard deviations of the points' surfaces, larger for small ones; None where these agree.
+
+    Relative to a crowd that walks along, a sensor is at rest; only walls, floor and ceiling differ. In a bare
+    corridor or a stairwell, large surfaces do not suffice for a pose, and small ones count in full. The points (N,
+    3) of the LiDAR frame were registered at the pose (4, 4) to all surfaces with equal weight.
+    """
+    matched = np.flatnonzero(surfaces.counts)
+    world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]
+    is_large = are_large(local_map, world, normals, T_world_lidar[:3, 3])
+    large = matched[is_large]
+    if len(large) < _FEWEST_LARGE:
+        return None
+    world, normals = world[is_large], normals[is_large]
+    residuals = np.einsum("ij,ij->i", world - surfaces.points[large], normals)
+    variances = surfaces.thickness_m[large, 0] ** 2 + _RANGE_NOISE_M**2
+    scale_m = _SCALE_PER_MEDIAN * np.median(np.abs(residuals))
+    weights = geman_mcclure(residuals, scale_m**2 + variances, variances)
+    scale = lever_scale(float(np.sqrt(np.mean(np.sum(points[large] ** 2, axis=1)))))
+    jacobian = point_to_plane_jacobian(points[large], normals @ T_world_lidar[:3, :3]) / scale
+    hessian = (jacobian * weights[:, None]).T @ jacobian
+    if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * float(weights @ surfaces.tilt[large, 0] ** 2):
+        return None
+    step_m = np.linalg.norm(np.linalg.solve(hessian, jacobian.T @ (weights * residuals)))
+    if step_m < _CONTRADICTION_CELLS * local_map.cell_m:
+        return None
+    inflation = np.full(len(points), _INFLATION)
+    inflation[large] = 1.0
+    return inflation
 
 
 def _heavy_tailed(prior: FloatArray, error: FloatArray) -> FloatArray:

@@ -44,10 +44,6 @@ class SampledScan:
     elevations: Annotated[FloatArray, Shape(None)]
     keypoints: Sweep  # the subset that is registered
 
-    def __post_init__(self) -> None:
-        if len(self.elevations) != len(self.sweep):
-            raise ValueError(f"{len(self.elevations)} elevations of {len(self.sweep)} points")
-
     def __len__(self) -> int:
         return len(self.sweep)
 
@@ -99,7 +95,7 @@ class Sampler(Stateful):
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
         squared = squared_ranges(scan.points)
-        cell_m = self._spacing_m(self._cell_m(squared))
+        cell_m = self._cell_m(squared)
         if self._has_rings is None and len(scan) >= _INSTANTS:
             self._has_rings = has_rings(scan)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
@@ -131,10 +127,6 @@ class Sampler(Stateful):
         if self._cell_range_m < _CLOSE_M:
             return _CELL_BOUNDS_M[0]
         return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
-
-    def _spacing_m(self, cell_m: float) -> float:
-        """The edge of the map's finest cells for that of the scene."""
-        return cell_m
 
     def _choose(self, scan: Scan, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
         """Indices (N,) of the points for the map, and their kinds (N,), if there are several."""

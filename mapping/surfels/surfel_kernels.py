@@ -54,8 +54,6 @@ _LEAST_SINE = 0.17
 _MOST_THICKNESS = 0.4
 _LEAST_WIDTH = 0.15
 _LEAST_WIDTH_CELLS = 0.2
-Scratch = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
-"""Room for the rows (27,) of cells around one, and for 15, 6 and 3 numbers."""
 # Least squared cosine between the view of a point and those of its cell for one side.
 _SAME_VIEW = 0.5
 # Columns of surfels: where the normal begins, and whether it is one of a plane.
@@ -184,7 +182,7 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
 
     `counts` (M,) has the numbers of points at the last computation.
     """
-    work = scratch()
+    work = np.empty(15), np.empty(6), np.empty(3)
     waiting, around = np.empty(_TOGETHER, dtype=np.int32), np.empty((_TOGETHER, 27), dtype=np.int32)
     count = 0
     for n in range(len(rows)):
@@ -219,21 +217,6 @@ def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -
 
 
 @compiled_part
-def scratch() -> Scratch:
-    """Room for `refresh_one`."""
-    return np.empty(27, dtype=np.int32), np.empty(15), np.empty(6), np.empty(3)
-
-
-@compiled_part
-def refresh_one(row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32], work: Scratch) -> None:
-    """Compute the surfel of one cell."""
-    counts[row] = cells.sums[row, 0]
-    prefetch_around(cells.keys[row], cells.bits, cells.table_keys, cells.table_rows)
-    _find_around(row, cells, work[0])
-    _compute(row, work[0], cells, surfels, work)
-
-
-@compiled_part
 def _find_around(row: int, cells: Cells, around: NDArray[np.int32]) -> None:
     """Write the rows (27,) of a cell and its neighbours, or -1, and prefetch their sums."""
     key, n = cells.keys[row], 0
@@ -246,9 +229,12 @@ def _find_around(row: int, cells: Cells, around: NDArray[np.int32]) -> None:
 
 
 @compiled_part
-def _compute(row: int, around: NDArray[np.int32], cells: Cells, surfels: FloatArray, work: Scratch) -> None:
-    """Compute the surfel of a cell, with the rows (27,) of the cells around it."""
-    _, total, covariance, values = work
+def _compute(
+    row: int, around: NDArray[np.int32], cells: Cells, surfels: FloatArray,
+    work: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:  # fmt: skip
+    """Compute the surfel of a cell, with the rows (27,) of the cells around it, and room for 15, 6 and 3 numbers."""
+    total, covariance, values = work
     _gather(row, around, cells, total)
     count, x, y, z = total[0], total[1] / total[0], total[2] / total[0], total[3] / total[0]
     covariance[0], covariance[1], covariance[2] = -x * x, -x * y, -x * z
@@ -344,13 +330,20 @@ def belong_to_others(
 
     Outdated surfels (M, 15) are updated.
     """
-    work, asked = scratch(), np.empty(len(rows), dtype=np.int32)
-    count = 0
+    asked, stale = np.empty(len(rows), dtype=np.int32), np.empty(2 * len(rows), dtype=np.int32)
+    count, size = 0, 0
     for n in range(len(rows)):
         prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
-        chosen[n] = False
+        chosen[n], other = False, other_side(rows[n], cells.sums)
+        if other == ABSENT and _is_seen_alike(views[n], cells.sums[rows[n]]):
+            continue
         asked[count] = n
-        count += other_side(rows[n], cells.sums) >= 0 or not _is_seen_alike(views[n], cells.sums[rows[n]])
+        count += 1
+        # An outdated plane is still the same plane; a cell without a plane may have one by now.
+        if other != ABSENT or not surfels[rows[n], _IS_PLANE] > 0.0:
+            stale[size], stale[size + 1] = rows[n], other
+            size += 2
+    refresh(stale[:size], cells, surfels, counts)
     for k in range(count):
         ahead = rows[asked[min(k + PREFETCHED, count - 1)]]
         prefetch(surfels[:, _IS_PLANE:], ahead)
@@ -358,16 +351,9 @@ def belong_to_others(
         n = asked[k]
         row, x, y, z = rows[n], float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
         other = other_side(row, cells.sums)
-        if other >= 0:
-            if outdated(row, cells.sums, counts):
-                refresh_one(row, cells, surfels, counts, work)
-            if outdated(other, cells.sums, counts):
-                refresh_one(other, cells, surfels, counts, work)
+        if other != ABSENT:
             chosen[n] = _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels)
             continue
-        # An outdated plane is still the same plane; a cell without a plane may have one by now.
-        if not surfels[row, _IS_PLANE] > 0.0 and outdated(row, cells.sums, counts):
-            refresh_one(row, cells, surfels, counts, work)
         p = surfels[row]
         behind = -(x * p[_NORMAL] + y * p[_NORMAL + 1] + z * p[_NORMAL + 2])
         chosen[n] = p[_IS_PLANE] > 0.0 and is_steep(behind, math.sqrt(x * x + y * y + z * z))
@@ -391,20 +377,17 @@ def turn_to_sensor(
 
     The sensor at (3,) measured points (N, 3).
     """
-    work = scratch()
+    others = np.empty(len(rows), dtype=np.int32)
     for n in range(len(rows)):
         prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
-        row = rows[n]
-        other = other_side(row, cells.sums) if row >= 0 else ABSENT
-        if other == ABSENT:
-            continue
-        if outdated(row, cells.sums, counts):
-            refresh_one(row, cells, surfels, counts, work)
-        if outdated(other, cells.sums, counts):
-            refresh_one(other, cells, surfels, counts, work)
-        x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
-        if _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels):
-            rows[n] = other
+        others[n] = other_side(rows[n], cells.sums) if rows[n] >= 0 else ABSENT
+    double = np.flatnonzero(others != ABSENT)
+    refresh(rows[double], cells, surfels, counts)
+    refresh(others[double], cells, surfels, counts)
+    for m in double:
+        x, y, z = sensor[0] - points[m, 0], sensor[1] - points[m, 1], sensor[2] - points[m, 2]
+        if _facing(others[m], x, y, z, cells, surfels) > _facing(rows[m], x, y, z, cells, surfels):
+            rows[m] = others[m]
 
 
 @compiled_part

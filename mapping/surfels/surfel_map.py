@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
@@ -41,6 +43,9 @@ _NOWHERE = -1
 _TIDIED_AFTER = 500
 # Spread of the elevations of points that were seen from many places.
 _ANY_HEIGHT_RAD = 0.2
+# Cells of a single scan's surfels, in cells of the map; points whose leverage exceeds the mean by the factor constrain
+# a direction that few others do.
+_SCAN_CELLS, _MANY_TIMES, _RIDGE = 2.0, 10.0, 1e-4
 # A direction that few walls are parallel to.
 _UNEVEN = np.array([0.46, 0.29, 0.84])
 
@@ -162,7 +167,6 @@ class SurfelMatcher(Matcher):
         self.surfaces = Surfaces.none(count)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
-        """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
         points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
         cells = point_keys(points, self._grids[0].cell_m)
         unmatched = np.flatnonzero(cells != self._cells)
@@ -198,7 +202,6 @@ class SurfelMap(LocalMap):
 
     @property
     def grids(self) -> list[SurfelGrid]:
-        """See `LocalMap`."""
         return self._grids
 
     @classmethod
@@ -219,7 +222,6 @@ class SurfelMap(LocalMap):
         return surfel_map
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
-        """See `LocalMap`."""
         self.insert(points, scan.elevations, sensor)
 
     def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
@@ -243,17 +245,14 @@ class SurfelMap(LocalMap):
             grid.insert(points, elevations, views, weight)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
-        """See `LocalMap`."""
         return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
 
     def level_normals(self) -> FloatArray:
-        """See `LocalMap`."""
         grid = self._grids[-1]
         surfels = grid.surfels(np.arange(len(grid), dtype=np.int32))
         return np.asarray(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL], dtype=np.float64)
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `LocalMap`."""
         grid = self._grids[-1]
         rows = grid.find(points, np.array(sensor))
         planes = grid.refreshed(rows)[rows]
@@ -261,11 +260,38 @@ class SurfelMap(LocalMap):
         return planes[:, NORMAL], np.where(is_plane, planes[:, SPREADS.start], np.inf)
 
     def means(self) -> FloatArray:
-        """See `LocalMap`."""
         return self._grids[1].means()
 
     def resample(self, other: "SurfelMap") -> None:
-        """See `LocalMap`; from the finest cells."""
         samples = other.grids[0].samples()
         for grid in self._grids:
             grid.insert_samples(*samples)
+
+
+def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: float, most: int) -> NDArray[np.intp]:
+    """Indices of the at most `most` points (N, 3) with by far the most leverage on a scan's registration, ascending.
+
+    The few points on the faces of boxes along a corridor determine its length, and an even sample has hardly any of
+    them. After Gelfand et al., "Geometrically Stable Sampling for the ICP Algorithm" (3DIM 2003), which sorts points by
+    each eigenvector of the information matrix; here by their statistical leverage, the same for all directions at once.
+    The points, in the LiDAR frame, have elevations (N,) above the sensor's equator, radians.
+    """
+    points, origin = np.ascontiguousarray(points), np.zeros(3)
+    views = np.empty((len(points), 3), dtype=np.float32)
+    write_views(points, origin, views)
+    grid = SurfelGrid(_SCAN_CELLS * cell_m)
+    grid.insert(points, elevations, views)
+    rows, surfaces = grid.find(points), Surfaces.none(len(points))
+    spread_m = np.empty(len(points))
+    match_planes(points, np.arange(len(points)), rows, grid.refreshed(rows), origin, spread_m, np.inf, surfaces)
+    planar = np.flatnonzero(surfaces.counts)
+    if not len(planar):
+        return planar
+    on_planes, normals = points.take(planar, axis=0), surfaces.normals[planar, 0]
+    lever_m = float(np.sqrt(np.einsum("ij,ij->i", on_planes, on_planes).mean()))
+    jacobian = point_to_plane_jacobian(on_planes, normals) / lever_scale(lever_m)
+    information = jacobian.T @ jacobian / len(planar) + _RIDGE * np.eye(6)
+    leverage = np.einsum("ij,ij->i", jacobian @ np.linalg.inv(information), jacobian)
+    eligible = np.flatnonzero(leverage > _MANY_TIMES * 6.0)
+    chosen = eligible[np.argsort(leverage[eligible])[::-1][:most]]
+    return np.sort(planar[chosen])

@@ -6,6 +6,7 @@ passed through should be empty in the map. All shifts are compared at once by FF
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,14 +73,12 @@ class BirdsEyeMap:
         peaks = []
         for yaw in np.arange(_YAWS) * (2.0 * np.pi / _YAWS):
             yield
-            c, s = np.cos(yaw), np.sin(yaw)
-            turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            turn = yaw_rotation(yaw).T
             image = _image(level @ turn, free @ turn[:2, :2], reach_m, self.cell_m)
             norm = float(np.linalg.norm(image))
             if norm == 0.0:
                 return np.empty((0, 4, 4))
-            product = spectrum * np.conj(rfft2(image, s=size))
-            correlation = np.asarray(irfft2(product, s=size) / norm, dtype=np.float32)
+            correlation = np.asarray(correlate(spectrum, image, size) / norm, dtype=np.float32)
             peaks += [
                 (score, yaw, self._position(shift, size, reach_m))
                 for score, shift in _peaks(correlation, peaks_per_yaw)
@@ -109,12 +108,10 @@ class BirdsEyeMap:
 
         Its points (N, 3) are levelled at that pose.
         """
-        c, s = np.cos(yaw), np.sin(yaw)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         away = self.points[:, :2] - xy
         around = self.points[np.einsum("ij,ij->i", away, away) < reach_m**2, 2]
         z = height_shift(around, level[:, 2], self.cell_m / _HEIGHT_BINS)
-        R = self.R_level_world.T @ turn @ self.R_level_world @ T_world_lidar[:3, :3]
+        R = self.R_level_world.T @ yaw_rotation(yaw) @ self.R_level_world @ T_world_lidar[:3, :3]
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
 
 
@@ -181,6 +178,18 @@ def _apart(
             if len(chosen) == most:
                 break
     return chosen
+
+
+def yaw_rotation(yaw: float) -> FloatArray:
+    """(3, 3) the rotation about z."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def correlate(spectrum: NDArray[Any], image: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
+    """Sums of products of an image of some size, given by its `rfft2`, and another one at every shift of that."""
+    correlation: NDArray[Any] = irfft2(spectrum * np.conj(rfft2(image, s=size)), s=size)
+    return correlation
 
 
 def height_shift(there: FloatArray, here: FloatArray, bin_m: float) -> float:

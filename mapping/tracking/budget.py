@@ -70,9 +70,6 @@ class Budget:
 
 def complete(steps: Steps[T]) -> T:
     """The result of a computation that is not to pause."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+    done = Budget().run(steps)
+    assert done is not None
+    return done[0]

@@ -19,13 +19,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
-from lidarslam.mapping.motion.prediction import (
-    LOST_MOTION,
-    UNKNOWN_VELOCITY,
-    MotionState,
-    Prediction,
-    Prior,
-)
+from lidarslam.mapping.motion.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from lidarslam.mapping.motion.velocity_bias import velocity_error
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
@@ -53,10 +47,6 @@ class Insertion:
     points: Annotated[FloatArray, Shape(None, 3)]  # in the world
     elevations: Annotated[FloatArray, Shape(None)]  # their angles above the sensor's equator, radians
     sensor: Annotated[FloatArray, Shape(3)]  # position in the world
-
-    def __post_init__(self) -> None:
-        if len(self.elevations) != len(self.points):
-            raise ValueError(f"{len(self.elevations)} elevations of {len(self.points)} points")
 
 
 class Mapper(Stateful):

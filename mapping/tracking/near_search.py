@@ -16,7 +16,7 @@ from lidarslam.mapping.motion.prediction import (
     ProcessNoise,
     predict,
 )
-from lidarslam.mapping.surfels.stability import constraining_points
+from lidarslam.mapping.surfels.surfel_map import constraining_points
 from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.mapped_scan import Attempt
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher

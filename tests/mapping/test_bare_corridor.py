@@ -11,8 +11,7 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction
 from lidarslam.mapping.registration.registration import register
 from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.surfels.stability import constraining_points
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.surfels.surfel_map import SurfelMap, constraining_points
 from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher, measure_fit

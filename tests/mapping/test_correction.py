@@ -90,13 +90,3 @@ def test_gtsam_reads_the_g2o_text_that_is_written(rng, tmp_path):
         assert list(factor.keys()) == [edge.first, edge.second]
         np.testing.assert_allclose(factor.measured().matrix(), edge.T_first_second, atol=1e-9)
         np.testing.assert_allclose(factor.noiseModel().covariance(), edge.covariance, rtol=1e-7, atol=1e-12)
-
-
-def test_information_is_translation_first_in_g2o_text():
-    covariance = np.diag([1 / 400, 1 / 900, 1 / 1600, 1 / 100, 1 / 25, 1 / 4])
-    _, line = format_g2o(np.eye(4)[None], [RelativePose(0, 1, np.eye(4), covariance)]).splitlines()
-    tag, first, second, *numbers = line.split()
-    assert (tag, first, second) == ("EDGE_SE3:QUAT", "0", "1")
-    assert [float(number) for number in numbers[:7]] == [0, 0, 0, 0, 0, 0, 1]
-    upper = np.array([float(number) for number in numbers[7:]])
-    np.testing.assert_allclose(upper[[0, 6, 11, 15, 18, 20]], [100, 25, 4, 400, 900, 1600])

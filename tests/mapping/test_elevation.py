@@ -83,18 +83,6 @@ def sampled(street: Any) -> list[SampledScan]:
     return [sampler.sample(scan) for scan in scans]
 
 
-def test_a_saved_estimator_goes_on_as_before(sampled, through_disk):
-    whole, first, second = ElevationEstimator(), ElevationEstimator(), ElevationEstimator()
-    for number, (scan, T) in enumerate(4 * list(zip(sampled, poses(), strict=True))):
-        whole.add(scan, registered(T))
-        (first if number < 25 else second).add(scan, registered(T))
-        if number == 24:
-            second.restore(through_disk(first.state()))
-    bias = whole.bias()
-    assert bias == second.bias()
-    assert np.rad2deg(bias.angle) == pytest.approx(TRUE_DEG, abs=0.03)
-
-
 def test_a_stretch_ends_where_tracking_does(sampled):
     estimator = ElevationEstimator()
     for number, (scan, T) in enumerate(zip(sampled, poses(), strict=True)):

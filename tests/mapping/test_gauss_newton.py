@@ -101,11 +101,6 @@ def test_each_open_direction_has_a_name_of_its_own():
     assert sorted(Degeneracy(directions, 5.0).names) == ["x", "y"]
 
 
-@pytest.mark.parametrize("factor", [0.1, 1.0, 20.0])
-def test_the_number_of_points_does_not_matter(factor):
-    assert find(corridor(np.random.default_rng(1), round(200 * factor))).names == ("x",)
-
-
 @pytest.mark.parametrize("weight", [1e-6, 1e6])
 def test_the_unit_of_the_weights_does_not_matter(rng, weight):
     scene = tilted(rng, corridor(rng), 0.02)

@@ -85,26 +85,6 @@ def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng):
         np.testing.assert_allclose(values, expected[name], rtol=1e-5, atol=1.0 if name == "rgb" else 1e-5)
 
 
-def test_attributes_go_on(rng, through_disk, monkeypatch):
-    """A map that is saved and restored in between is the whole one, to the last bit."""
-    monkeypatch.setattr(module, "_MIN_PENDING", 1500)
-    scans = [
-        (rng.uniform(-3.0, 3.0, (1000, 3)), some(rng, 1000, number, names))
-        for number, names in enumerate(("", "intensity", "intensity", "intensity rgb ring time", "rgb"))
-    ]
-    whole = GlobalMap(VOXEL_M)
-    for points, known in scans:
-        whole.add(points, np.eye(4), known)
-    for after in range(len(scans)):
-        part, restored = GlobalMap(VOXEL_M), GlobalMap(1.0)
-        for number, (points, known) in enumerate(scans):
-            if number == after:
-                restored.restore(through_disk(part.state()))
-            (part if number < after else restored).add(points, np.eye(4), known)
-        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
-        assert restored.means().layout == whole.means().layout
-
-
 def test_precision_does_not_suffer_far_from_the_origin():
     grid = GlobalMap(0.1)
     far = np.array([[12_345.678, -9_876.543, 210.987]])
@@ -141,10 +121,13 @@ def test_views_turn_with_the_submap():
         np.testing.assert_allclose(drawn.cloud().normals.mean(axis=0), expected, atol=1e-6)
 
 
-def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng):
+def test_a_map_holds_what_its_voxels_reach_and_leaves_out_the_rest(rng):
     points = rng.uniform(-5.0, 5.0, (500, 3))
-    whole, moved = GlobalMap(0.05), GlobalMap(0.05)
+    whole, moved, far = GlobalMap(0.05), GlobalMap(0.05), GlobalMap(0.05)
     whole.add(points, np.eye(4))
+    far.add(points, exp([0.0, 0.0, 0.0, reach_m(0.05) - 6.0, 0.0, 0.0]))
+    assert far.beyond == 0
+    assert len(far.points()) == pytest.approx(len(whole.points()), rel=0.1)
     moved.add(points, np.eye(4))
     for distance_m in (-1e7, 60_000.0, 1e12):
         moved.add(points, exp([0.0, 0.0, 0.0, 0.0, distance_m, 0.0]))
@@ -153,12 +136,3 @@ def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng):
     assert moved.beyond == 1500 + len(whole.points())
     drawn = drawn_map(moved, Views().placed(np.empty((0, 4, 4))), GlobalMapConfig())
     assert "52 km" in drawn.warning
-
-
-def test_points_up_to_the_reach_are_in_the_map(rng):
-    points = rng.uniform(-5.0, 5.0, (500, 3))
-    near, far = GlobalMap(0.05), GlobalMap(0.05)
-    near.add(points, np.eye(4))
-    far.add(points, exp([0.0, 0.0, 0.0, reach_m(0.05) - 6.0, 0.0, 0.0]))
-    assert far.beyond == 0
-    assert len(far.points()) == pytest.approx(len(near.points()), rel=0.1)

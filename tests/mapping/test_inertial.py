@@ -443,18 +443,3 @@ def test_signs_units_and_axes_that_cannot_be_right_are_seen(rates, forces, seen,
     )
     found = compared(walk, rng, flawed, make_transform(np.eye(3), T_LIDAR_IMU[:3, 3])).contradiction()
     assert found is None if seen is None else seen in str(found)
-
-
-def test_restored_it_goes_on_alike(walked, through_disk):
-    """To the last bit, in the middle of a second of gravity."""
-    for stamp in 8.0 + PERIOD_S * np.arange(3):
-        take(walked, stamp, inverse(walk(0.5)) @ walk(stamp))
-    begun, resumed = walked, Inertial(samples(walk, 20.0), T_LIDAR_IMU)
-    resumed.restore(through_disk(begun.state()))
-    for stamp in 8.3 + PERIOD_S * np.arange(15):
-        pose = inverse(walk(0.5)) @ walk(stamp)
-        one, other = take(begun, stamp, pose), take(resumed, stamp, pose)
-        np.testing.assert_array_equal(one.T_world_lidar, other.T_world_lidar)
-        np.testing.assert_array_equal(one.covariance, other.covariance)
-        directions = [None if each.direction is None else each.direction.lidar for each in (begun, resumed)]
-        np.testing.assert_array_equal(*directions)

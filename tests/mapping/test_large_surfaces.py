@@ -6,8 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.registration.large_surfaces import inflation_of_small
-from lidarslam.mapping.registration.registration import register
+from lidarslam.mapping.registration.registration import inflation_of_small, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .shapes import on_sides, surfel_map_of

@@ -117,12 +117,6 @@ def curvatures(points: FloatArray, rings: NDArray[np.intp] | None = None) -> Flo
     return found
 
 
-def test_the_curvature_of_a_straight_line_is_zero():
-    line = np.linspace([3.0, -2.0, 1.0], [4.8, -2.0, 3.4], 30)
-    np.testing.assert_array_equal(np.isnan(curvatures(line)), np.arange(30) // 5 % 5 == 0)
-    np.testing.assert_allclose(curvatures(line)[5:25], 0.0, atol=1e-24)
-
-
 @pytest.mark.parametrize("angle_deg", [30.0, 90.0, 150.0])
 def test_the_curvature_of_a_corner(angle_deg):
     """The sides' sums are 15 steps of 5 cm along either."""
@@ -256,18 +250,6 @@ def test_features_are_points_as_measured_with_their_times(ring_scans):
     edges, planes = extract_features(replace(scan, time_offsets=None), 0.5, 100.0, 0.1)
     assert edges.times is None
     np.testing.assert_array_equal(planes.points, features[1].points)
-
-
-def test_features_lie_within_the_range_limits(ring_scans):
-    scan = ring_scans[0]
-    all_of, some = extract_features(scan, 0.5, 100.0, FINE_M), extract_features(scan, 4.0, 7.0, FINE_M)
-    for every, limited in zip(all_of, some, strict=True):
-        ranges = np.linalg.norm(limited.points, axis=1)
-        assert ((ranges > 4.0) & (ranges < 7.0)).all()
-        before = np.linalg.norm(every.points, axis=1)
-        within = every.points[(before > 4.0) & (before < 7.0)]
-        assert len(within) < len(every)
-        assert np.isin(rows_of(within, scan), rows_of(limited.points, scan)).all()
 
 
 def test_one_feature_a_voxel_is_kept(ring_scans):

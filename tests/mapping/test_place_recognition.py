@@ -1,16 +1,14 @@
 """Sparse submaps and their bird's-eye views: turned, moved and tilted, places are recognised; others are not."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
-from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
-from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, SubmapFile, _level_rotation
+from lidarslam.mapping.loops.birds_eye_view import BirdsEyeView, align, compare
+from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, _level_rotation
 
 from .runs import assert_near
-from .shapes import on_boxes, on_sides
+from .shapes import on_boxes
 
 RADIUS_M = 16.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])
@@ -33,8 +31,8 @@ def submap(points_world: FloatArray, T_world_lidar: FloatArray):
 
 
 def similarity(first, second) -> tuple[float, float]:
-    descriptor = BirdEyeView.of(second).descriptor(RADIUS_M)
-    found, turn = compare(descriptor, BirdEyeView.of(first).descriptor(RADIUS_M)[None])
+    descriptor = BirdsEyeView.of(second).descriptor(RADIUS_M)
+    found, turn = compare(descriptor, BirdsEyeView.of(first).descriptor(RADIUS_M)[None])
     return float(found[0]), float(turn[0])
 
 
@@ -46,18 +44,10 @@ def hall() -> FloatArray:
 HOME = pose(0.5, 0.3, 0.0)
 
 
-@pytest.mark.parametrize("yaw_deg", [0.0, 37.0, -60.0])
-def test_the_turn_is_found_whatever_it_is(hall, yaw_deg):
-    score, turn = similarity(submap(hall, HOME), submap(hall, pose(0.5, 0.3, yaw_deg)))
-    off = np.rad2deg(turn) - yaw_deg
-    assert abs((off + 90.0) % 180.0 - 90.0) <= 3.0
-    assert score > 0.7
-
-
 def test_a_place_is_found_among_others(hall):
     places = [scene(seed) for seed in range(2, 30)] + [hall]
-    descriptors = np.stack([BirdEyeView.of(submap(place, HOME)).descriptor(RADIUS_M) for place in places])
-    query = BirdEyeView.of(submap(hall, pose(2.0, -0.9, 130.0))).descriptor(RADIUS_M)
+    descriptors = np.stack([BirdsEyeView.of(submap(place, HOME)).descriptor(RADIUS_M) for place in places])
+    query = BirdsEyeView.of(submap(hall, pose(2.0, -0.9, 130.0))).descriptor(RADIUS_M)
     scores, _ = compare(query, descriptors)
     assert scores.argmax() == 28
     assert descriptors[0].nbytes < 6_500
@@ -69,7 +59,7 @@ def test_laid_over_one_another(hall, T_target_source):
     true[2, 3] = 0.4
     target, source = submap(hall, HOME), submap(hall, HOME @ true)
     _, turn = similarity(target, source)
-    T, score = align(BirdEyeView.of(target), BirdEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
+    T, score = align(BirdsEyeView.of(target), BirdsEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
     assert_near(T, true, 0.6, 4.0)
     assert 0.5 < score <= 1.0
 
@@ -78,7 +68,7 @@ def test_of_repeated_places_the_expected_one_counts():
     pillars = np.concatenate([[[4.0 * i, s * 3.0, 0.0]] for i in range(-6, 7) for s in (-1, 1)])
     points = pillars.repeat(80, axis=0)
     points += np.random.default_rng(0).uniform(-0.2, 0.2, points.shape) * [1, 1, 8]
-    target = source = BirdEyeView(points[:, :2], points[:, 2], np.eye(3))
+    target = source = BirdsEyeView(points[:, :2], points[:, 2], np.eye(3))
     for x in (-4.0, 0.0, 4.0):
         T, _ = align(target, source, np.zeros(1), RADIUS_M, np.array([x + 0.5, 0.0]), 3.0)
         assert T[0, 3] == pytest.approx(x, abs=0.6)
@@ -130,9 +120,9 @@ def test_points_out_of_range_or_not_finite_are_left_out():
 @pytest.mark.parametrize("count", [0, 1, 8])
 def test_nearly_empty_submaps_have_a_descriptor(count):
     tiny = SparseSubmap.of(np.random.default_rng(0).uniform(-4, 4, (count, 3)), 60.0)
-    descriptor = BirdEyeView.of(tiny).descriptor(RADIUS_M)
+    descriptor = BirdsEyeView.of(tiny).descriptor(RADIUS_M)
     assert np.isfinite(descriptor).all()
-    T, _ = align(BirdEyeView.of(tiny), BirdEyeView.of(tiny), np.zeros(1), RADIUS_M)
+    T, _ = align(BirdsEyeView.of(tiny), BirdsEyeView.of(tiny), np.zeros(1), RADIUS_M)
     assert np.isfinite(T).all()
 
 
@@ -141,20 +131,3 @@ def test_memory_of_a_submap_is_bounded():
     found = SparseSubmap.of(points, 60.0)
     assert len(found) == 2500
     assert sum(array.nbytes for array in vars(found).values() if isinstance(array, np.ndarray)) < 70_000
-
-
-def test_submaps_come_back_from_their_file_to_the_last_bit(rng, tmp_path):
-    kept = SubmapFile(tmp_path)
-    given = [SparseSubmap.of(on_sides(rng, np.full(3, 6.0), points), 100.0) for points in (2001, 0, 7, 900)]
-    for one in given:
-        kept.append(one)
-        assert len(kept[-1]) == len(one)
-    assert len(kept) == len(given)
-    assert not list(tmp_path.iterdir())
-    for one, other in zip(kept, given, strict=True):
-        for field in fields(SparseSubmap):
-            a, b = np.asarray(getattr(one, field.name)), np.asarray(getattr(other, field.name))
-            assert a.dtype == b.dtype, field.name
-            assert np.array_equal(a, b), field.name
-    with pytest.raises(IndexError):
-        kept[len(given)]

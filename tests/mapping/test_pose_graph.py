@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 import pytest
 
@@ -201,28 +200,6 @@ def test_a_good_covariance_is_kept(rng):
 def test_a_component_is_named_by_its_first_node():
     assert first_connected(8, [(6, 7), (4, 5), (5, 7), (1, 2)]).tolist() == [0, 1, 1, 3, 4, 4, 4, 4]
     assert first_connected(2, []).tolist() == [0, 1]
-
-
-@pytest.mark.real_data
-def test_a_real_graph_ends_where_gtsam_ends_with_it(real_data):
-    path = real_data / "trajectories" / "parking-garage.g2o"
-    if not path.is_file():
-        pytest.skip(f"no {path.name} in the real data")
-    factors, values = gtsam.readG2o(str(path), True)
-    poses = np.array([values.atPose3(key).matrix() for key in range(values.size())])
-    edges, loops = [], []
-    for row in range(factors.size()):
-        factor = factors.at(row)
-        one = RelativePose(*factor.keys(), factor.measured().matrix(), factor.noiseModel().covariance())
-        (edges if one.second - one.first == 1 else loops).append(one)
-    optimised = optimise(poses, edges, loops)
-    assert optimised.inliers.all()
-    factors.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
-    found = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
-    ours = gtsam.Values()
-    for key, pose in enumerate(optimised.poses):
-        ours.insert(key, gtsam.Pose3(pose))
-    assert factors.error(ours) == pytest.approx(factors.error(found), rel=1e-6)
 
 
 def test_gravity_holds_roll_and_pitch_where_the_edges_drift():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.loops.closure import NEAR_SCANS, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph import slam_graph
@@ -162,7 +162,8 @@ def closed(walk: Walk) -> tuple[SlamGraph, Corrected]:
 
 
 def test_a_closed_round_takes_the_drift_away(walk, closed):
-    _, result = closed
+    graph, result = closed
+    np.testing.assert_array_equal(graph.present().T_world_lidar, result.T_world_lidar)
     before, after = walk.errors_m(walk.estimate), walk.errors_m(result.T_world_lidar)
     assert before.max() > 0.6
     assert np.sqrt(np.mean(after**2)) < 0.2 * np.sqrt(np.mean(before**2))
@@ -215,14 +216,6 @@ def test_every_loop_that_is_inlier_is_one_and_an_edge_beside_those_of_trajectory
     assert loops == sum(result.inliers)
     assert len(result.edges) - loops == 2 * (keyframes - 1)
     assert 20 < keyframes < 120
-
-
-def test_the_scans_between_follow_their_keyframes(walk, closed):
-    _, result = closed
-    np.testing.assert_allclose(result.T_world_lidar[result.keyframe_scans], result.keyframe_poses, atol=1e-9)
-    steps = log(inverse(result.T_world_lidar[:-1]) @ result.T_world_lidar[1:])
-    as_estimated = log(inverse(walk.estimate[:-1]) @ walk.estimate[1:])
-    assert np.linalg.norm((steps - as_estimated)[:, 3:], axis=1).max() < 0.04  # spread over the way, no jump
 
 
 def test_the_map_is_drawn_where_the_scans_have_gone(walk, closed):
@@ -298,33 +291,6 @@ def test_a_run_without_a_scan_has_nothing_to_correct():
     assert graph.finish() is None
     graph.draw(np.zeros((3, 3)), np.eye(4), VOXEL_M)  # nothing to draw into, and no harm done
     graph.close()
-
-
-@pytest.mark.long
-def test_a_graph_that_is_restored_goes_on_to_the_same_result(walk, closed, through_disk, tmp_path):
-    """After loops were closed, which the present poses show without a change of the graph."""
-    scans, file = list(walk.scans()), tmp_path / "submaps.bin"
-    begun = SlamGraph(CONFIG, file=file)
-    until = int(0.97 * len(scans))
-    go_on(begun, scans[:until])
-    before, after = walk.errors_m(walk.estimate)[:until], walk.errors_m(begun.present().T_world_lidar)
-    assert np.sqrt(np.mean(after**2)) < 0.25 * np.sqrt(np.mean(before**2))
-    saved = through_disk(begun.state())
-    go_on(begun, scans[until : until + 20])  # more lies in the file by the time that it is killed
-    begun.close()
-    graph = SlamGraph(CONFIG, file=file)
-    graph.restore(saved)
-    go_on(graph, scans[until:])
-    result = graph.finish()
-    whole, expected = closed
-    np.testing.assert_array_equal(result.T_world_lidar, expected.T_world_lidar)
-    np.testing.assert_array_equal(result.keyframe_scans, expected.keyframe_scans)
-    assert result.inliers == expected.inliers
-    for found, closure in zip(result.closures, expected.closures, strict=True):
-        for name, value in vars(closure).items():
-            np.testing.assert_array_equal(getattr(found, name), value)
-    drawn = graph.draw_map(result, VOXEL_M)
-    np.testing.assert_array_equal(drawn.means().rows, whole.draw_map(expected, VOXEL_M).means().rows)
 
 
 def test_a_recording_that_is_added_whole_has_the_result_of_one_that_is_followed(walk, closed):

@@ -10,7 +10,6 @@ from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout, Rows
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.pose_graph.edges import Keyframe
-from lidarslam.mapping.pose_graph.keyframe_graph import SubmapStore
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER, Drawn, SubmapPlacement, draw_local_map
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
@@ -85,13 +84,8 @@ def revisited(rng: np.random.Generator) -> tuple[SubmapPlacement, FloatArray]:
     return laid(submaps, poses, targets)[0], poses
 
 
-@pytest.mark.parametrize("resumed", [False, True])
-def test_where_a_submap_lay_when_a_scan_was_registered(revisited, through_disk, resumed):
+def test_where_a_submap_lay_when_a_scan_was_registered(revisited):
     laid, poses = revisited
-    if resumed:
-        again = SubmapPlacement(RADIUS_M)
-        again.restore(through_disk(laid.state()))
-        laid = again
     exchanged = 40 + SCANS_LATER
     before = laid.place(0, 0, poses[0], exchanged - 1)
     after = laid.place(0, 0, poses[0], exchanged)
@@ -128,12 +122,9 @@ NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
 
 
 def as_registered(
-    measured: LoopClosure,
-    way: FloatArray,
-    radius_m: float,
-    first: FloatArray | None = REGISTERED,
+    measured: LoopClosure, way: FloatArray, radius_m: float, first: FloatArray | None = REGISTERED,
     drawn: tuple[Drawn, ...] = (),
-) -> LoopClosure:
+) -> LoopClosure:  # fmt: skip
     """The closure of the first and last scan, in a local map of that radius."""
     placement = SubmapPlacement(radius_m)
     placement._drawn = [*drawn]
@@ -169,24 +160,3 @@ def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip):
 def test_elsewhere_the_closure_counts(round_trip, radius_m, first, off):
     measured = closure(round_trip, off)
     assert as_registered(measured, round_trip, radius_m, first) is measured
-
-
-def test_submaps_come_back_in_any_order(rng, tmp_path):
-    store = SubmapStore(tmp_path)
-    layouts = [Layout(), Layout(intensity=True), Layout(), Layout(rgb=True, first=True)]
-    kept = [
-        VoxelMeans(rng.normal(size=(size, layout.width)).astype(np.float32), layout)
-        for size, layout in zip((5, 0, 1000, 3), layouts, strict=True)
-    ]
-    for means in kept:
-        store.append(means)
-    assert len(store) == 4
-    for index in (2, 0, 3, 1, 2):
-        np.testing.assert_array_equal(store[index].rows, kept[index].rows)
-        assert store[index].layout == kept[index].layout
-    store.append(kept[0])  # reading in between does no harm
-    np.testing.assert_array_equal(store[4].rows, kept[0].rows)
-    assert not list(tmp_path.iterdir())  # the file has no name
-    store.close()
-    with pytest.raises(ValueError):
-        store.append(kept[0])

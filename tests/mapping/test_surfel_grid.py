@@ -76,25 +76,14 @@ def test_a_surfel_is_as_thick_as_the_noise(rng):
     np.testing.assert_allclose(thickness, 0.02, rtol=0.1)
 
 
-def test_several_batches_make_what_one_makes(rng):
-    points, elevations = cloud(rng, 20_000), rng.normal(size=20_000)
-    at_once, in_parts = grid_of(points, elevations), SurfelGrid(CELL)
+@pytest.mark.parametrize("weight", [1.0, 3.0], ids=["in batches", "weighed"])
+def test_batches_make_what_one_makes_and_a_point_counts_as_many_as_it_weighs(rng, weight):
+    points, elevations, times = cloud(rng, 20_000), rng.normal(size=20_000), round(weight)
+    grid, whole = SurfelGrid(CELL), grid_of(np.repeat(points, times, axis=0), np.repeat(elevations, times))
     for part in np.array_split(np.arange(len(points)), 7):
-        in_parts.insert(points[part], elevations[part], from_above(len(part)))
-    assert len(at_once) == len(in_parts)
-    one, other = surfels_at(at_once, points), surfels_at(in_parts, points)
-    np.testing.assert_allclose(other[:, MEAN], one[:, MEAN], atol=1e-5)
-    np.testing.assert_allclose(other[:, SPREADS], one[:, SPREADS], atol=1e-4)
-    np.testing.assert_allclose(other[:, ELEVATION_SPREAD], one[:, ELEVATION_SPREAD], atol=1e-4)
-    np.testing.assert_allclose(other[:, COUNT], one[:, COUNT], rtol=1e-5)
-
-
-def test_a_point_counts_as_many_as_it_weighs(rng):
-    points, elevations = cloud(rng, 3_000), rng.normal(size=3_000)
-    weighed, repeated = SurfelGrid(CELL), SurfelGrid(CELL)
-    weighed.insert(points, elevations, from_above(3_000), weight=3.0)
-    repeated.insert(np.repeat(points, 3, axis=0), np.repeat(elevations, 3), from_above(9_000))
-    one, other = surfels_at(weighed, points), surfels_at(repeated, points)
+        grid.insert(points[part], elevations[part], from_above(len(part)), weight)
+    assert len(grid) == len(whole)
+    one, other = surfels_at(grid, points), surfels_at(whole, points)
     for columns in (MEAN, SPREADS, ELEVATION_SPREAD):
         np.testing.assert_allclose(one[:, columns], other[:, columns], atol=1e-4)
     np.testing.assert_allclose(one[:, COUNT], other[:, COUNT], rtol=1e-5)
@@ -228,23 +217,3 @@ def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng):
     assert (grid.find(strays[strays[:, 2] > 1.8]) == ABSENT).all()
     assert (grid.find(once) != ABSENT).all()
     np.testing.assert_allclose(surfels_at(grid, inner)[:, MEAN], seen, atol=1e-3)
-
-
-def test_a_place_seen_again_and_again_takes_no_more_cells(rng):
-    """Without tidying noise would reach a third more of them."""
-
-    def cells(tidied: bool) -> list[int]:
-        grid, counts = SurfelGrid(0.1), []
-        for scan in range(1, 1_601):
-            points = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.zeros(3), half_size=1.0, count=300)
-            grid.insert(points + rng.normal(0.0, 0.03, points.shape), np.zeros(len(points)), from_above(len(points)))
-            if tidied and scan % 100 == 0:
-                grid.tidy()
-            if scan % 400 == 0:
-                counts.append(len(grid))
-        return counts
-
-    tidied, untidied = cells(True), cells(False)
-    assert tidied[-1] < 1.05 * tidied[0]
-    assert untidied[-1] > 1.1 * untidied[0]
-    assert tidied[-1] < 0.8 * untidied[-1]

@@ -1,13 +1,11 @@
 """Walls thinner than a cell: each side is matched by those who see it, wherever the cells' borders are."""
 
 from collections.abc import Sequence
-from copy import deepcopy
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
-from lidarslam.core.state import Saved
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import Correspondences
 from lidarslam.mapping.surfels.grid import MEAN, NORMAL, SurfelGrid
@@ -125,18 +123,6 @@ def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng):
     for points, sensor, x in ((faces[0], [-1.0, 7.0, 0.0], 2.1), (faces[1], [5.0, 7.0, 0.0], 2.2)):
         surfels = grid.surfels(grid.find(points, np.array(sensor)))
         np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
-
-
-def test_both_sides_restored_go_on_alike_to_the_last_bit(rng):
-    grid, near, far = grid_of_both_sides(rng, count=300)
-    restored = SurfelGrid(CELL)
-    restored.restore(Saved(deepcopy(grid.state())))
-    for other in (grid, restored):
-        for points, view in ((near, NEAR_SIDE), (far, FAR_SIDE)):
-            show(other, points + np.array([0.0, 0.4, 0.0]), view)
-    np.testing.assert_equal(restored.state(), grid.state())
-    for points, sensor in ((near, SENSORS[0]), (far, SENSORS[1])):
-        np.testing.assert_array_equal(grid.find(points, sensor), restored.find(points, sensor))
 
 
 def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng):

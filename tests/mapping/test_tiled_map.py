@@ -163,24 +163,6 @@ def test_a_map_that_just_fits_stays_in_one_piece(views):
     assert drawn_map(fits, views, CONFIG).tiled is None
 
 
-def test_a_map_goes_on_with_the_tiles_on_disk(tmp_path, through_disk):
-    """Tiles that were written after the state are not in it; those of the one that was not killed are the same."""
-    whole = walked(GlobalMap(VOXEL_M, MOST, TileStore()))
-    for after in (3, 17, 30):
-        file = tmp_path / f"tiles{after}.bin"
-        part = walked(GlobalMap(VOXEL_M, MOST, TileStore(file=file)), range(after))
-        saved = through_disk(part.state())
-        kept = file.stat().st_size if file.exists() else 0
-        walked(part, range(after, 40))  # and then it is killed
-        assert file.stat().st_size > kept
-        restored = GlobalMap(1.0, MOST, TileStore(file=file))
-        restored.restore(saved)
-        walked(restored, range(after, 40))
-        assert restored.tiles() == whole.tiles()
-        for tile in whole.tiles():
-            np.testing.assert_array_equal(restored.tile(tile).means().rows, whole.tile(tile).means().rows)
-
-
 def test_tiles_that_are_cut_off_are_refused(tmp_path, through_disk):
     file = tmp_path / "tiles.bin"
     saved = through_disk(walked(GlobalMap(VOXEL_M, MOST, TileStore(file=file))).state())

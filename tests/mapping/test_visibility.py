@@ -235,14 +235,3 @@ def test_views_of_several_recordings_are_joined(rng):
     parts = [placed([wall(10.0)] * 2), placed([wall(9.0)])]
     assert not any(seen_through(at(10.0), part, VOXEL_M).any() for part in parts)
     assert seen_through(at(10.0), PlacedViews.join(parts), VOXEL_M).all()
-
-
-@pytest.mark.parametrize("after", [0, 7, 600])
-def test_views_go_on(after, rng, through_disk):
-    whole, first, second = Views(every=1), Views(every=1), Views()
-    for number, cloud in enumerate(rng.uniform(-5.0, 5.0, (700, 20, 3))):
-        if number == after:
-            second.restore(through_disk(first.state()))
-        whole.add(cloud, number)
-        (first if number < after else second).add(cloud, number)
-    np.testing.assert_equal(second.state(), whole.state())

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.fft import next_fast_len, rfft2
 
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.mapping.loops.sparse_submap import PLANE, SparseSubmap
-from lidarslam.mapping.tracking.birds_eye_map import height_shift
+from lidarslam.mapping.tracking.birds_eye_map import correlate, height_shift, yaw_rotation
 
 _DIRECTIONS = 60  # over half a turn
 _BINS = 64
@@ -25,7 +25,7 @@ _HEIGHT_BIN_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class BirdEyeView:
+class BirdsEyeView:
     """A submap from above: `structure` (M, 2) of its upright points, `heights` (N,) of all."""
 
     structure: FloatArray
@@ -33,7 +33,7 @@ class BirdEyeView:
     R_level_lidar: FloatArray
 
     @classmethod
-    def of(cls, submap: SparseSubmap, upside_down: bool = False) -> "BirdEyeView":
+    def of(cls, submap: SparseSubmap, upside_down: bool = False) -> "BirdsEyeView":
         """View a submap; upside down where its sensor is mounted the other way up than that of the others."""
         R = np.diag([1.0, -1.0, -1.0]) @ submap.R_level_lidar if upside_down else submap.R_level_lidar
         level = submap.points.astype(np.float64) @ R.T
@@ -65,13 +65,9 @@ def compare(descriptor: NDArray[np.complex64], others: NDArray[np.complex64]) ->
 
 
 def align(
-    target: BirdEyeView,
-    source: BirdEyeView,
-    yaws: FloatArray,
-    radius_m: float,
-    expected_xy: FloatArray | None = None,
-    within_m: float = 0.0,
-) -> tuple[FloatArray, float]:
+    target: BirdsEyeView, source: BirdsEyeView, yaws: FloatArray, radius_m: float,
+    expected_xy: FloatArray | None = None, within_m: float = 0.0,
+) -> tuple[FloatArray, float]:  # fmt: skip
     """`T_target_source` (4, 4), in the LiDAR frames, by correlation of two views; and the score, 0 to 1.
 
     Turns (Y,) of the source, upright, are tried. Its position, upright, in the target's view is expected at some (2,)
@@ -88,14 +84,13 @@ def align(
         prior = np.clip(1.0 - squared / (within_m + cell_m) ** 2, 0.0, None)
     score, turn, shift = -1.0, np.eye(3), [0.0, 0.0]
     for yaw in yaws:
-        c, s = np.cos(yaw), np.sin(yaw)
-        here = _image(source.structure @ np.array([[c, s], [-s, c]]), radius_m, size)
-        overlay = prior * irfft2(spectrum * np.conj(rfft2(here)), s=(size, size))
+        R = yaw_rotation(yaw)
+        here = _image(source.structure @ R[:2, :2].T, radius_m, size)
+        overlay = prior * correlate(spectrum, here, (size, size))
         peak = np.unravel_index(int(overlay.argmax()), overlay.shape)
         here_score = float(overlay[peak] / max(length * np.sqrt(np.sum(here * here)), 1e-12))
         if here_score > score:
-            score, shift = here_score, shifts[list(peak)].tolist()
-            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            score, shift, turn = here_score, shifts[list(peak)].tolist(), R
     moved = make_transform(turn, [*shift, height_shift(target.heights, source.heights, _HEIGHT_BIN_M)])
     target_level = make_transform(target.R_level_lidar, np.zeros(3))
     return inverse(target_level) @ moved @ make_transform(source.R_level_lidar, np.zeros(3)), score
