@@ -235,7 +235,7 @@ class _Stations:
 
     def on_ground(self, k: int, aside: float) -> FloatArray:
         """A point (3,) on the ground that far to the left of station k."""
-        return on_ground(self.at(k, aside, 0.0)[None, :2], self.ground)[0]
+        return np.asarray(on_ground(self.at(k, aside, 0.0)[None, :2], self.ground)[0])
 
     def is_beside(self, point: FloatArray, reach: float) -> bool:
         """Whether a thing that reaches that far around a point (3,) is outside the free space along the path."""
