@@ -204,3 +204,8 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], scale: float)
     rough = gaussian_filter(rng.standard_normal(shape), scale, mode="reflect")
     rough -= rough.mean()
     return np.asarray(rough / max(float(rough.std()), 1e-12))
+
+
+def relief(rng: np.random.Generator, shape: tuple[int, ...], *waves: tuple[float, float]) -> FloatArray:
+    """The sum of smooth random surfaces, each by its deviation and its scale in cells."""
+    return np.sum([size * smooth_noise(rng, shape, scale) for size, scale in waves], axis=0)

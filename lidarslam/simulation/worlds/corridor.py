@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import HAIR_M, OUTER_WALL_M, Builder, Opening, Room, smooth_noise, starting
+from lidarslam.simulation.worlds.building import HAIR_M, OUTER_WALL_M, Builder, Opening, Room, relief, starting
 from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds
 from lidarslam.simulation.worlds.paths import Clearance
@@ -51,8 +51,7 @@ def _ground(length: float, yard: Room, rng: np.random.Generator) -> HeightField:
     """Level in the corridor and along the front, a little uneven in the yard."""
     low = np.floor(yard.low - [length, 0.0] - _MARGIN_M)
     nodes = paths.grid_nodes(low, yard.high + _MARGIN_M, _CELL_M)
-    shape = nodes.shape[:2]
-    hills = 0.12 * smooth_noise(rng, shape, 8.0 / _CELL_M) + 0.01 * smooth_noise(rng, shape, 0.7)
+    hills = relief(rng, nodes.shape[:2], (0.12, 8.0 / _CELL_M), (0.01, 0.7))
     return HeightField(low, _CELL_M, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
 
 

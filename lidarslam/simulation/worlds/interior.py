@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room, around, row, starting
+from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Room, around, row, starting
 from lidarslam.simulation.worlds.paths import Clearance
 
 Size = tuple[float, float, float]  # width, depth, height

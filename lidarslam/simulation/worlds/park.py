@@ -5,7 +5,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import Builder, around, smooth_noise
+from lidarslam.simulation.worlds.building import Builder, around, relief
 from lidarslam.simulation.worlds.outdoor import Grounds, beside
 
 _CELL_M = 0.5
@@ -32,12 +32,11 @@ def build(seed: int) -> World:
 
 def _ground(rng: np.random.Generator, path: FloatArray) -> HeightField:
     """Swells some 25 m wide and up to a few metres high; the path itself is smoother than the grass."""
-    low = np.floor(path.min(axis=0) - _MARGIN_M)
-    distance = paths.distance_to_loop(paths.grid_nodes(low, path.max(axis=0) + _MARGIN_M, _CELL_M), path)
-    shape = distance.shape
+    low, nodes = paths.grid_around(path, _MARGIN_M, _CELL_M)
+    distance = paths.distance_to_loop(nodes, path)
     on_grass = np.clip((distance - 1.0) / 1.5, 0.1, 1.0)
-    heights = rng.uniform(0.9, 1.5) * smooth_noise(rng, shape, 22.0 / _CELL_M)
-    heights += on_grass * (0.03 * smooth_noise(rng, shape, 1.5 / _CELL_M) + 0.012 * smooth_noise(rng, shape, 0.7))
+    heights = relief(rng, distance.shape, (rng.uniform(0.9, 1.5), 22.0 / _CELL_M))
+    heights += on_grass * relief(rng, distance.shape, (0.03, 1.5 / _CELL_M), (0.012, 0.7))
     return HeightField(low, _CELL_M, heights - 0.06 * (1.0 - on_grass))
 
 

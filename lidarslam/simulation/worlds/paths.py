@@ -121,6 +121,12 @@ def grid_nodes(low: FloatArray, high: FloatArray, cell_m: float) -> FloatArray:
     return np.asarray(low + cell_m * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1))
 
 
+def grid_around(points: FloatArray, margin_m: float, cell_m: float) -> tuple[FloatArray, FloatArray]:
+    """The lowest node (2,) of a grid that reaches that far around points (N, 2), at whole metres, and all (X, Y, 2)."""
+    low = np.floor(points.min(axis=0) - margin_m)
+    return low, grid_nodes(low, points.max(axis=0) + margin_m, cell_m)
+
+
 def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:
     """Points (N, 3) on the ground at (N, 2)."""
     return np.column_stack([xy, ground.height_at(xy)])
