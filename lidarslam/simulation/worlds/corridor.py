@@ -59,8 +59,9 @@ def _draw_corridor(length: float, solid: Builder, rng: np.random.Generator) -> N
     """Walls, ceiling and the closed end; boxes against the walls at uneven distances, all different."""
     half, top = 0.5 * _WIDTH_M, _HEIGHT_M + OUTER_WALL_M
     solid.block((-length, 0.0), starting((-half - OUTER_WALL_M, half), OUTER_WALL_M), (-0.3, top))
-    solid.block((-length, 0.0), (-half, half), (_HEIGHT_M, top))
-    solid.block((-length - OUTER_WALL_M, -length), (-half - OUTER_WALL_M, half + OUTER_WALL_M), (-0.3, top))
+    solid.blocks(
+        (-length, 0.0, half, _HEIGHT_M, top), (-length - OUTER_WALL_M, -length, half + OUTER_WALL_M, -0.3, top)
+    )
     for k in range(_BOXES):
         x = -length + (k + rng.uniform(0.25, 0.75)) * length / _BOXES
         long, deep, high = rng.uniform([0.3, 0.3, 0.3], [0.8, _DEEPEST_BOX_M, 0.8])

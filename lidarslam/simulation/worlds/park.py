@@ -67,16 +67,16 @@ def _pavilion(grounds: Grounds) -> FloatArray:
         index, side = int(rng.integers(len(grounds.path))), rng.choice([-1.0, 1.0])
         where, yaw = grounds.beside(index, side * (0.75 * size + 4.0))
     part, half = Builder(), 0.5 * size
-    part.block((-half - 0.3, half + 0.3), (-half - 0.3, half + 0.3), (-1.2, 0.18))
-    for x in np.linspace(-half, half, 3):
-        for y in (-half, half):
-            part.pole((x, y), (-1.2, high), 0.14)
-    part.block((-half, half), (half - 0.1, half + 0.1), (0.1, high))  # the back wall
-    part.block((-half + 0.3, half - 0.3), (half - 0.6, half - 0.1), (0.1, 0.6))
+    part.blocks((half + 0.3, half + 0.3, -1.2, 0.18))
+    part.poles(*((x, y, -1.2, high, 0.14) for x in np.linspace(-half, half, 3) for y in (-half, half)))
+    # the back wall and a seat along it
+    part.blocks(
+        (-half, half, half - 0.1, half + 0.1, 0.1, high), (-half + 0.3, half - 0.3, half - 0.6, half - 0.1, 0.1, 0.6)
+    )
     for y in (-half - 0.6, half + 0.6):
         part.beam((0.0, y, high - 0.15), (0.0, 0.0, high + 0.3 * size), size + 1.0, 0.12)
     part.block(around((-half, half), 0.08), (-0.12, 0.12), (high, high + 0.28 * size))
-    part.block((-half - 0.2, half + 0.2), (-half - 0.2, half + 0.2), (high - 0.2, high))
+    part.blocks((half + 0.2, half + 0.2, high - 0.2, high))
     grounds.put(part, where, yaw)
     return np.append(where, 0.75 * size)
 
