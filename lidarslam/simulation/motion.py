@@ -188,11 +188,6 @@ MOUNTS: dict[str, tuple[float, float, float]] = {
 }
 
 
-def find_carrier(name: str) -> Carrier:
-    """The carrier of that name."""
-    return choose("motion", name, CARRIERS)
-
-
 def mount_pose(name: str, height_m: float) -> FloatArray:
     """T_body_lidar (4, 4) of a LiDAR mounted so, that far above the body's origin."""
     R = Rotation.from_rotvec(np.deg2rad(choose("mount", name, MOUNTS))).as_matrix()

@@ -15,8 +15,8 @@ from scipy.interpolate import CubicSpline
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.imu import GRAVITY
-from lidarslam.simulation.motion import CHANNELS, Carrier, Motion, Sway, find_carrier, ground_under
-from lidarslam.simulation.world import World
+from lidarslam.simulation.motion import CARRIERS, CHANNELS, Carrier, Motion, Sway, ground_under
+from lidarslam.simulation.world import World, choose
 from lidarslam.simulation.worlds.paths import lengths_along, turning_angles
 
 
@@ -197,7 +197,7 @@ def motion_along_route(name: str, world: World, seed: int, speed_mps: float | No
     Raises:
         InputError: there is no such carrier, or it does not stop and the route has a corner that asks for it.
     """
-    carrier = find_carrier(name)
+    carrier = choose("motion", name, CARRIERS)
     rng = np.random.default_rng([seed, *name.encode()])
     carrier = replace(carrier, speed_mps=carrier.speed_mps * rng.uniform(0.85, 1.1))
     if speed_mps is not None:
@@ -211,9 +211,7 @@ def motion_along_route(name: str, world: World, seed: int, speed_mps: float | No
 
 def _seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
     """The carrier's sines with random phases, frequencies within a tenth and amplitudes within a fifth of nominal."""
-    gait = rng.uniform(0.9, 1.1)
-
-    sines = carrier.sway
+    gait, sines = rng.uniform(0.9, 1.1), carrier.sway
     sizes = [swing.amplitude * rng.uniform(0.8, 1.2) for swing in sines]
     return Sway(
         tuple(CHANNELS.index(swing.axis) for swing in sines),
