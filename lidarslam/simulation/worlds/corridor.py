@@ -27,7 +27,11 @@ def build(seed: int) -> World:
     rng = np.random.default_rng(seed)
     length, depth, width = rng.uniform(24.0, 40.0), rng.uniform(25.0, 40.0), rng.uniform(25.0, 40.0)
     yard = Room(np.array([0.0, -0.5 * width]), np.array([depth, 0.5 * width]))
-    ground = _ground(length, yard, rng)
+    # Level in the corridor and along the front, a little uneven in the yard.
+    low = np.floor(yard.low - [length, 0.0] - _MARGIN_M)
+    nodes = paths.grid_nodes(low, yard.high + _MARGIN_M, _CELL_M)
+    hills = relief(rng, nodes.shape[:2], (0.12, 8.0 / _CELL_M), (0.01, 0.7))
+    ground = HeightField(low, _CELL_M, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
     route = _route(length, yard, ground)
     grounds = Grounds(rng, route.waypoints[:, :2], ground)
     _draw_corridor(length, grounds.solid, rng)
@@ -45,14 +49,6 @@ def _route(length: float, yard: Room, ground: HeightField) -> Route:
     loop = paths.subdivide_loop(np.concatenate([entry, paths.round_corners(corners, np.full(4, 3.0), 1.0)]), 4.0)
     way = np.concatenate([inside, loop, entry, inside[1:]])
     return Route(paths.on_ground(way, ground), 0.3, 0.45, 2.2, 1.6)
-
-
-def _ground(length: float, yard: Room, rng: np.random.Generator) -> HeightField:
-    """Level in the corridor and along the front, a little uneven in the yard."""
-    low = np.floor(yard.low - [length, 0.0] - _MARGIN_M)
-    nodes = paths.grid_nodes(low, yard.high + _MARGIN_M, _CELL_M)
-    hills = relief(rng, nodes.shape[:2], (0.12, 8.0 / _CELL_M), (0.01, 0.7))
-    return HeightField(low, _CELL_M, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
 
 
 def _draw_corridor(length: float, solid: Builder, rng: np.random.Generator) -> None:

@@ -23,7 +23,12 @@ def build(seed: int) -> World:
     road = _road(rng)
     low, nodes = paths.grid_around(road, _MARGIN_M, _CELL_M)
     distance = paths.distance_to_loop(nodes, road, 12.0)
-    ground = _ground(rng, low, distance)
+    # Swells some 150 m long and several metres high; fields are rough, the road is smooth and a little raised.
+    heights = relief(rng, distance.shape, (rng.uniform(2.0, 3.0), 50.0 / _CELL_M), (0.35, 24.0 / _CELL_M))
+    off_road = np.clip((distance - _ROAD_HALF_M) / 1.5, 0.0, 1.0)
+    heights += (0.1 + 0.9 * off_road) * 0.05 * smooth_noise(rng, distance.shape, 2.0 / _CELL_M)
+    heights += off_road * 0.035 * smooth_noise(rng, distance.shape, 0.7) - 0.2 * off_road
+    ground = HeightField(low, _CELL_M, heights)
     grounds = Grounds(rng, road, ground)
     for things in (_poles, _fences, _barn, _bales, _hedges, _trees):
         things(grounds)
@@ -50,16 +55,6 @@ def _road(rng: np.random.Generator) -> FloatArray:
         loop[:, 1] += amplitude * np.sin(2.0 * np.pi * loop[:, 0] / wave + phase)
     begin = np.abs(loop - [-0.25 * side, loop[:, 1].min()]).sum(axis=1).argmin()
     return np.roll(loop, -begin, axis=0)[:: rng.choice([-1, 1])]
-
-
-def _ground(rng: np.random.Generator, low: FloatArray, distance: FloatArray) -> HeightField:
-    """Swells some 150 m long and several metres high; fields are rough, the road is smooth and a little raised."""
-    shape = distance.shape
-    heights = relief(rng, shape, (rng.uniform(2.0, 3.0), 50.0 / _CELL_M), (0.35, 24.0 / _CELL_M))
-    off_road = np.clip((distance - _ROAD_HALF_M) / 1.5, 0.0, 1.0)
-    heights += (0.1 + 0.9 * off_road) * 0.05 * smooth_noise(rng, shape, 2.0 / _CELL_M)
-    heights += off_road * 0.035 * smooth_noise(rng, shape, 0.7) - 0.2 * off_road
-    return HeightField(low, _CELL_M, heights)
 
 
 def _poles(grounds: Grounds) -> None:

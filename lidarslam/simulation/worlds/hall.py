@@ -254,14 +254,20 @@ def _draw_shell(plan: HallPlan, put: Furnisher) -> None:
     for side, gate_x in enumerate(((width - 9.0, width - 3.0), (7.0, 20.0), None, None)):
         _draw_wall(*plan.floor.at_wall(side, builder), plan.height, gate_x, rng)
     for x in frames[1:-1]:
-        _draw_truss(plan, x, builder)
+        # A lattice girder across the hall: chords, posts, and diagonals that change direction in the middle.
+        low, high = plan.height - _TRUSS_M, plan.height - 0.25
+        for z in (low, high):
+            builder.box((x, 0.5 * depth, z), (0.2, depth, 0.16))
+        for k, (a, b) in enumerate(pairwise(np.linspace(0.0, depth, 15))):
+            ends = (low, high) if k < 7 else (high, low)
+            builder.beam((x, a, ends[0]), (x, b, ends[1]), 0.1, 0.1)
+            builder.box((x, b, 0.5 * (low + high)), (0.1, 0.1, high - low))
     for y in np.linspace(0.0, depth, 10)[1:-1]:
         builder.box((0.5 * width, y, plan.height - 0.1), (width, 0.14, 0.2))
     rows = (plan.aisle_y[0] - rng.uniform(4.0, 6.0), 0.5 * sum(plan.aisle_y) + rng.uniform(-1.5, 1.5))
     _draw_columns(plan, frames, rows, put)
     _draw_crane(plan, rows, put)
-    _draw_ducts(plan, put)
-    _draw_pipes(plan, put)
+    _draw_ducts_and_pipes(plan, put)
 
 
 def _draw_wall(
@@ -289,17 +295,6 @@ def _draw_wall(
         wall.block(around((left, right), 0.12), (-0.02, 0.1), (0.0, shut))
         wall.block((left - 0.2, right + 0.2), (0.0, 0.45), (shut, shut + 0.5))
     wall.block(around([k * bay for k in range(bays + 1)], 0.2), (0.0, 0.3), (0.0, height))
-
-
-def _draw_truss(plan: HallPlan, x: float, builder: Builder) -> None:
-    """A lattice girder across the hall: chords, posts, and diagonals that change direction in the middle."""
-    low, high, depth = plan.height - _TRUSS_M, plan.height - 0.25, plan.floor.high[1]
-    for z in (low, high):
-        builder.box((x, 0.5 * depth, z), (0.2, depth, 0.16))
-    for k, (a, b) in enumerate(pairwise(np.linspace(0.0, depth, 15))):
-        ends = (low, high) if k < 7 else (high, low)
-        builder.beam((x, a, ends[0]), (x, b, ends[1]), 0.1, 0.1)
-        builder.box((x, b, 0.5 * (low + high)), (0.1, 0.1, high - low))
 
 
 def _draw_columns(plan: HallPlan, frames: FloatArray, rows: tuple[float, float], put: Furnisher) -> None:
@@ -331,9 +326,11 @@ def _draw_crane(plan: HallPlan, rows: tuple[float, float], put: Furnisher) -> No
     builder.box((x, y, hook - 0.2), (0.35, 0.2, 0.5))
 
 
-def _draw_ducts(plan: HallPlan, put: Furnisher) -> None:
-    """Round ventilation ducts along the hall below the trusses, with outlets and hangers."""
-    builder, rng = put.builder, put.rng
+def _draw_ducts_and_pipes(plan: HallPlan, put: Furnisher) -> None:
+    """Round ducts along the hall below the trusses, with outlets and hangers; pipes in bundles along the far right
+    wall, and down pipes with valves between its pilasters.
+    """
+    builder, rng, depth = put.builder, put.rng, plan.floor.high[1]
     for y in (plan.aisle_y[0] + rng.uniform(1.5, 3.0), plan.aisle_y[1] + rng.uniform(0.5, 2.0)):
         radius, z = rng.uniform(0.3, 0.5), plan.height - _TRUSS_M - rng.uniform(0.8, 1.2)
         start, end = rng.uniform(2.0, 8.0), plan.floor.high[0] - rng.uniform(2.0, 8.0)
@@ -343,11 +340,6 @@ def _draw_ducts(plan: HallPlan, put: Furnisher) -> None:
             builder.cylinder((x - 0.05, y, z), (x + 0.05, y, z), radius + 0.05)
             side = rng.choice([-1.0, 1.0]) * (radius + 0.5)
             builder.cylinder((x + 1.0, y, z), (x + 1.0, y + side, z - 0.5), 0.5 * radius)
-
-
-def _draw_pipes(plan: HallPlan, put: Furnisher) -> None:
-    """Pipes in bundles along the far right wall, and down pipes with valves between its pilasters."""
-    builder, rng, depth = put.builder, put.rng, plan.floor.high[1]
     x = plan.floor.high[0] - 0.45
     for k in range(int(rng.integers(2, 5))):
         z, radius = 5.0 + 0.42 * k, rng.uniform(0.06, 0.16)

@@ -19,7 +19,13 @@ def build(seed: int) -> World:
     """A park; the path has something upright in sight everywhere, but little of it."""
     rng = np.random.default_rng(seed)
     path = paths.winding_loop(rng, rng.uniform(240.0, 390.0), 4, 0.35, 12.0)
-    ground = _ground(rng, path)
+    low, nodes = paths.grid_around(path, _MARGIN_M, _CELL_M)
+    distance = paths.distance_to_loop(nodes, path)
+    # Swells some 25 m wide and up to a few metres high; the path itself is smoother than the grass.
+    heights = relief(rng, distance.shape, (rng.uniform(0.9, 1.5), 22.0 / _CELL_M))
+    on_grass = np.clip((distance - 1.0) / 1.5, 0.1, 1.0)
+    heights += on_grass * relief(rng, distance.shape, (0.03, 1.5 / _CELL_M), (0.012, 0.7))
+    ground = HeightField(low, _CELL_M, heights - 0.06 * (1.0 - on_grass))
     grounds = Grounds(rng, path, ground)
     _along_the_path(grounds)
     pavilion = _pavilion(grounds)
@@ -28,16 +34,6 @@ def build(seed: int) -> World:
     route = Route(paths.on_ground(paths.resample_loop(path, 2.0), ground), 3.0, _FREE_SIDE_M, 3.0, 6.0)
     grounds.prune(route)
     return World("park", seed, route, *grounds.solid.solids, (ground,), _strollers(grounds), map_spacing_m=0.1)
-
-
-def _ground(rng: np.random.Generator, path: FloatArray) -> HeightField:
-    """Swells some 25 m wide and up to a few metres high; the path itself is smoother than the grass."""
-    low, nodes = paths.grid_around(path, _MARGIN_M, _CELL_M)
-    distance = paths.distance_to_loop(nodes, path)
-    on_grass = np.clip((distance - 1.0) / 1.5, 0.1, 1.0)
-    heights = relief(rng, distance.shape, (rng.uniform(0.9, 1.5), 22.0 / _CELL_M))
-    heights += on_grass * relief(rng, distance.shape, (0.03, 1.5 / _CELL_M), (0.012, 0.7))
-    return HeightField(low, _CELL_M, heights - 0.06 * (1.0 - on_grass))
 
 
 def _along_the_path(grounds: Grounds) -> None:

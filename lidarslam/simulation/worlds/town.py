@@ -66,7 +66,12 @@ def build(seed: int) -> World:
     lane = lane_of(nodes[draw_tour(rng, len(nodes), streets)], 1.0)
     rng = np.random.default_rng(seed)  # what stands there does not depend on how long a tour was looked for
     course = Course.along(np.concatenate([lane, lane[:1]]))
-    ground = _ground(rng, course)
+    low = np.floor(course.points.min(axis=0) - _MARGIN_M)
+    high = course.points.max(axis=0) + _MARGIN_M
+    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
+    distance = np.asarray(course.tree.query(grid_nodes(low, high, cell))[0])
+    hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
+    ground = HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
     route = Route(on_ground(lane, ground), 2.0, FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
     taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
     rows = _Rows(Grounds(rng, course.points, ground), course, taken)
@@ -177,15 +182,6 @@ class Course:
         """Distance (M,) of points (M, 2) from the nearest part of the course."""
         nearest = self.tree.query(xy)[0]
         return np.asarray(np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0)))  # nearer between two points
-
-
-def _ground(rng: np.random.Generator, course: Course) -> HeightField:
-    low = np.floor(course.points.min(axis=0) - _MARGIN_M)
-    high = course.points.max(axis=0) + _MARGIN_M
-    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
-    distance = np.asarray(course.tree.query(grid_nodes(low, high, cell))[0])
-    hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
-    return HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
 
 
 @dataclass(frozen=True)
