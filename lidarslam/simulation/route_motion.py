@@ -316,16 +316,16 @@ def _turn(carrier: Carrier, before: FloatArray, after: FloatArray, angle: float)
 def _on_the_ground(carrier: Carrier, world: World, way: FloatArray) -> FloatArray:
     """The base (N, 7) of the motion: the path on the ground, with the attitude that the carrier takes from it."""
     xy, (lift, rise, yaw) = way[:, :2], way[:, 2:].T
-    ground = ground_under(world, xy, carrier.footprint_m)
+    height, slope = ground_under(world, xy, carrier.footprint_m)
+    c, s = np.cos(yaw), np.sin(yaw)
     flight = min(carrier.flight_height_m, 0.5 * world.route.free_height_m)
-    z = ground.height + lift + flight
+    z = height + lift + flight
     roll, pitch = np.zeros(len(z)), np.zeros(len(z))
     if carrier.leans_with_ground:
-        slope_pitch, slope_roll = ground.pitch_and_roll(yaw, rise)
-        pitch, roll = pitch + slope_pitch, roll + slope_roll
+        pitch -= np.arctan(c * slope[:, 0] + s * slope[:, 1] + rise)
+        roll += np.arctan(c * slope[:, 1] - s * slope[:, 0])
     velocity = np.gradient(xy, TIME_STEP_S, axis=0)
     if carrier.banks:
-        c, s = np.cos(yaw), np.sin(yaw)
         ax, ay = np.gradient(velocity, TIME_STEP_S, axis=0).T
         pitch += np.arctan(smoothed(c * ax + s * ay, carrier.smoothing_s) / GRAVITY)
         roll -= np.arctan(smoothed(c * ay - s * ax, carrier.smoothing_s) / GRAVITY)

@@ -265,8 +265,7 @@ def _draw_shell(plan: HallPlan, put: Furnisher) -> None:
     for y in np.linspace(0.0, depth, 10)[1:-1]:
         builder.box((0.5 * width, y, plan.height - 0.1), (width, 0.14, 0.2))
     rows = (plan.aisle_y[0] - rng.uniform(4.0, 6.0), 0.5 * sum(plan.aisle_y) + rng.uniform(-1.5, 1.5))
-    _draw_columns(plan, frames, rows, put)
-    _draw_crane(plan, rows, put)
+    _draw_columns_and_crane(plan, frames, rows, put)
     _draw_ducts_and_pipes(plan, put)
 
 
@@ -297,9 +296,11 @@ def _draw_wall(
     wall.block(around([k * bay for k in range(bays + 1)], 0.2), (0.0, 0.3), (0.0, height))
 
 
-def _draw_columns(plan: HallPlan, frames: FloatArray, rows: tuple[float, float], put: Furnisher) -> None:
-    """Columns of H section on footings below the trusses, where the route and the ramps leave room; girders on top."""
-    top, width, builder = plan.height - _TRUSS_M - 0.08, plan.floor.high[0], put.builder
+def _draw_columns_and_crane(plan: HallPlan, frames: FloatArray, rows: tuple[float, float], put: Furnisher) -> None:
+    """Columns of H section on footings below the trusses, where the route and the ramps leave room; girders on top,
+    and under them a bridge crane, its hook hanging.
+    """
+    top, width, builder, rng = plan.height - _TRUSS_M - 0.08, plan.floor.high[0], put.builder, put.rng
     for y in rows:
         builder.box((0.5 * width, y, top - 0.3), (width, 0.25, 0.6))
         for x in frames[1:-1]:
@@ -309,12 +310,7 @@ def _draw_columns(plan: HallPlan, frames: FloatArray, rows: tuple[float, float],
                     builder.box((x, y + side * 0.19, 0.5 * top), (0.4, 0.03, top))
                 builder.box((x, y, 0.5 * top), (0.03, 0.35, top))
                 builder.box((x, y, 1.5), (0.44, 0.44, 0.08))
-
-
-def _draw_crane(plan: HallPlan, rows: tuple[float, float], put: Furnisher) -> None:
-    """A bridge crane under the girders of the column rows, its hook hanging."""
-    builder, rng = put.builder, put.rng
-    z, x = plan.height - _TRUSS_M - 1.0, rng.uniform(0.35, 0.8) * plan.floor.high[0]
+    z, x = plan.height - _TRUSS_M - 1.0, rng.uniform(0.35, 0.8) * width
     for y in rows:
         builder.box((x, y, z + 0.1), (3.2, 0.3, 0.45))
     for dx in (-0.9, 0.9):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Grass, HeightField, Route
 from lidarslam.simulation.worlds import paths
-from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise, starting
+from lidarslam.simulation.worlds.building import Builder, heading, rotation_z, smooth_noise, starting
 
 # Feet extend this far down, so that nothing hovers on a slope.
 SUNK_M = 0.3
@@ -37,7 +37,9 @@ class Grounds:
 
     def beside(self, index: int, left_m: float) -> tuple[FloatArray, float]:
         """A place (2,) to the left of a point of the path, counted round and round, and the path's heading there."""
-        return paths.beside_loop(self.path, index % len(self.path), left_m)
+        path, count = self.path, len(self.path)
+        yaw = heading(path[(index % count + 1) % count] - path[index % count - 1])
+        return path[index % count] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
     def off_path(self, xy: FloatArray) -> float:
         """Distance of the nearest of points (..., 2) from the path."""

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route
-from lidarslam.simulation.worlds.building import Builder, heading, left_of
+from lidarslam.simulation.worlds.building import Builder, left_of
 
 
 def loop_length(loop: FloatArray) -> float:
@@ -107,12 +107,6 @@ def distance_to_loop(xy: FloatArray, loop: FloatArray, farthest_m: float = np.in
     """
     distance, _ = cKDTree(resample_loop(loop, 0.2)).query(xy, distance_upper_bound=farthest_m)
     return np.minimum(distance, farthest_m)
-
-
-def beside_loop(loop: FloatArray, index: int, left_m: float) -> tuple[FloatArray, float]:
-    """A place (2,) to the left of a point of the closed polyline (M, 2), and the polyline's heading there."""
-    yaw = heading(loop[(index + 1) % len(loop)] - loop[index - 1])
-    return loop[index] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
 
 def grid_nodes(low: FloatArray, high: FloatArray, cell_m: float) -> FloatArray:
