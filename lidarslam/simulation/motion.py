@@ -19,17 +19,14 @@ CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "activity")
 class Sway:
     """K sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest."""
 
-    axes: tuple[int, ...] = ()  # indices into x, y, z, roll, pitch, yaw
-    amplitudes: tuple[float, ...] = ()  # metres or radians
-    frequencies_hz: tuple[float, ...] = ()
-    phases: tuple[float, ...] = ()
+    # Each: the index into x, y, z, roll, pitch, yaw; amplitude in metres or radians; frequency in Hz; phase.
+    sines: tuple[tuple[int, float, float, float], ...] = ()
 
     def at(self, times: FloatArray) -> FloatArray:
         """Deflections (N, 6) at times (N,), full size."""
         deflections = np.zeros((len(times), 6))
-        sines = zip(self.axes, self.amplitudes, self.frequencies_hz, self.phases, strict=True)
-        for axis, amplitude, frequency, phase in sines:
-            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency * times + phase)
+        for axis, amplitude, frequency_hz, phase in self.sines:
+            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency_hz * times + phase)
         return deflections
 
 

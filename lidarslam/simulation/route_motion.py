@@ -213,15 +213,13 @@ def _seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
     """The carrier's sines with random phases, frequencies within a tenth and amplitudes within a fifth of nominal."""
     gait, sines = rng.uniform(0.9, 1.1), carrier.sway
     sizes = [swing.amplitude * rng.uniform(0.8, 1.2) for swing in sines]
-    return Sway(
-        tuple(CHANNELS.index(swing.axis) for swing in sines),
-        tuple(
-            float(np.deg2rad(size)) if swing.axis in ("roll", "pitch", "yaw") else size
-            for swing, size in zip(sines, sizes, strict=True)
-        ),
-        tuple(swing.frequency_hz * (gait if swing.stepwise else rng.uniform(0.9, 1.1)) for swing in sines),
-        tuple(rng.uniform(0.0, 2.0 * np.pi) for _ in sines),
-    )
+    sizes = [
+        float(np.deg2rad(a)) if s.axis in ("roll", "pitch", "yaw") else a for s, a in zip(sines, sizes, strict=True)
+    ]
+    rates_hz = [s.frequency_hz * (gait if s.stepwise else rng.uniform(0.9, 1.1)) for s in sines]
+    phases = [rng.uniform(0.0, 2.0 * np.pi) for _ in sines]
+    axes = [CHANNELS.index(swing.axis) for swing in sines]
+    return Sway(tuple(zip(axes, sizes, rates_hz, phases, strict=True)))
 
 
 def _circuit(carrier: Carrier, world: World) -> FloatArray:
