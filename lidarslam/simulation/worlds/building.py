@@ -208,4 +208,4 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], scale: float)
 
 def relief(rng: np.random.Generator, shape: tuple[int, ...], *waves: tuple[float, float]) -> FloatArray:
     """The sum of smooth random surfaces, each by its deviation and its scale in cells."""
-    return np.sum([size * smooth_noise(rng, shape, scale) for size, scale in waves], axis=0)
+    return np.asarray(np.sum([size * smooth_noise(rng, shape, scale) for size, scale in waves], axis=0))
