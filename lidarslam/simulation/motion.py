@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -20,17 +19,14 @@ CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "activity")
 class Sway:
     """K sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest."""
 
-    axes: tuple[int, ...] = ()  # indices into x, y, z, roll, pitch, yaw
-    amplitudes: tuple[float, ...] = ()  # metres or radians
-    frequencies_hz: tuple[float, ...] = ()
-    phases: tuple[float, ...] = ()
+    # Each: the index into x, y, z, roll, pitch, yaw; amplitude in metres or radians; frequency in Hz; phase.
+    sines: tuple[tuple[int, float, float, float], ...] = ()
 
     def at(self, times: FloatArray) -> FloatArray:
         """Deflections (N, 6) at times (N,), full size."""
         deflections = np.zeros((len(times), 6))
-        sines = zip(self.axes, self.amplitudes, self.frequencies_hz, self.phases, strict=True)
-        for axis, amplitude, frequency, phase in sines:
-            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency * times + phase)
+        for axis, amplitude, frequency_hz, phase in self.sines:
+            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency_hz * times + phase)
         return deflections
 
 
@@ -188,11 +184,6 @@ MOUNTS: dict[str, tuple[float, float, float]] = {
 }
 
 
-def find_carrier(name: str) -> Carrier:
-    """The carrier of that name."""
-    return choose("motion", name, CARRIERS)
-
-
 def mount_pose(name: str, height_m: float) -> FloatArray:
     """T_body_lidar (4, 4) of a LiDAR mounted so, that far above the body's origin."""
     R = Rotation.from_rotvec(np.deg2rad(choose("mount", name, MOUNTS))).as_matrix()
@@ -203,21 +194,10 @@ _SAMPLES = 24
 _BLOCK = 4096
 
 
-class Ground(NamedTuple):
-    """Planes that fit the ground under footprints."""
+def ground_under(world: World, xy: FloatArray, radius_m: float) -> tuple[FloatArray, FloatArray]:
+    """Planes that fit the ground within a radius of (N, 2) positions, by weighted least squares.
 
-    height: FloatArray  # (N,) z at the footprint's middle
-    slope: FloatArray  # (N, 2) rise for each metre in x and y
-
-    def pitch_and_roll(self, yaw: FloatArray, rise: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """Pitch and roll (N,) of a body of that yaw (N,) on the planes, which rise by `rise` more for each metre."""
-        c, s = np.cos(yaw), np.sin(yaw)
-        pitch = -np.arctan(c * self.slope[:, 0] + s * self.slope[:, 1] + rise)
-        return pitch, np.arctan(c * self.slope[:, 1] - s * self.slope[:, 0])
-
-
-def ground_under(world: World, xy: FloatArray, radius_m: float) -> Ground:
-    """Fit planes to the ground within a radius of (N, 2) positions, by weighted least squares.
+    Their heights (N,) at the positions, and their slopes (N, 2), the rise for each metre in x and y.
 
     Samples are spread over the disc like the seeds of a sunflower, with weights that vanish at its rim: triangle edges
     pass gently under the body.
@@ -234,7 +214,7 @@ def ground_under(world: World, xy: FloatArray, radius_m: float) -> Ground:
     for start in range(0, len(xy), _BLOCK):
         samples = xy[start : start + _BLOCK, None] + offsets
         heights[start : start + _BLOCK] = world.ground_at(samples.reshape(-1, 2)).reshape(-1, _SAMPLES)
-    return Ground(heights @ weights, heights @ fit.T)
+    return heights @ weights, heights @ fit.T
 
 
 def motion_along(trajectory: Trajectory) -> Motion:

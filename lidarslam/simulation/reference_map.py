@@ -54,22 +54,15 @@ class SeenSurfaces:
 
     def keys(self) -> KeyArray:
         """Sorted keys of the seen surfaces."""
-        self._merge()
+        self._keys = _unique(np.concatenate([self._keys, *self._pending]))
+        self._pending.clear()
         return self._keys
 
     def add_keys(self, keys: KeyArray) -> None:
         """Add surfaces that were seen elsewhere, by their keys."""
         self._pending.append(keys)
         if sum(map(len, self._pending)) > max(_BLOCK, len(self._keys)):
-            self._merge()
-
-    def around(self) -> KeyArray:
-        """Sorted keys of the seen voxels and all that touch them."""
-        return _spread(self.keys())
-
-    def _merge(self) -> None:
-        self._keys = _unique(np.concatenate([self._keys, *self._pending]))
-        self._pending.clear()
+            self.keys()
 
 
 def reference_map(simulation: Simulation, spacing_m: float | None = None, step: int = 1) -> ReferenceMap:
@@ -88,8 +81,12 @@ def sample_seen(mesh: Mesh, seen: SeenSurfaces, spacing_m: float = 0.05) -> Refe
 
     Time and memory are those of the seen surfaces, not of the mesh, which is traversed once.
     """
-    around = seen.around()
-    pieces = pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m)
+    around = seen.keys()
+    for axis in range(3):
+        step = np.int64(1) << (_BITS * axis + 4)
+        around = _unique(np.concatenate([around - step, around, around + step]))
+    cells = (_unique(around >> 4)[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF
+    pieces = pieces_near(mesh, cells, seen.voxel_m)
     facing = pieces.normals
     sectors = _sectors(facing)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
@@ -142,23 +139,8 @@ def _sectors(normals: FloatArray) -> KeyArray:
     return np.asarray((2 * axis + (leaning[np.arange(len(axis)), axis] > 0.0)) << 1)
 
 
-def _cells(upper_bits: KeyArray) -> KeyArray:
-    """The voxels (N, 3) of keys (N,) without their lowest four bits."""
-    return np.asarray((upper_bits[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF)
-
-
-def _spread(keys: KeyArray) -> KeyArray:
-    """Sorted keys of the voxels and of all that touch them."""
-    for axis in range(3):
-        step = np.int64(1) << (_BITS * axis + 4)
-        keys = _unique(np.concatenate([keys - step, keys, keys + step]))
-    return keys
-
-
 def _sides(sorted_keys: KeyArray, keys: KeyArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Whether a point's side was seen (N,), and its far side (N,), whose key comes right after it."""
-    if not len(sorted_keys):
-        return np.zeros(len(keys), dtype=bool), np.zeros(len(keys), dtype=bool)
     last = len(sorted_keys) - 1
     place = np.searchsorted(sorted_keys, keys)
     front = sorted_keys[np.minimum(place, last)] == keys

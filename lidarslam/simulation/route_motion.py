@@ -15,8 +15,8 @@ from scipy.interpolate import CubicSpline
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.imu import GRAVITY
-from lidarslam.simulation.motion import CHANNELS, Carrier, Motion, Sway, find_carrier, ground_under
-from lidarslam.simulation.world import World
+from lidarslam.simulation.motion import CARRIERS, CHANNELS, Carrier, Motion, Sway, ground_under
+from lidarslam.simulation.world import World, choose
 from lidarslam.simulation.worlds.paths import lengths_along, turning_angles
 
 
@@ -197,7 +197,7 @@ def motion_along_route(name: str, world: World, seed: int, speed_mps: float | No
     Raises:
         InputError: there is no such carrier, or it does not stop and the route has a corner that asks for it.
     """
-    carrier = find_carrier(name)
+    carrier = choose("motion", name, CARRIERS)
     rng = np.random.default_rng([seed, *name.encode()])
     carrier = replace(carrier, speed_mps=carrier.speed_mps * rng.uniform(0.85, 1.1))
     if speed_mps is not None:
@@ -211,19 +211,15 @@ def motion_along_route(name: str, world: World, seed: int, speed_mps: float | No
 
 def _seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
     """The carrier's sines with random phases, frequencies within a tenth and amplitudes within a fifth of nominal."""
-    gait = rng.uniform(0.9, 1.1)
-
-    sines = carrier.sway
+    gait, sines = rng.uniform(0.9, 1.1), carrier.sway
     sizes = [swing.amplitude * rng.uniform(0.8, 1.2) for swing in sines]
-    return Sway(
-        tuple(CHANNELS.index(swing.axis) for swing in sines),
-        tuple(
-            float(np.deg2rad(size)) if swing.axis in ("roll", "pitch", "yaw") else size
-            for swing, size in zip(sines, sizes, strict=True)
-        ),
-        tuple(swing.frequency_hz * (gait if swing.stepwise else rng.uniform(0.9, 1.1)) for swing in sines),
-        tuple(rng.uniform(0.0, 2.0 * np.pi) for _ in sines),
-    )
+    sizes = [
+        float(np.deg2rad(a)) if s.axis in ("roll", "pitch", "yaw") else a for s, a in zip(sines, sizes, strict=True)
+    ]
+    rates_hz = [s.frequency_hz * (gait if s.stepwise else rng.uniform(0.9, 1.1)) for s in sines]
+    phases = [rng.uniform(0.0, 2.0 * np.pi) for _ in sines]
+    axes = [CHANNELS.index(swing.axis) for swing in sines]
+    return Sway(tuple(zip(axes, sizes, rates_hz, phases, strict=True)))
 
 
 def _circuit(carrier: Carrier, world: World) -> FloatArray:
@@ -318,16 +314,16 @@ def _turn(carrier: Carrier, before: FloatArray, after: FloatArray, angle: float)
 def _on_the_ground(carrier: Carrier, world: World, way: FloatArray) -> FloatArray:
     """The base (N, 7) of the motion: the path on the ground, with the attitude that the carrier takes from it."""
     xy, (lift, rise, yaw) = way[:, :2], way[:, 2:].T
-    ground = ground_under(world, xy, carrier.footprint_m)
+    height, slope = ground_under(world, xy, carrier.footprint_m)
+    c, s = np.cos(yaw), np.sin(yaw)
     flight = min(carrier.flight_height_m, 0.5 * world.route.free_height_m)
-    z = ground.height + lift + flight
+    z = height + lift + flight
     roll, pitch = np.zeros(len(z)), np.zeros(len(z))
     if carrier.leans_with_ground:
-        slope_pitch, slope_roll = ground.pitch_and_roll(yaw, rise)
-        pitch, roll = pitch + slope_pitch, roll + slope_roll
+        pitch -= np.arctan(c * slope[:, 0] + s * slope[:, 1] + rise)
+        roll += np.arctan(c * slope[:, 1] - s * slope[:, 0])
     velocity = np.gradient(xy, TIME_STEP_S, axis=0)
     if carrier.banks:
-        c, s = np.cos(yaw), np.sin(yaw)
         ax, ay = np.gradient(velocity, TIME_STEP_S, axis=0).T
         pitch += np.arctan(smoothed(c * ax + s * ay, carrier.smoothing_s) / GRAVITY)
         roll -= np.arctan(smoothed(c * ay - s * ax, carrier.smoothing_s) / GRAVITY)

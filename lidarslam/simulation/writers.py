@@ -105,8 +105,10 @@ def write_kitti(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
         for number, simulated in enumerate(scans):
             scan = simulated.scan
             T_world_lidar = rig.T_world_lidar_at(np.array([scan.stamp]))
-            points = compensate(scan, rig)
-            (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(_rows(points, simulated).tobytes())
+            # KITTI's own scans are too low, and all readers raise them; exact points would come out too high.
+            points = correct_elevation(compensate(scan, rig), -KITTI_DEG)
+            rows = np.column_stack([points, simulated.intensities / _FULL_INTENSITY]).astype("<f4")
+            (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(rows.tobytes())
             times.write(f"{scan.stamp:.9f}\n")
             poses.write(format_kitti(T_CAM_LIDAR @ T_world_lidar @ inverse(T_CAM_LIDAR)))
 
@@ -124,12 +126,6 @@ def compensate(scan: Scan, rig: Rig) -> FloatArray:
     T_stamp_point = (inverse(T_world_lidar[0]) @ T_world_lidar[1:])[instant]
     rotated = np.einsum("nij,nj->ni", T_stamp_point[:, :3, :3], scan.points)
     return np.asarray(rotated + T_stamp_point[:, :3, 3])
-
-
-def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
-    # KITTI's own scans are too low, and all readers raise them; exact points would come out too high.
-    intensities = simulated.intensities / _FULL_INTENSITY
-    return np.column_stack([correct_elevation(points, -KITTI_DEG), intensities]).astype("<f4")
 
 
 def _format_calibration() -> str:

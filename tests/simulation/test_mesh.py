@@ -1,9 +1,10 @@
-"""Triangles of the primitives: closed, outward, of the right size; rays meet what formulas say they meet."""
+"""Triangles of the primitives: closed, outward, of the right size; rays meet what formulas say; movers go round."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lidarslam.core.geometry import is_rigid
 from lidarslam.simulation.mesh import (
     CYLINDER_SIDES,
     Caster,
@@ -101,6 +102,7 @@ def test_world_mesh_holds_everything_that_stands(boxes, cylinders, field):
     assert mesh.triangles.dtype == np.int32
 
 
+UNIT_BOX = Boxes(np.zeros((1, 3)), np.ones((1, 3)), np.eye(3)[None])
 ROUTE = Route(np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0]]), 1.0, 1.0, 3.0, 1.0)
 
 
@@ -160,7 +162,36 @@ def test_boxes_by_formula_agree_with_their_mesh(rng):
 
 
 def test_rays_along_an_axis_meet_boxes():
-    box = Boxes(np.zeros((1, 3)), np.ones((1, 3)), np.eye(3)[None])
     origins = np.array([[-5.0, 0.5, 0.5], [-5.0, 1.5, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    distances, _ = meet_boxes(box, origins, np.tile([1.0, 0.0, 0.0], (4, 1)))
+    distances, _ = meet_boxes(UNIT_BOX, origins, np.tile([1.0, 0.0, 0.0], (4, 1)))
     np.testing.assert_array_equal(distances, [4.0, np.inf, np.inf, np.inf])  # the last starts inside
+
+
+def test_outside_its_grid_a_field_goes_on_level():
+    field = HeightField(np.zeros(2), 1.0, np.array([[0.0, 1.0], [2.0, 3.0]]))
+    np.testing.assert_allclose(field.height_at(np.array([[-5.0, -5.0], [9.0, 9.0], [9.0, 0.0]])), [0.0, 3.0, 2.0])
+
+
+@pytest.fixture
+def mover() -> Mover:
+    """Round a rectangle of 10 m by 5 m on a slope, counter-clockwise."""
+    corners = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 1.0], [10.0, 5.0, 1.0], [0.0, 5.0, 0.0]])
+    return Mover(UNIT_BOX, corners, 2.0, 3.0)
+
+
+def test_a_mover_goes_round_at_its_speed(mover):
+    period = (2.0 * 5.0 + 2.0 * np.sqrt(101.0)) / mover.speed_mps
+    poses = mover.pose_at(np.linspace(0.0, 3.0 * period, 40001))
+    assert is_rigid(poses)
+    np.testing.assert_allclose(poses[-1], poses[0], atol=1e-9)
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    expected = 3.0 * period / 40000 * mover.speed_mps
+    assert steps.max() <= expected * (1.0 + 1e-6)
+    np.testing.assert_allclose(np.median(steps), expected)
+
+
+def test_a_mover_looks_where_it_goes(mover):
+    poses = mover.pose_at(np.array([0.0, 4.5, 7.5]))
+    np.testing.assert_allclose(poses[0, :3, 3], 3.0 / np.sqrt(101.0) * np.array([10.0, 0.0, 1.0]))
+    np.testing.assert_allclose(poses[:, :2, 0], [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(poses[:, :3, 2], np.broadcast_to([0.0, 0.0, 1.0], (3, 3)))

@@ -63,18 +63,6 @@ def test_nothing_stands_in_the_way_of_the_car(small):
 
 
 @pytest.mark.slow
-def test_both_sides_are_built_up(small):
-    lane = subdivide_loop(small.route.waypoints, 1.0)[:, :2]
-    ahead = np.roll(lane, -1, axis=0) - lane
-    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
-    eyes = np.column_stack([lane, small.ground_at(lane) + 2.5])
-    caster = Caster(small)
-    for side in (left, -left):
-        rays = np.column_stack([side, np.zeros(len(side))])
-        assert (caster.cast(eyes, rays, np.zeros(len(eyes)), 100.0).ranges < 17.0).mean() > 0.6
-
-
-@pytest.mark.slow
 def test_a_car_goes_round_and_round(small):
     motion = motion_along_route("car-fast", small, 0)
     way = np.linalg.norm(np.diff(motion.base[:, :2], axis=0), axis=1)

@@ -1,6 +1,7 @@
 """Every world: the same from the same seed, free along the way, standing on its ground; indoors closed all round."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,11 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.simulation.mesh import Caster, box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.motion import Sway
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import WORLDS, World, build_world
 from lidarslam.simulation.worlds.building import UP
+from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, STANDING
 from lidarslam.simulation.worlds.paths import Clearance, loop_length, subdivide_loop
 
 from .conftest import cached_world, cast, caster_of
@@ -216,3 +219,54 @@ def test_grass_grows_beside_the_roads_and_not_on_them(name: str, kept_free_m: fl
     assert 0.8 * tallest_m > grass.heights[grass.heights > 0.0].mean() > 0.04
     assert grass.heights.max() < tallest_m
     assert (grass.heights.shape, grass.cell_m) == (ground.heights.shape, ground.cell_m)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_corridor_opens_into_a_yard_and_recordings_begin_deep_in_it(seed: int) -> None:
+    world = cached_world("corridor", seed)
+    waypoints = world.route.waypoints
+    length = 1.2 - float(waypoints[:, 0].min())
+    mouth = np.array([[-0.5, 0.0, 1.2]])
+    ahead = cast(caster_of("corridor", seed), mouth, np.array([1.0, 0.0, 0.0]))
+    assert 5.0 < ahead[0] < 41.0  # a tree may stand before the far side
+    assert np.ptp(waypoints[:, 1]) > 13.0
+    motion = motion_along_route("handheld", world, seed)
+    start, later = motion.pose_at(np.array([0.0, 8.0]))[:, :3, 3]
+    assert -0.7 * length < start[0] < -0.5 * length
+    assert later[0] > start[0] + 3.0  # on its way out
+    np.testing.assert_array_equal(waypoints[:, 2], world.ground_at(waypoints[:, :2]))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_carrier_climbs_the_stairs_smoothly_and_comes_down_again(seed: int) -> None:
+    world = cached_world("stairs", seed)
+    motion = replace(motion_along_route("handheld", world, seed), sway=Sway())
+    times = np.arange(0.0, motion.duration_s, 0.01)
+    z = motion.pose_at(times)[:, 2, 3]
+    assert z.max() == pytest.approx(world.route.waypoints[:, 2].max(), abs=0.05)
+    assert z.max() > 4 * 2 * 9 * 0.17 - 0.05
+    assert abs(z[0]) < 1e-9
+    assert abs(z[-1]) < 1e-9
+    climb = np.gradient(z, times)
+    assert 0.4 < np.abs(climb).max() < 0.55
+    assert np.abs(np.gradient(climb, times)).max() < 1.0
+    level = np.linalg.norm(np.diff(motion.pose_at(times)[:, :2, 3], axis=0), axis=1)
+    steep = np.abs(climb[1:]) > 0.35
+    assert np.median(np.abs(np.diff(z))[steep] / level[steep]) == pytest.approx(0.17 / 0.28, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_crowd_is_around_the_start_and_half_of_it_goes_along(seed: int) -> None:
+    world = cached_world("crowd", seed)
+    motion = motion_along_route("handheld", world, seed)
+    assert len(world.movers) == COMPANIONS + STANDING + CROSSING == 30
+    times = np.arange(0.0, 8.0, 0.5)
+    carrier = motion.pose_at(times)[:, :3, 3]
+    people = np.stack([mover.pose_at(times)[:, :3, 3] for mover in world.movers])
+    apart = np.linalg.norm((people - carrier)[..., :2], axis=2)
+    assert apart[:, 0].max() < 13.0
+    assert np.median(apart[:, 0]) < 6.0
+    beside = apart[:COMPANIONS, times > 3.5]
+    assert np.ptp(beside, axis=1).max() < 1.0
+    assert beside.max() < 8.5
+    assert apart[:, times > 1.0].min() > world.route.free_side_m

@@ -100,6 +100,15 @@ class Builder:
             low, high = np.array(limits).T
             self.box(0.5 * (low + high), np.abs(high - low))
 
+    def blocks(self, *rows: Sequence[float]) -> None:
+        """Boxes along the axes, each by its limits x x y y z z; five numbers are x x y z z, y from -y to y, and four
+        are x y z z.
+        """
+        for row in rows:
+            x = (-row[0], row[0]) if len(row) == 4 else row[:2]
+            y = (-row[-3], row[-3]) if len(row) < 6 else row[2:4]
+            self.block(x, y, row[-2:])
+
     def wall(self, a_xy: FloatArray, b_xy: FloatArray, z: Limits, thickness: float) -> None:
         """A wall with its middle line from a to b (2,), from height z[0] to z[1]."""
         step = b_xy - a_xy
@@ -124,6 +133,11 @@ class Builder:
     def pole(self, xy: Vector, z: Limits, radius: float) -> None:
         """An upright cylinder at (2,), from height z[0] to z[1]."""
         self.cylinder((*xy, z[0]), (*xy, z[1]), radius)
+
+    def poles(self, *rows: tuple[float, float, float, float, float]) -> None:
+        """Upright cylinders, each by x, y, its lower and its upper end, and its radius."""
+        for x, y, low, high, radius in rows:
+            self.pole((x, y), (low, high), radius)
 
     def pierced_wall(self, x: Limits, y: Limits, height: float, openings: Iterable[Opening]) -> None:
         """A wall with openings: whole between them, and closed below and above each."""
@@ -190,3 +204,8 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], scale: float)
     rough = gaussian_filter(rng.standard_normal(shape), scale, mode="reflect")
     rough -= rough.mean()
     return np.asarray(rough / max(float(rough.std()), 1e-12))
+
+
+def relief(rng: np.random.Generator, shape: tuple[int, ...], *waves: tuple[float, float]) -> FloatArray:
+    """The sum of smooth random surfaces, each by its deviation and its scale in cells."""
+    return np.asarray(np.sum([size * smooth_noise(rng, shape, scale) for size, scale in waves], axis=0))

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import HAIR_M, OUTER_WALL_M, Builder, Opening, Room, smooth_noise, starting
+from lidarslam.simulation.worlds.building import HAIR_M, OUTER_WALL_M, Builder, Opening, Room, relief, starting
 from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds
 from lidarslam.simulation.worlds.paths import Clearance
@@ -27,7 +27,11 @@ def build(seed: int) -> World:
     rng = np.random.default_rng(seed)
     length, depth, width = rng.uniform(24.0, 40.0), rng.uniform(25.0, 40.0), rng.uniform(25.0, 40.0)
     yard = Room(np.array([0.0, -0.5 * width]), np.array([depth, 0.5 * width]))
-    ground = _ground(length, yard, rng)
+    # Level in the corridor and along the front, a little uneven in the yard.
+    low = np.floor(yard.low - [length, 0.0] - _MARGIN_M)
+    nodes = paths.grid_nodes(low, yard.high + _MARGIN_M, _CELL_M)
+    hills = relief(rng, nodes.shape[:2], (0.12, 8.0 / _CELL_M), (0.01, 0.7))
+    ground = HeightField(low, _CELL_M, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
     route = _route(length, yard, ground)
     grounds = Grounds(rng, route.waypoints[:, :2], ground)
     _draw_corridor(length, grounds.solid, rng)
@@ -47,21 +51,13 @@ def _route(length: float, yard: Room, ground: HeightField) -> Route:
     return Route(paths.on_ground(way, ground), 0.3, 0.45, 2.2, 1.6)
 
 
-def _ground(length: float, yard: Room, rng: np.random.Generator) -> HeightField:
-    """Level in the corridor and along the front, a little uneven in the yard."""
-    low = np.floor(yard.low - [length, 0.0] - _MARGIN_M)
-    nodes = paths.grid_nodes(low, yard.high + _MARGIN_M, _CELL_M)
-    shape = nodes.shape[:2]
-    hills = 0.12 * smooth_noise(rng, shape, 8.0 / _CELL_M) + 0.01 * smooth_noise(rng, shape, 0.7)
-    return HeightField(low, _CELL_M, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
-
-
 def _draw_corridor(length: float, solid: Builder, rng: np.random.Generator) -> None:
     """Walls, ceiling and the closed end; boxes against the walls at uneven distances, all different."""
     half, top = 0.5 * _WIDTH_M, _HEIGHT_M + OUTER_WALL_M
     solid.block((-length, 0.0), starting((-half - OUTER_WALL_M, half), OUTER_WALL_M), (-0.3, top))
-    solid.block((-length, 0.0), (-half, half), (_HEIGHT_M, top))
-    solid.block((-length - OUTER_WALL_M, -length), (-half - OUTER_WALL_M, half + OUTER_WALL_M), (-0.3, top))
+    solid.blocks(
+        (-length, 0.0, half, _HEIGHT_M, top), (-length - OUTER_WALL_M, -length, half + OUTER_WALL_M, -0.3, top)
+    )
     for k in range(_BOXES):
         x = -length + (k + rng.uniform(0.25, 0.75)) * length / _BOXES
         long, deep, high = rng.uniform([0.3, 0.3, 0.3], [0.8, _DEEPEST_BOX_M, 0.8])

@@ -32,16 +32,9 @@ def build(seed: int) -> World:
     corners = np.array([[low[0], low[1], 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
     route = Route(corners, 0.8, _FREE_SIDE_M, _FREE_HEIGHT_M, SPEED_MPS)
     builder = Builder()
-    _draw_shell(room, height, builder, rng)
-    put = Furnisher(builder, Clearance(replace(route, free_side_m=_CROWD_SIDE_M + 0.4)), rng)
-    _furnish(room, height, put)
-    return World("crowd", seed, route, *builder.solids, movers=draw_people(route, rng))
-
-
-def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Generator) -> None:
-    """Floor, ceiling with lamps, and walls with windows on two sides."""
-    low, high = room.low - OUTER_WALL_M, room.high + OUTER_WALL_M
-    builder.block((low[0], high[0]), (low[1], high[1]), starting((-0.2, height), 0.2))
+    # Floor, ceiling with lamps, and walls with windows on two sides.
+    outer_low, outer_high = room.low - OUTER_WALL_M, room.high + OUTER_WALL_M
+    builder.block((outer_low[0], outer_high[0]), (outer_low[1], outer_high[1]), starting((-0.2, height), 0.2))
     draw_room_ceiling(room, height, builder, rng)
     for side in range(4):
         wall, length = room.at_wall(side, builder)
@@ -49,6 +42,9 @@ def _draw_shell(room: Room, height: float, builder: Builder, rng: np.random.Gene
         places = np.arange(1.5, length - wide - 1.0, wide + 1.2)[: 20 * (side < 2)]
         windows = [Opening((float(x), float(x) + wide), (0.8, height - 0.7)) for x in places]
         wall.glazed_wall((-OUTER_WALL_M, length + OUTER_WALL_M), height, windows)
+    put = Furnisher(builder, Clearance(replace(route, free_side_m=_CROWD_SIDE_M + 0.4)), rng)
+    _furnish(room, height, put)
+    return World("crowd", seed, route, *builder.solids, movers=draw_people(route, rng))
 
 
 def _furnish(room: Room, height: float, put: Furnisher) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import UP, Builder, smooth_noise
+from lidarslam.simulation.worlds.building import UP, Builder, relief, smooth_noise
 from lidarslam.simulation.worlds.outdoor import SUNK_M, Grounds, beside
 
 _CELL_M = 0.75
@@ -21,9 +21,14 @@ def build(seed: int) -> World:
     """Fields; a road of two gently winding kilometres that can be driven at 30 m/s for half of it."""
     rng = np.random.default_rng(seed)
     road = _road(rng)
-    low = np.floor(road.min(axis=0) - _MARGIN_M)
-    distance = paths.distance_to_loop(paths.grid_nodes(low, road.max(axis=0) + _MARGIN_M, _CELL_M), road, 12.0)
-    ground = _ground(rng, low, distance)
+    low, nodes = paths.grid_around(road, _MARGIN_M, _CELL_M)
+    distance = paths.distance_to_loop(nodes, road, 12.0)
+    # Swells some 150 m long and several metres high; fields are rough, the road is smooth and a little raised.
+    heights = relief(rng, distance.shape, (rng.uniform(2.0, 3.0), 50.0 / _CELL_M), (0.35, 24.0 / _CELL_M))
+    off_road = np.clip((distance - _ROAD_HALF_M) / 1.5, 0.0, 1.0)
+    heights += (0.1 + 0.9 * off_road) * 0.05 * smooth_noise(rng, distance.shape, 2.0 / _CELL_M)
+    heights += off_road * 0.035 * smooth_noise(rng, distance.shape, 0.7) - 0.2 * off_road
+    ground = HeightField(low, _CELL_M, heights)
     grounds = Grounds(rng, road, ground)
     for things in (_poles, _fences, _barn, _bales, _hedges, _trees):
         things(grounds)
@@ -50,17 +55,6 @@ def _road(rng: np.random.Generator) -> FloatArray:
         loop[:, 1] += amplitude * np.sin(2.0 * np.pi * loop[:, 0] / wave + phase)
     begin = np.abs(loop - [-0.25 * side, loop[:, 1].min()]).sum(axis=1).argmin()
     return np.roll(loop, -begin, axis=0)[:: rng.choice([-1, 1])]
-
-
-def _ground(rng: np.random.Generator, low: FloatArray, distance: FloatArray) -> HeightField:
-    """Swells some 150 m long and several metres high; fields are rough, the road is smooth and a little raised."""
-    shape = distance.shape
-    heights = rng.uniform(2.0, 3.0) * smooth_noise(rng, shape, 50.0 / _CELL_M)
-    heights += 0.35 * smooth_noise(rng, shape, 24.0 / _CELL_M)
-    off_road = np.clip((distance - _ROAD_HALF_M) / 1.5, 0.0, 1.0)
-    heights += (0.1 + 0.9 * off_road) * 0.05 * smooth_noise(rng, shape, 2.0 / _CELL_M)
-    heights += off_road * 0.035 * smooth_noise(rng, shape, 0.7) - 0.2 * off_road
-    return HeightField(low, _CELL_M, heights)
 
 
 def _poles(grounds: Grounds) -> None:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import UP, smooth_noise
+from lidarslam.simulation.worlds.building import UP, relief
 from lidarslam.simulation.worlds.outdoor import Grounds, on_slope
 
 _CELL_M = 0.4
@@ -19,25 +19,19 @@ def build(seed: int) -> World:
     """A forest; its track is just wide enough to pass."""
     rng = np.random.default_rng(seed)
     track = paths.winding_loop(rng, rng.uniform(160.0, 290.0), 6, 0.6, 4.0)
-    ground = _ground(rng, track)
+    low, nodes = paths.grid_around(track, _MARGIN_M, _CELL_M)
+    distance = paths.distance_to_loop(nodes, track)
+    # Slopes of up to a sixth or so, knolls, and bumps that are worn down on the track.
+    heights = relief(rng, distance.shape, (rng.uniform(1.0, 2.0), 16.0 / _CELL_M), (0.22, 4.0 / _CELL_M))
+    untrodden = np.clip((distance - 0.5) / 1.5, 0.3, 1.0)
+    heights += untrodden * relief(rng, distance.shape, (0.09, 1.0 / _CELL_M), (0.02, 0.7))
+    ground = HeightField(low, _CELL_M, heights)
     grounds = Grounds(rng, track, ground)
     _trees(grounds)
     _floor(grounds)
     route = Route(paths.on_ground(paths.resample_loop(track, 1.5), ground), 1.5, _FREE_SIDE_M, 2.6, 3.0)
     grounds.prune(route)
     return World("forest", seed, route, *grounds.solid.solids, (ground,), map_spacing_m=0.1)
-
-
-def _ground(rng: np.random.Generator, track: FloatArray) -> HeightField:
-    """Slopes of up to a sixth or so, knolls, and bumps that are worn down on the track."""
-    low = np.floor(track.min(axis=0) - _MARGIN_M)
-    distance = paths.distance_to_loop(paths.grid_nodes(low, track.max(axis=0) + _MARGIN_M, _CELL_M), track)
-    shape = distance.shape
-    untrodden = np.clip((distance - 0.5) / 1.5, 0.3, 1.0)
-    heights = rng.uniform(1.0, 2.0) * smooth_noise(rng, shape, 16.0 / _CELL_M)
-    heights += 0.22 * smooth_noise(rng, shape, 4.0 / _CELL_M)
-    heights += untrodden * (0.09 * smooth_noise(rng, shape, 1.0 / _CELL_M) + 0.02 * smooth_noise(rng, shape, 0.7))
-    return HeightField(low, _CELL_M, heights)
 
 
 def _scatter(grounds: Grounds, count: int, from_track_m: tuple[float, float], apart_m: float) -> FloatArray:

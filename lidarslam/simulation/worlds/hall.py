@@ -1,12 +1,13 @@
 """A large industrial hall: machines and racks below, decks above, and ramps that lead up to them and down again."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.world import Boxes, Cylinders, Mover, Route, World
+from lidarslam.simulation.world import Mover, Route, World
 from lidarslam.simulation.worlds import hall_equipment as equipment
 from lidarslam.simulation.worlds.building import UP, Builder, Opening, Room, around
 from lidarslam.simulation.worlds.interior import Furnisher, Measures, Piece, Size, crate, draw_railing
@@ -22,8 +23,7 @@ _SLAB_M, _WALL_M, _TRUSS_M = 0.25, 0.4, 1.6
 _GAP_M = 0.5  # between the things on the floor
 
 
-@dataclass(frozen=True)
-class Deck:
+class Deck(NamedTuple):
     """A level floor on columns."""
 
     floor: Room
@@ -31,8 +31,7 @@ class Deck:
     railings: FloatArray  # (K, 2, 2) from and to, its open edges
 
 
-@dataclass(frozen=True)
-class HallPlan:
+class HallPlan(NamedTuple):
     """The hall."""
 
     floor: Room  # from the origin
@@ -65,27 +64,19 @@ def draw_hall(rng: np.random.Generator) -> HallPlan:
     ]
     route = Route(np.array(waypoints), 0.8, 0.9, 2.2, 2.0)
     ramps = np.array([ramp_a, ramp_b, ramp_c, ramp_d])
-    decks = _decks(width, depth, deck_1_x, landing_y, rise)
-    return HallPlan(Room(np.zeros(2), np.array([width, depth])), height, aisles, turn_x, ramps, decks, route)
-
-
-def _decks(width: float, depth: float, deck_1_x: float, landing_y: float, rise: float) -> tuple[Deck, ...]:
-    """Deck 1, deck 2 and the landing, with railings wherever no ramp joins and no wall is, a gap for the stairs."""
-    near, next_lane, far = _LANE_AT_M, depth - _NEXT_LANE_AT_M, depth - _LANE_AT_M
-    one, two = (deck_1_x, depth - _STRIP_M), (_DECK_2_WIDTH_M, depth - _STRIP_M)  # the decks' corners in the hall
-    landing = (_LANDING_WIDTH_M, landing_y)
-    railings = (
-        [_edge(one, (deck_1_x, depth), next_lane, far), _edge(one, (width, one[1]), width - 2.5, half=0.7)],
-        [_edge(two, (_DECK_2_WIDTH_M, depth), far), _edge((0.0, two[1]), two, near)],
+    # Railings wherever no ramp joins and no wall is, a gap for the stairs.
+    one, two, landing = (deck_1_x, front), (_DECK_2_WIDTH_M, front), (_LANDING_WIDTH_M, landing_y)
+    edges = (
+        [_edge(one, (deck_1_x, depth), next_lane, far), _edge(one, (width, front), width - 2.5, half=0.7)],
+        [_edge(two, (_DECK_2_WIDTH_M, depth), far), _edge((0.0, front), two, near)],
         [_edge((0.0, landing_y), landing, near), _edge((_LANDING_WIDTH_M, 0.0), landing, near)],
     )
-    floors = (
-        Room(np.array(one), np.array([width, depth])),
-        Room(np.array([0.0, two[1]]), np.array([two[0], depth])),
-        Room(np.zeros(2), np.array(landing)),
+    floors = ((one, (width, depth)), ((0.0, front), (two[0], depth)), ((0.0, 0.0), landing))
+    decks = tuple(
+        Deck(Room(np.array(low), np.array(high)), z, np.concatenate(railings))
+        for (low, high), z, railings in zip(floors, (rise, 2.0 * rise, rise), edges, strict=True)
     )
-    levels = (rise, 2.0 * rise, rise)
-    return tuple(Deck(*deck) for deck in zip(floors, levels, map(np.concatenate, railings), strict=True))
+    return HallPlan(Room(np.zeros(2), np.array([width, depth])), height, aisles, turn_x, ramps, decks, route)
 
 
 def _edge(a: tuple[float, float], b: tuple[float, float], *gaps: float, half: float = 0.5 * _LANE_M) -> FloatArray:
@@ -114,21 +105,17 @@ def build(seed: int) -> World:
     for deck in plan.decks[:2]:
         _fill(put, deck.floor, 0.4, deck.z, 40)
     _fill(put, plan.floor, 0.6, 0.0, 300)
-    world = World("hall", seed, plan.route, *put.builder.solids, movers=movers)
-    return _mirrored(world, rng.choice([-1.0, 1.0], 2))
-
-
-def _mirrored(world: World, signs: FloatArray) -> World:
-    """The world with x, y or both turned to the other side: four halls from one plan."""
-    mirror = np.append(signs, 1.0)
-    boxes, cylinders = world.boxes, world.cylinders
-    return replace(
-        world,
-        route=replace(world.route, waypoints=world.route.waypoints * mirror),
-        # A box is its own mirror image; turning both of its sides keeps the rotation right-handed.
-        boxes=Boxes(boxes.centres * mirror, boxes.half_sizes, boxes.R_world_box * np.outer(mirror, mirror)),
-        cylinders=Cylinders(cylinders.starts * mirror, cylinders.ends * mirror, cylinders.radii),
-        movers=tuple(replace(mover, waypoints=mover.waypoints * mirror) for mover in world.movers),
+    # x, y or both turned to the other side: four halls from one plan. A box is its own mirror image; turning both of
+    # its sides keeps the rotation right-handed.
+    mirror = np.append(rng.choice([-1.0, 1.0], 2), 1.0)
+    boxes, cylinders = put.builder.solids
+    return World(
+        "hall",
+        seed,
+        replace(plan.route, waypoints=plan.route.waypoints * mirror),
+        replace(boxes, centres=boxes.centres * mirror, R_world_box=boxes.R_world_box * np.outer(mirror, mirror)),
+        replace(cylinders, starts=cylinders.starts * mirror, ends=cylinders.ends * mirror),
+        movers=tuple(replace(mover, waypoints=mover.waypoints * mirror) for mover in movers),
     )
 
 
@@ -161,10 +148,10 @@ def _stand(top: FloatArray, thickness: float, put: Furnisher) -> None:
 
 def _draw_deck(deck: Deck, put: Furnisher) -> None:
     """Slab, beams below it, columns at its corners and between, railings along its open edges."""
-    size = deck.floor.high - deck.floor.low
     low, high = np.append(deck.floor.low, deck.z - _SLAB_M), np.append(deck.floor.high, deck.z)
-    put.builder.box(0.5 * (low + high), high - low)
+    put.builder.block(*np.stack([low, high], axis=1))
     put.clearance.take(low - 0.35 * UP, high)
+    size = high - low
     xs, ys = (np.linspace(low[k] + 0.15, high[k] - 0.15, max(2, round(size[k] / 4.5) + 1)) for k in (0, 1))
     for x in xs:
         put.builder.box((x, 0.5 * (low[1] + high[1]), deck.z - _SLAB_M - 0.15), (0.18, size[1] - 0.02, 0.3))
@@ -239,7 +226,7 @@ def _set_machines(plan: HallPlan, put: Furnisher) -> None:
 
 
 _GOODS: tuple[tuple[Piece, Measures], ...] = (
-    (equipment.loaded_pallet, (1.25, 0.95, 1.3)),
+    (lambda spot, _, rng: equipment.pallet(spot, 1.2, rng), (1.25, 0.95, 1.3)),
     (equipment.drums, (1.0, 1.25, 1.8)),
     (crate, ((0.5, 1.4), (0.5, 1.4), (0.5, 1.4))),
 )
@@ -267,14 +254,19 @@ def _draw_shell(plan: HallPlan, put: Furnisher) -> None:
     for side, gate_x in enumerate(((width - 9.0, width - 3.0), (7.0, 20.0), None, None)):
         _draw_wall(*plan.floor.at_wall(side, builder), plan.height, gate_x, rng)
     for x in frames[1:-1]:
-        _draw_truss(plan, x, builder)
+        # A lattice girder across the hall: chords, posts, and diagonals that change direction in the middle.
+        low, high = plan.height - _TRUSS_M, plan.height - 0.25
+        for z in (low, high):
+            builder.box((x, 0.5 * depth, z), (0.2, depth, 0.16))
+        for k, (a, b) in enumerate(pairwise(np.linspace(0.0, depth, 15))):
+            ends = (low, high) if k < 7 else (high, low)
+            builder.beam((x, a, ends[0]), (x, b, ends[1]), 0.1, 0.1)
+            builder.box((x, b, 0.5 * (low + high)), (0.1, 0.1, high - low))
     for y in np.linspace(0.0, depth, 10)[1:-1]:
         builder.box((0.5 * width, y, plan.height - 0.1), (width, 0.14, 0.2))
     rows = (plan.aisle_y[0] - rng.uniform(4.0, 6.0), 0.5 * sum(plan.aisle_y) + rng.uniform(-1.5, 1.5))
-    _draw_columns(plan, frames, rows, put)
-    _draw_crane(plan, rows, put)
-    _draw_ducts(plan, put)
-    _draw_pipes(plan, put)
+    _draw_columns_and_crane(plan, frames, rows, put)
+    _draw_ducts_and_pipes(plan, put)
 
 
 def _draw_wall(
@@ -295,35 +287,20 @@ def _draw_wall(
     for window in windows:
         wall.block(window.x, (-_WALL_M, -_WALL_M + 0.05), window.z)
         wall.block(around(np.linspace(*window.x, 4)[1:-1], 0.03), (-_WALL_M, -_WALL_M + 0.12), window.z)
-    for gate in gates:
-        _draw_gate(wall, gate)
+    for (left, right), (_, shut) in gates:  # a roller shutter of broad slats, set back, with guides and its box above
+        for z in np.arange(0.0, shut, 0.4):
+            wall.block((left, right), (-_WALL_M, -_WALL_M + 0.08), (z, min(z + 0.34, shut)))
+        wall.block((left, right), (-_WALL_M, -_WALL_M + 0.05), (0.0, shut))
+        wall.block(around((left, right), 0.12), (-0.02, 0.1), (0.0, shut))
+        wall.block((left - 0.2, right + 0.2), (0.0, 0.45), (shut, shut + 0.5))
     wall.block(around([k * bay for k in range(bays + 1)], 0.2), (0.0, 0.3), (0.0, height))
 
 
-def _draw_gate(wall: Builder, gate: Opening) -> None:
-    """A roller shutter of broad slats, set back, with guides and its box above."""
-    top = gate.z[1]
-    for z in np.arange(0.0, top, 0.4):
-        wall.block(gate.x, (-_WALL_M, -_WALL_M + 0.08), (z, min(z + 0.34, top)))
-    wall.block(gate.x, (-_WALL_M, -_WALL_M + 0.05), (0.0, top))
-    wall.block(around(gate.x, 0.12), (-0.02, 0.1), (0.0, top))
-    wall.block((gate.x[0] - 0.2, gate.x[1] + 0.2), (0.0, 0.45), (top, top + 0.5))
-
-
-def _draw_truss(plan: HallPlan, x: float, builder: Builder) -> None:
-    """A lattice girder across the hall: chords, posts, and diagonals that change direction in the middle."""
-    low, high, depth = plan.height - _TRUSS_M, plan.height - 0.25, plan.floor.high[1]
-    for z in (low, high):
-        builder.box((x, 0.5 * depth, z), (0.2, depth, 0.16))
-    for k, (a, b) in enumerate(pairwise(np.linspace(0.0, depth, 15))):
-        ends = (low, high) if k < 7 else (high, low)
-        builder.beam((x, a, ends[0]), (x, b, ends[1]), 0.1, 0.1)
-        builder.box((x, b, 0.5 * (low + high)), (0.1, 0.1, high - low))
-
-
-def _draw_columns(plan: HallPlan, frames: FloatArray, rows: tuple[float, float], put: Furnisher) -> None:
-    """Columns of H section on footings below the trusses, where the route and the ramps leave room; girders on top."""
-    top, width, builder = plan.height - _TRUSS_M - 0.08, plan.floor.high[0], put.builder
+def _draw_columns_and_crane(plan: HallPlan, frames: FloatArray, rows: tuple[float, float], put: Furnisher) -> None:
+    """Columns of H section on footings below the trusses, where the route and the ramps leave room; girders on top,
+    and under them a bridge crane, its hook hanging.
+    """
+    top, width, builder, rng = plan.height - _TRUSS_M - 0.08, plan.floor.high[0], put.builder, put.rng
     for y in rows:
         builder.box((0.5 * width, y, top - 0.3), (width, 0.25, 0.6))
         for x in frames[1:-1]:
@@ -333,12 +310,7 @@ def _draw_columns(plan: HallPlan, frames: FloatArray, rows: tuple[float, float],
                     builder.box((x, y + side * 0.19, 0.5 * top), (0.4, 0.03, top))
                 builder.box((x, y, 0.5 * top), (0.03, 0.35, top))
                 builder.box((x, y, 1.5), (0.44, 0.44, 0.08))
-
-
-def _draw_crane(plan: HallPlan, rows: tuple[float, float], put: Furnisher) -> None:
-    """A bridge crane under the girders of the column rows, its hook hanging."""
-    builder, rng = put.builder, put.rng
-    z, x = plan.height - _TRUSS_M - 1.0, rng.uniform(0.35, 0.8) * plan.floor.high[0]
+    z, x = plan.height - _TRUSS_M - 1.0, rng.uniform(0.35, 0.8) * width
     for y in rows:
         builder.box((x, y, z + 0.1), (3.2, 0.3, 0.45))
     for dx in (-0.9, 0.9):
@@ -350,9 +322,11 @@ def _draw_crane(plan: HallPlan, rows: tuple[float, float], put: Furnisher) -> No
     builder.box((x, y, hook - 0.2), (0.35, 0.2, 0.5))
 
 
-def _draw_ducts(plan: HallPlan, put: Furnisher) -> None:
-    """Round ventilation ducts along the hall below the trusses, with outlets and hangers."""
-    builder, rng = put.builder, put.rng
+def _draw_ducts_and_pipes(plan: HallPlan, put: Furnisher) -> None:
+    """Round ducts along the hall below the trusses, with outlets and hangers; pipes in bundles along the far right
+    wall, and down pipes with valves between its pilasters.
+    """
+    builder, rng, depth = put.builder, put.rng, plan.floor.high[1]
     for y in (plan.aisle_y[0] + rng.uniform(1.5, 3.0), plan.aisle_y[1] + rng.uniform(0.5, 2.0)):
         radius, z = rng.uniform(0.3, 0.5), plan.height - _TRUSS_M - rng.uniform(0.8, 1.2)
         start, end = rng.uniform(2.0, 8.0), plan.floor.high[0] - rng.uniform(2.0, 8.0)
@@ -362,11 +336,6 @@ def _draw_ducts(plan: HallPlan, put: Furnisher) -> None:
             builder.cylinder((x - 0.05, y, z), (x + 0.05, y, z), radius + 0.05)
             side = rng.choice([-1.0, 1.0]) * (radius + 0.5)
             builder.cylinder((x + 1.0, y, z), (x + 1.0, y + side, z - 0.5), 0.5 * radius)
-
-
-def _draw_pipes(plan: HallPlan, put: Furnisher) -> None:
-    """Pipes in bundles along the far right wall, and down pipes with valves between its pilasters."""
-    builder, rng, depth = put.builder, put.rng, plan.floor.high[1]
     x = plan.floor.high[0] - 0.45
     for k in range(int(rng.integers(2, 5))):
         z, radius = 5.0 + 0.42 * k, rng.uniform(0.06, 0.16)

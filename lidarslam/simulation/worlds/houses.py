@@ -4,7 +4,7 @@ A house is drawn in its own frame: the origin at the left end of its front as se
 into the house, z up from the pavement.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ _FOUNDATION_M = 2.0
 _OFFSET_M = 0.02
 
 
-@dataclass(frozen=True)
-class _Style:
+class _Style(NamedTuple):
     """Measures that all facades of one house share."""
 
     storeys: int
@@ -61,8 +60,7 @@ def house(
     if passage:  # a way through to the yard in place of the door
         middle = float(openings[door].mean())
         a, b = max(middle - 1.4, 0.4), min(middle + 1.4, width - 0.4)
-        part.block((x0, a), (recess, depth), (-_FOUNDATION_M, 3.0))
-        part.block((b, x1), (recess, depth), (-_FOUNDATION_M, 3.0))
+        part.block([(x0, a), (b, x1)], (recess, depth), (-_FOUNDATION_M, 3.0))
         part.block((x0, x1), (recess, depth), (3.0, top))
         before, after = openings[openings[:, 1] < a - 0.1], openings[openings[:, 0] > b + 0.1]
         openings, door = np.concatenate([before, [[a, b]], after]), len(before)
@@ -83,11 +81,8 @@ def _draw_style(rng: np.random.Generator, storeys: tuple[int, int], spread: floa
     is_shop = rng.random() < 0.3
     sill = rng.uniform(0.7, 1.0)
     count, recess = int(rng.integers(*storeys, endpoint=True)), rng.uniform(0.14, 0.38)
-    axis, opening, lintel = (
-        spread * rng.uniform(2.1, 3.4),
-        rng.uniform(0.4, 0.62),
-        rng.uniform(sill + 1.2, storey - 0.25),
-    )
+    axis, opening = spread * rng.uniform(2.1, 3.4), rng.uniform(0.4, 0.62)
+    lintel = rng.uniform(sill + 1.2, storey - 0.25)
     ground = (0.35, 2.6) if is_shop else (sill + 0.1, rng.uniform(2.2, 2.6))
     return _Style(count, storey, recess, axis, opening, sill, lintel, *ground)
 
@@ -139,8 +134,7 @@ def _bay(part: Builder, style: _Style, opening: FloatArray, reach: float) -> Non
 
 def _balcony(part: Builder, opening: FloatArray, floor: float, reach: float) -> None:
     x0, x1 = opening[0] - 0.3, opening[1] + 0.3
-    part.block((x0, x1), (-reach, 0.1), (floor - 0.16, floor))
-    part.block((x0, x1), (-reach, -reach + 0.05), (floor + 0.95, floor + 1.0))
+    part.blocks((x0, x1, -reach, 0.1, floor - 0.16, floor), (x0, x1, -reach, -reach + 0.05, floor + 0.95, floor + 1.0))
     part.block(starting((x0, x1 - 0.05), 0.04), (-reach + 0.06, 0.05), (floor + 0.1, floor + 1.0))
     bars = starting(np.linspace(x0, x1 - 0.04, max(3, round((x1 - x0) / 0.5))), 0.04)
     part.block(bars, (-reach + 0.01, -reach + 0.04), (floor - 0.02, floor + 0.96))

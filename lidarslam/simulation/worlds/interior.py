@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Limits, Room, around, row, starting
+from lidarslam.simulation.worlds.building import HAIR_M, UP, Builder, Room, around, row, starting
 from lidarslam.simulation.worlds.paths import Clearance
 
 Size = tuple[float, float, float]  # width, depth, height
@@ -31,9 +31,11 @@ def desk(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     spot.block((side * (half - 0.5), side * (half - 0.08)), (0.08, depth - 0.1), (0.0, 0.58))
     for k in range(int(rng.integers(1, 3))):
         x = (k - 0.5) * 0.58 + rng.uniform(-0.05, 0.05)
-        spot.block((x - 0.27, x + 0.27), (0.16, 0.19), (top + 0.14, top + 0.48))
-        spot.block((x - 0.1, x + 0.1), (0.12, 0.28), (top + 0.035, top + 0.05))
-        spot.block((x - 0.03, x + 0.03), (0.19, 0.21), (top + 0.05, top + 0.2))
+        spot.blocks(
+            (x - 0.27, x + 0.27, 0.16, 0.19, top + 0.14, top + 0.48),
+            (x - 0.1, x + 0.1, 0.12, 0.28, top + 0.035, top + 0.05),
+            (x - 0.03, x + 0.03, 0.19, 0.21, top + 0.05, top + 0.2),
+        )
     spot.block((-0.22, 0.22), (0.42, 0.56), (top + 0.035, top + 0.06))
 
 
@@ -57,18 +59,14 @@ def shelf(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     boards = np.linspace(0.06, height - 0.03, max(2, round(height / 0.38) + 1))
     for z, above in pairwise(boards):
         spot.block((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (z, z + 0.025))
-        _goods(spot, (-half + 0.05, half - 0.05), depth, (z + 0.025, above - 0.03), rng)
+        at, low = -half + 0.05, z + 0.025
+        while at < half - 0.05 - 0.15:
+            length = min(rng.uniform(0.15, 0.5), half - 0.05 - at)
+            if rng.random() < 0.75:
+                y = (0.03, depth * rng.uniform(0.55, 0.95))
+                spot.block((at, at + length), y, (low, low + (above - 0.03 - low) * rng.uniform(0.5, 0.95)))
+            at += length + rng.choice([0.01, 0.12])
     spot.block((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (boards[-1], boards[-1] + 0.025))
-
-
-def _goods(spot: Builder, x: Limits, depth: float, z: Limits, rng: np.random.Generator) -> None:
-    at = x[0]
-    while at < x[1] - 0.15:
-        length = min(rng.uniform(0.15, 0.5), x[1] - at)
-        if rng.random() < 0.75:
-            y = (0.03, depth * rng.uniform(0.55, 0.95))
-            spot.block((at, at + length), y, (z[0], z[0] + (z[1] - z[0]) * rng.uniform(0.5, 0.95)))
-        at += length + rng.choice([0.01, 0.12])
 
 
 def cabinet(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -96,8 +94,7 @@ def counter(spot: Builder, size: Size, rng: np.random.Generator) -> None:
 def sofa(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A sofa, 0.85 m deep."""
     half, seat = 0.5 * size[0], rng.uniform(0.38, 0.44)
-    spot.block((-half, half), (0.04, 0.85), (0.06, seat - 0.1))
-    spot.block((-half, half), (0.0, 0.22), (0.06, seat + 0.4))
+    spot.blocks((-half, half, 0.04, 0.85, 0.06, seat - 0.1), (-half, half, 0.0, 0.22, 0.06, seat + 0.4))
     spot.block(starting((-half, half - 0.16), 0.16), (0.1, 0.83), (0.06, seat + 0.18))
     cushions = max(1, round((size[0] - 0.32) / 0.65))
     spot.block(row(-half + 0.16, half - 0.16, cushions, 0.01), (0.2, 0.84), (seat - 0.1, seat))
@@ -107,14 +104,12 @@ def plant(spot: Builder, size: Size, rng: np.random.Generator) -> None:
     """A pot with leaves to all sides, about 0.35 m around its middle."""
     spot = spot.shifted(0.0, 0.5 * size[1] - 0.005)
     pot, high = rng.uniform(0.28, 0.42), size[2]
-    spot.pole((0.0, 0.0), (0.0, pot), rng.uniform(0.14, 0.19))
-    spot.pole((0.0, 0.0), (pot, 0.75 * high), 0.02)
+    spot.poles((0.0, 0.0, 0.0, pot, rng.uniform(0.14, 0.19)), (0.0, 0.0, pot, 0.75 * high, 0.02))
     for _ in range(int(rng.integers(9, 15))):
         angle, rise = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 1.2)
         direction = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         side = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        length = rng.uniform(0.22, 0.34)
-        root = np.array([0.0, 0.0, rng.uniform(pot, 0.78 * high)])
+        length, root = rng.uniform(0.22, 0.34), np.array([0.0, 0.0, rng.uniform(pot, 0.78 * high)])
         leaf = (length, rng.uniform(0.06, 0.14), 0.012)
         R = np.stack([direction, side, np.cross(direction, side)], axis=1)
         spot.box(root + 0.5 * length * direction, leaf, R=R)
@@ -152,16 +147,16 @@ def radiator(spot: Builder, width: float) -> None:
 def chair(spot: Builder, rng: np.random.Generator) -> None:
     """A chair on five castors or four legs, its back towards +y of the spot."""
     seat = rng.uniform(0.43, 0.5)
-    spot.block((-0.23, 0.23), (-0.23, 0.23), (seat, seat + 0.06))
-    spot.block((-0.21, 0.21), (0.2, 0.26), (seat + 0.12, seat + 0.52))
-    spot.block((-0.03, 0.03), (0.2, 0.24), (seat - 0.02, seat + 0.3))
+    spot.blocks(
+        (0.23, 0.23, seat, seat + 0.06), (-0.21, 0.21, 0.2, 0.26, seat + 0.12, seat + 0.52),
+        (-0.03, 0.03, 0.2, 0.24, seat - 0.02, seat + 0.3),
+    )  # fmt: skip
     if rng.random() < 0.6:
         spot.pole((0.0, 0.0), (0.08, seat), 0.03)
         for angle in np.arange(5) * 0.4 * np.pi:
             spot.cylinder((0.0, 0.0, 0.09), (0.29 * np.cos(angle), 0.29 * np.sin(angle), 0.04), 0.022)
     else:
-        for x, y in ((-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2), (0.2, 0.2)):
-            spot.pole((x, y), (0.0, seat), 0.017)
+        spot.poles(*((x, y, 0.0, seat, 0.017) for y in (-0.2, 0.2) for x in (-0.2, 0.2)))
 
 
 def table(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -189,9 +184,7 @@ def conference(spot: Builder, size: Size, rng: np.random.Generator) -> None:
 def round_table(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A round table on one foot, with a margin of 5 cm."""
     radius = 0.5 * size[0] - 0.05
-    spot.pole((0.0, 0.0), (0.72, 0.75), radius)
-    spot.pole((0.0, 0.0), (0.02, 0.72), 0.045)
-    spot.pole((0.0, 0.0), (0.0, 0.02), 0.55 * radius)
+    spot.poles((0.0, 0.0, 0.72, 0.75, radius), (0.0, 0.0, 0.02, 0.72, 0.045), (0.0, 0.0, 0.0, 0.02, 0.55 * radius))
 
 
 def round_table_with_chairs(spot: Builder, size: Size, rng: np.random.Generator) -> None:
@@ -212,12 +205,7 @@ def screened_workplace(spot: Builder, size: Size, rng: np.random.Generator) -> N
 
 def crate(spot: Builder, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
     """A closed box."""
-    spot.block((-0.5 * size[0], 0.5 * size[0]), (-0.5 * size[1], 0.5 * size[1]), (0.0, size[2]))
-
-
-def _gas_bottle(spot: Builder, size: Size, rng: np.random.Generator, height: float, radius: float) -> None:  # noqa: ARG001
-    spot.pole((0.0, 0.28), (0.0, height), radius)
-    spot.pole((0.0, 0.28), (height, height + 0.1), 0.3 * radius)
+    spot.blocks((0.5 * size[0], 0.5 * size[1], 0.0, size[2]))
 
 
 def draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
@@ -231,7 +219,7 @@ def draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
 
 
 Measure = float | tuple[float, float]  # a length, or the limits it is drawn between
-Measures = tuple[Measure, Measure, Measure]
+Measures = tuple[Measure, Measure | None, Measure]  # a depth of None is the width
 
 
 @dataclass(frozen=True)
@@ -294,7 +282,7 @@ class Furnisher:
                 return True
         return False
 
-    def some(self, room: Room, pieces: "Pieces") -> None:
+    def some(self, room: Room, pieces: Pieces) -> None:
         """A number of pieces, each of its own size."""
         for _ in self.number(pieces.count):
             if pieces.is_on_floor:
@@ -308,8 +296,8 @@ class Furnisher:
 
     def drawn(self, size: Measures) -> Size:
         """A size within limits."""
-        width, depth, height = (self.rng.uniform(*one) if isinstance(one, tuple) else one for one in size)
-        return width, depth, height
+        width, depth, height = (self.rng.uniform(*one) if isinstance(one, tuple) else one or 0.0 for one in size)
+        return width, depth or width, height
 
 
 def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
@@ -339,21 +327,14 @@ def furnish_corridor(corridor: Room, height: float, put: Furnisher) -> None:
 
 def _conference(room: Room, put: Furnisher) -> None:
     longest = max(1.5, float((room.high - room.low).max()) - 2.4)
-    for _ in range(3):
-        if put.on_floor(room, put.drawn(((1.4, longest), (2.0, 2.4), 1.0)), conference):
-            break
-
-
-def _round_tables(room: Room, put: Furnisher) -> None:
-    for _ in put.number((1, 4)):
-        span = put.rng.uniform(1.6, 2.0)
-        put.on_floor(room, (span, span, 1.0), round_table_with_chairs)
+    any(put.on_floor(room, put.drawn(((1.4, longest), (2.0, 2.4), 1.0)), conference) for _ in range(3))
 
 
 def _gas_bottles(room: Room, put: Furnisher) -> None:
     for _ in put.number((1, 4)):
-        bottle = partial(_gas_bottle, height=put.rng.uniform(0.7, 1.6), radius=put.rng.uniform(0.12, 0.25))
-        put.at_wall(room, (0.55, 0.55, 1.7), bottle)
+        height, radius = put.rng.uniform(0.7, 1.6), put.rng.uniform(0.12, 0.25)
+        rows = (0.0, 0.28, 0.0, height, radius), (0.0, 0.28, height, height + 0.1, 0.3 * radius)
+        put.at_wall(room, (0.55, 0.55, 1.7), lambda spot, _, __, rows=rows: spot.poles(*rows))  # type: ignore[misc]
 
 
 _SHELF = (0.8, 1.4), (0.28, 0.42)
@@ -381,7 +362,7 @@ KINDS: dict[str, tuple[Pieces | Callable[[Room, Furnisher], None], ...]] = {
     "kitchen": (
         Pieces(cabinet, 1, (0.62, 0.64, 1.85)),
         Pieces(counter, 1, ((1.6, 2.6), 0.64, 2.2), tries=30),
-        _round_tables,
+        Pieces(round_table_with_chairs, (1, 4), ((1.6, 2.0), None, 1.0), is_on_floor=True),
         Pieces(plant, 1, _PLANT),
     ),
     "laboratory": (

@@ -1,6 +1,6 @@
 """An office floor: corridors that close a loop around sharp corners, and rooms off them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, groupby, product
 from typing import NamedTuple
 
@@ -52,8 +52,7 @@ class WallLine:
         return 1.0 if self.right == _CORRIDOR else -1.0
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """A floor plan."""
 
     loop: FloatArray  # (M, 2) corners of the closed path along the middle of the corridors
@@ -129,22 +128,18 @@ def _walls(xs: FloatArray, ys: FloatArray, labels: Labels) -> tuple[WallLine, ..
     """A wall wherever two labels meet, as long as the two stay the same."""
     padded = np.pad(labels, 1, constant_values=_OUTSIDE)
     walls: list[WallLine] = []
-    for x, left, right in zip(xs, padded[:-1, 1:-1], padded[1:, 1:-1], strict=True):
-        walls += [WallLine(np.array([x, ys[a]]), np.array([x, ys[b]]), *pair) for a, b, pair in _runs(left, right)]
-    for y, left, right in zip(ys, padded[1:-1, 1:].T, padded[1:-1, :-1].T, strict=True):
-        walls += [WallLine(np.array([xs[a], y]), np.array([xs[b], y]), *pair) for a, b, pair in _runs(left, right)]
+    along_y = (xs, ys, padded[:-1, 1:-1], padded[1:, 1:-1])
+    along_x = (ys, xs, padded[1:-1, 1:].T, padded[1:-1, :-1].T)
+    for order, (lines, ends, lefts, rights) in ((1, along_y), (-1, along_x)):
+        for at, left, right in zip(lines, lefts, rights, strict=True):
+            start = 0
+            for pair, members in groupby(zip(left.tolist(), right.tolist(), strict=True)):
+                stop = start + len(list(members))
+                if pair[0] != pair[1]:
+                    a, b = (np.array([at, end][::order]) for end in (ends[start], ends[stop]))
+                    walls.append(WallLine(a, b, *pair))
+                start = stop
     return tuple(walls)
-
-
-def _runs(left: Labels, right: Labels) -> list[tuple[int, int, tuple[int, int]]]:
-    """Maximal runs (start, stop, pair) of equal pairs whose two labels differ."""
-    runs, start = [], 0
-    for pair, members in groupby(zip(left.tolist(), right.tolist(), strict=True)):
-        stop = start + len(list(members))
-        if pair[0] != pair[1]:
-            runs.append((start, stop, pair))
-        start = stop
-    return runs
 
 
 # Limits between which the largest length of the route is drawn.
@@ -154,8 +149,7 @@ _DOOR_HEIGHT_M = 2.12
 _TURN_M = 1.0
 
 
-@dataclass(frozen=True)
-class Door:
+class Door(NamedTuple):
     """A door from a corridor into a room."""
 
     wall: WallLine
@@ -174,11 +168,6 @@ class _Visit(NamedTuple):
     along: float
     path: FloatArray
 
-    def excludes(self, other: "_Visit") -> bool:
-        """Whether two visits are to the same room, or branch off the loop too close to one another."""
-        is_close = self.leg == other.leg and abs(self.along - other.along) < 1.0
-        return self.door.room == other.door.room or is_close
-
 
 def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]:
     """A door or two for every room, and the route, which leads through open ones up to its largest length."""
@@ -191,10 +180,23 @@ def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]
             along = rng.uniform(0.85, wall.length - 0.85)
             opened = rng.choice([0.0, rng.uniform(0.3, 1.1), rng.uniform(1.6, 1.8)], p=[0.45, 0.25, 0.3])
             doors.append(Door(wall, along, rng.uniform(0.85, 1.1), label, opened, rng.choice([-1.0, 1.0])))
-    visits = _choose_visits(plan, doors, rng)
+    # Visits by the index of their door: in random order up to the route's largest length, one to a room, and none too
+    # close on the loop to another.
+    length, longest = loop_length(plan.loop), rng.uniform(*_ROUTE_LENGTHS_M)
+    visits: dict[int, _Visit] = {}
+    for k in rng.permutation(len(doors)).tolist():
+        visit = _visit(plan, doors[k], rng)
+        if visit is None or any(
+            visit.door.room == other.door.room or (visit.leg == other.leg and abs(visit.along - other.along) < 1.0)
+            for other in visits.values()
+        ):
+            continue
+        if length + loop_length(visit.path) <= longest:
+            visits[k] = visit
+            length += loop_length(visit.path)
     # A second door into a visited room is shut: its leaf would obstruct the route.
     visited = {visit.door.room for visit in visits.values()}
-    doors = [replace(door, opened=0.0) if door.room in visited else door for door in doors]
+    doors = [door._replace(opened=0.0) if door.room in visited else door for door in doors]
     doors = [visits[k].door if k in visits else door for k, door in enumerate(doors)]
     parts: list[FloatArray] = []
     for leg, corner in enumerate(plan.loop):
@@ -202,21 +204,6 @@ def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]
         parts += [corner[None], *(visit.path for visit in visited_here)]
     way = np.concatenate(parts)
     return doors, Route(np.column_stack([way, np.zeros(len(way))]), 0.3, 0.4, _DOOR_HEIGHT_M - 0.07, 1.2)
-
-
-def _choose_visits(plan: Plan, doors: list[Door], rng: np.random.Generator) -> dict[int, _Visit]:
-    """Visits by the index of their door: in random order up to the route's largest length."""
-    length = loop_length(plan.loop)
-    longest = rng.uniform(*_ROUTE_LENGTHS_M)
-    chosen: dict[int, _Visit] = {}
-    for k in rng.permutation(len(doors)).tolist():
-        visit = _visit(plan, doors[k], rng)
-        if visit is None or any(map(visit.excludes, chosen.values())):
-            continue
-        if length + loop_length(visit.path) <= longest:
-            chosen[k] = visit
-            length += loop_length(visit.path)
-    return chosen
 
 
 def _visit(plan: Plan, door: Door, rng: np.random.Generator) -> _Visit | None:
@@ -235,7 +222,7 @@ def _visit(plan: Plan, door: Door, rng: np.random.Generator) -> _Visit | None:
     near, far, aside = threshold + _TURN_M * inwards, threshold + depth * inwards, across * (side * wall.direction)
     path = np.stack([start, near, near + aside, far + aside, far, start])
     # The leaf hangs on the side that the path does not turn to, and opens back to the wall.
-    open_door = replace(door, width=rng.uniform(1.1, 1.2), opened=rng.uniform(1.65, 1.8), hinge=-side)
+    open_door = door._replace(width=rng.uniform(1.1, 1.2), opened=rng.uniform(1.65, 1.8), hinge=-side)
     return _Visit(open_door, index, along, path)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.world import Grass, HeightField, Route
 from lidarslam.simulation.worlds import paths
-from lidarslam.simulation.worlds.building import Builder, rotation_z, smooth_noise, starting
+from lidarslam.simulation.worlds.building import Builder, heading, rotation_z, smooth_noise, starting
 
 # Feet extend this far down, so that nothing hovers on a slope.
 SUNK_M = 0.3
@@ -37,7 +37,9 @@ class Grounds:
 
     def beside(self, index: int, left_m: float) -> tuple[FloatArray, float]:
         """A place (2,) to the left of a point of the path, counted round and round, and the path's heading there."""
-        return paths.beside_loop(self.path, index % len(self.path), left_m)
+        path, count = self.path, len(self.path)
+        yaw = heading(path[(index % count + 1) % count] - path[index % count - 1])
+        return path[index % count] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
     def off_path(self, xy: FloatArray) -> float:
         """Distance of the nearest of points (..., 2) from the path."""
@@ -73,12 +75,12 @@ def car(rng: np.random.Generator, round_wheels: bool = True) -> Builder:
     waist, roof = (1.05, rng.uniform(1.9, 2.3)) if is_van else (rng.uniform(0.82, 0.95), rng.uniform(1.4, 1.55))
     bonnet, boot = rng.uniform(0.26, 0.32) * length, rng.uniform(0.06, 0.2) * length
     bonnet, boot = (0.25 * length, 0.02) if is_van else (bonnet, boot)
-    part.block((-a, a), (-b, b), (0.22, waist - 0.12))
-    part.block((-a + 0.1, a - bonnet + 0.1), (-b + 0.05, b - 0.05), (waist - 0.2, waist))
-    part.block((a - bonnet, a - 0.15), (-b + 0.08, b - 0.08), (waist - 0.3, waist - 0.06))
     slant = 0.35 if is_van else 0.5
     front, back = a - bonnet - slant, -a + boot + 0.3 * (not is_van)
-    part.block((back, front), (-b + 0.1, b - 0.1), (waist - 0.1, roof))
+    part.blocks(
+        (a, b, 0.22, waist - 0.12), (-a + 0.1, a - bonnet + 0.1, b - 0.05, waist - 0.2, waist),
+        (a - bonnet, a - 0.15, b - 0.08, waist - 0.3, waist - 0.06), (back, front, b - 0.1, waist - 0.1, roof),
+    )  # fmt: skip
     for foot, head in ((front + slant, front - 0.03), (back - 0.28 * (not is_van) - 0.03, back + 0.02)):
         part.beam((foot, 0.0, waist - 0.06), (head, 0.0, roof - 0.05), width - 0.22, 0.08)
     for side in (-1.0, 1.0):
@@ -99,23 +101,20 @@ def pedestrian(rng: np.random.Generator) -> Builder:
         stride = side * rng.uniform(0.08, 0.16)
         part.beam((2.2 * stride, side * 0.09, -0.05), (0.0, side * 0.09, 0.88 * tall), 0.14, 0.16)
         part.beam((-1.8 * stride, side * 0.27, 0.8 * tall), (0.0, side * 0.25, 1.42 * tall), 0.09, 0.1)
-    part.block((-0.12, 0.13), (-0.21, 0.21), (0.82 * tall, 1.46 * tall))
-    part.block((-0.09, 0.11), (-0.08, 0.08), (1.46 * tall, 1.75 * tall))
+    part.blocks((-0.12, 0.13, 0.21, 0.82 * tall, 1.46 * tall), (-0.09, 0.11, 0.08, 1.46 * tall, 1.75 * tall))
     return part
 
 
 def lamp_post(height: float, reach: float) -> Builder:
     """A tapering lamp post with its arm along x; with no reach, a lantern on top."""
     part = Builder()
-    part.pole((0.0, 0.0), (-SUNK_M, 1.1), 0.1)
-    part.pole((0.0, 0.0), (1.1, height), 0.065)
+    part.poles((0.0, 0.0, -SUNK_M, 1.1, 0.1), (0.0, 0.0, 1.1, height, 0.065))
     if reach > 0.0:
         tip = (reach, 0.0, height + 0.25)
         part.cylinder((0.0, 0.0, height - 0.05), tip, 0.045)
         part.box(tip, (0.7, 0.28, 0.13))
     else:
-        part.block((-0.22, 0.22), (-0.22, 0.22), (height - 0.05, height + 0.35))
-        part.block((-0.3, 0.3), (-0.3, 0.3), (height + 0.35, height + 0.42))
+        part.blocks((0.22, 0.22, height - 0.05, height + 0.35), (0.3, 0.3, height + 0.35, height + 0.42))
     return part
 
 
@@ -156,8 +155,7 @@ def bin_row(rng: np.random.Generator, count: int) -> Builder:
 def litter_bin() -> Builder:
     """A round litter bin."""
     part = Builder()
-    for z, radius in (((-SUNK_M, 0.85), 0.24), ((0.95, 1.0), 0.26), ((0.8, 1.0), 0.03)):
-        part.pole((0.0, 0.0), z, radius)
+    part.poles((0.0, 0.0, -SUNK_M, 0.85, 0.24), (0.0, 0.0, 0.95, 1.0, 0.26), (0.0, 0.0, 0.8, 1.0, 0.03))
     return part
 
 
@@ -165,10 +163,10 @@ def bus_shelter(rng: np.random.Generator) -> Builder:
     """A shelter open towards x, its back along y."""
     part = Builder()
     half = 0.5 * rng.uniform(3.0, 4.2)
-    part.block((-0.75, 0.7), (-half, half), (2.35, 2.47))
-    part.block((-0.72, -0.68), (-half, half), (0.15, 2.35))
-    part.block((-0.7, 0.35), (half - 0.05, half), (0.15, 2.35))
-    part.block((-0.6, -0.25), (-0.6 * half, 0.6 * half), (0.42, 0.48))
+    part.blocks(
+        (-0.75, 0.7, half, 2.35, 2.47), (-0.72, -0.68, half, 0.15, 2.35),
+        (-0.7, 0.35, half - 0.05, half, 0.15, 2.35), (-0.6, -0.25, 0.6 * half, 0.42, 0.48),
+    )  # fmt: skip
     for x, y in ((-0.7, -half + 0.05), (-0.7, half - 0.05), (0.6, -half + 0.05), (0.6, half - 0.05), (-0.5, 0.0)):
         part.pole((x, y), (-SUNK_M, 2.4 if y else 0.44), 0.04)
     return part
@@ -182,8 +180,8 @@ def log_pile(rng: np.random.Generator, rows: int) -> Builder:
         y, z = (2.0 * k - (rows - level - 1)) * radius, radius * (0.7 + 1.74 * level)
         shift, r = rng.normal(0.0, 0.08), radius * rng.uniform(0.85, 1.0)
         part.cylinder((shift - half, y, z), (shift + half, y, z), r)
-    for x, side in product((-0.6 * half, 0.6 * half), (-1.0, 1.0)):
-        part.pole((x, side * (rows * radius + 0.06)), (-SUNK_M, 1.3), 0.05)
+    for x in (-0.6 * half, 0.6 * half):
+        part.poles(*((x, side * (rows * radius + 0.06), -SUNK_M, 1.3, 0.05) for side in (-1.0, 1.0)))
     return part
 
 
@@ -285,8 +283,8 @@ def fallen_trunk(rng: np.random.Generator, length: float, radius: float) -> Buil
     """A lying trunk along x, its middle at the origin, half sunk, with stubs of boughs and a plate of roots."""
     part = Builder()
     half, low = 0.5 * length, 0.6 * radius
-    part.cylinder((-half, 0.0, low), (0.1 * half, 0.0, low), radius)
-    part.cylinder((0.1 * half, 0.0, low), (half, 0.0, low), 0.75 * radius)
+    for start, end, thick in ((-half, 0.1 * half, radius), (0.1 * half, half, 0.75 * radius)):
+        part.cylinder((start, 0.0, low), (end, 0.0, low), thick)
     for x in rng.uniform(-0.2 * half, 0.9 * half, int(rng.integers(2, 5))):
         angle = rng.uniform(0.2, np.pi - 0.2)
         tip = np.array([x + 0.3, np.cos(angle), low + np.sin(angle)]) * [1.0, 0.9, 0.9]

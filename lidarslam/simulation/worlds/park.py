@@ -5,7 +5,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import Builder, around, smooth_noise
+from lidarslam.simulation.worlds.building import Builder, around, relief
 from lidarslam.simulation.worlds.outdoor import Grounds, beside
 
 _CELL_M = 0.5
@@ -19,7 +19,13 @@ def build(seed: int) -> World:
     """A park; the path has something upright in sight everywhere, but little of it."""
     rng = np.random.default_rng(seed)
     path = paths.winding_loop(rng, rng.uniform(240.0, 390.0), 4, 0.35, 12.0)
-    ground = _ground(rng, path)
+    low, nodes = paths.grid_around(path, _MARGIN_M, _CELL_M)
+    distance = paths.distance_to_loop(nodes, path)
+    # Swells some 25 m wide and up to a few metres high; the path itself is smoother than the grass.
+    heights = relief(rng, distance.shape, (rng.uniform(0.9, 1.5), 22.0 / _CELL_M))
+    on_grass = np.clip((distance - 1.0) / 1.5, 0.1, 1.0)
+    heights += on_grass * relief(rng, distance.shape, (0.03, 1.5 / _CELL_M), (0.012, 0.7))
+    ground = HeightField(low, _CELL_M, heights - 0.06 * (1.0 - on_grass))
     grounds = Grounds(rng, path, ground)
     _along_the_path(grounds)
     pavilion = _pavilion(grounds)
@@ -28,17 +34,6 @@ def build(seed: int) -> World:
     route = Route(paths.on_ground(paths.resample_loop(path, 2.0), ground), 3.0, _FREE_SIDE_M, 3.0, 6.0)
     grounds.prune(route)
     return World("park", seed, route, *grounds.solid.solids, (ground,), _strollers(grounds), map_spacing_m=0.1)
-
-
-def _ground(rng: np.random.Generator, path: FloatArray) -> HeightField:
-    """Swells some 25 m wide and up to a few metres high; the path itself is smoother than the grass."""
-    low = np.floor(path.min(axis=0) - _MARGIN_M)
-    distance = paths.distance_to_loop(paths.grid_nodes(low, path.max(axis=0) + _MARGIN_M, _CELL_M), path)
-    shape = distance.shape
-    on_grass = np.clip((distance - 1.0) / 1.5, 0.1, 1.0)
-    heights = rng.uniform(0.9, 1.5) * smooth_noise(rng, shape, 22.0 / _CELL_M)
-    heights += on_grass * (0.03 * smooth_noise(rng, shape, 1.5 / _CELL_M) + 0.012 * smooth_noise(rng, shape, 0.7))
-    return HeightField(low, _CELL_M, heights - 0.06 * (1.0 - on_grass))
 
 
 def _along_the_path(grounds: Grounds) -> None:
@@ -68,16 +63,16 @@ def _pavilion(grounds: Grounds) -> FloatArray:
         index, side = int(rng.integers(len(grounds.path))), rng.choice([-1.0, 1.0])
         where, yaw = grounds.beside(index, side * (0.75 * size + 4.0))
     part, half = Builder(), 0.5 * size
-    part.block((-half - 0.3, half + 0.3), (-half - 0.3, half + 0.3), (-1.2, 0.18))
-    for x in np.linspace(-half, half, 3):
-        for y in (-half, half):
-            part.pole((x, y), (-1.2, high), 0.14)
-    part.block((-half, half), (half - 0.1, half + 0.1), (0.1, high))  # the back wall
-    part.block((-half + 0.3, half - 0.3), (half - 0.6, half - 0.1), (0.1, 0.6))
+    part.blocks((half + 0.3, half + 0.3, -1.2, 0.18))
+    part.poles(*((x, y, -1.2, high, 0.14) for x in np.linspace(-half, half, 3) for y in (-half, half)))
+    # the back wall and a seat along it
+    part.blocks(
+        (-half, half, half - 0.1, half + 0.1, 0.1, high), (-half + 0.3, half - 0.3, half - 0.6, half - 0.1, 0.1, 0.6)
+    )
     for y in (-half - 0.6, half + 0.6):
         part.beam((0.0, y, high - 0.15), (0.0, 0.0, high + 0.3 * size), size + 1.0, 0.12)
     part.block(around((-half, half), 0.08), (-0.12, 0.12), (high, high + 0.28 * size))
-    part.block((-half - 0.2, half + 0.2), (-half - 0.2, half + 0.2), (high - 0.2, high))
+    part.blocks((half + 0.2, half + 0.2, high - 0.2, high))
     grounds.put(part, where, yaw)
     return np.append(where, 0.75 * size)
 

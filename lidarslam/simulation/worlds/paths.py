@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route
-from lidarslam.simulation.worlds.building import Builder, heading, left_of
+from lidarslam.simulation.worlds.building import Builder, left_of
 
 
 def loop_length(loop: FloatArray) -> float:
@@ -109,16 +109,16 @@ def distance_to_loop(xy: FloatArray, loop: FloatArray, farthest_m: float = np.in
     return np.minimum(distance, farthest_m)
 
 
-def beside_loop(loop: FloatArray, index: int, left_m: float) -> tuple[FloatArray, float]:
-    """A place (2,) to the left of a point of the closed polyline (M, 2), and the polyline's heading there."""
-    yaw = heading(loop[(index + 1) % len(loop)] - loop[index - 1])
-    return loop[index] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
-
-
 def grid_nodes(low: FloatArray, high: FloatArray, cell_m: float) -> FloatArray:
     """Nodes (X, Y, 2) of a regular grid from the corner low to the corner high (2,) or a little beyond."""
     counts = np.ceil((high - low) / cell_m).astype(int) + 1
     return np.asarray(low + cell_m * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1))
+
+
+def grid_around(points: FloatArray, margin_m: float, cell_m: float) -> tuple[FloatArray, FloatArray]:
+    """The lowest node (2,) of a grid that reaches that far around points (N, 2), at whole metres, and all (X, Y, 2)."""
+    low = np.floor(points.min(axis=0) - margin_m)
+    return low, grid_nodes(low, points.max(axis=0) + margin_m, cell_m)
 
 
 def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:

@@ -65,7 +65,13 @@ def build(seed: int) -> World:
     plan = StairPlan(storeys, steps, width, shaft, landing, rng.uniform(4.0, 6.0))
     builder, route = Builder(), _route(plan)
     for number in range(2 * plan.storeys):
-        _draw_flight(plan, number, builder)
+        flight, half = plan.flight(builder, number), 0.5 * plan.width
+        for k in range(1, plan.steps):
+            flight.block(((k - 1) * TREAD_M, k * TREAD_M), (-half, half), ((k - 1) * RISE_M - 0.1, k * RISE_M))
+        slab = (plan.climb - _SLAB_M, plan.climb)
+        flight.block((plan.run, plan.run + plan.landing), (-half, plan.across - half), slab)
+        rail = half - _RAIL_ASIDE_M
+        draw_railing(flight.point(0.0, rail, RISE_M), flight.point(plan.run, rail, plan.climb), builder)
     top = plan.flight(builder, 2 * plan.storeys)
     draw_railing(top.point(0.0, -0.5 * plan.width), top.point(0.0, 0.5 * plan.width + plan.shaft), builder)
     _draw_shell(plan, builder, Clearance(route), rng)
@@ -87,16 +93,6 @@ def _route(plan: StairPlan) -> Route:
     lobby = np.array([[-0.5 * plan.landing, near, 0.0], [-0.5 * plan.landing, far, 0.0], [start, far, 0.0]])
     waypoints = np.concatenate([[[start, near, 0.0]], up, up[-2::-1], lobby])
     return Route(waypoints, 0.3, _FREE_SIDE_M, _FREE_HEIGHT_M, _SPEED_LIMIT_MPS)
-
-
-def _draw_flight(plan: StairPlan, number: int, builder: Builder) -> None:
-    flight, half = plan.flight(builder, number), 0.5 * plan.width
-    for k in range(1, plan.steps):
-        flight.block(((k - 1) * TREAD_M, k * TREAD_M), (-half, half), ((k - 1) * RISE_M - 0.1, k * RISE_M))
-    slab = (plan.climb - _SLAB_M, plan.climb)
-    flight.block((plan.run, plan.run + plan.landing), (-half, plan.across - half), slab)
-    aside = half - _RAIL_ASIDE_M
-    draw_railing(flight.point(0.0, aside, RISE_M), flight.point(plan.run, aside, plan.climb), builder)
 
 
 def _draw_shell(plan: StairPlan, builder: Builder, clearance: Clearance, rng: np.random.Generator) -> None:

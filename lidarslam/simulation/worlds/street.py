@@ -1,8 +1,8 @@
 """City streets round one block or two: houses, kerbs, parked and oncoming cars, trees, poles, people."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
-from lidarslam.simulation.worlds.building import Builder, Vector, heading, left_of, smooth_noise
+from lidarslam.simulation.worlds.building import Builder, Vector, heading, left_of, relief
 from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
 
@@ -106,27 +106,20 @@ class Quarter:
         """Middle lines of the kerb's stones, from (2,) to (2,)."""
         middle = RISE_M - 0.5 * KERB_WIDTH_M
         for side in self.sides():
-            first, until_end = (
-                _REACH_M if self.arms(self._node(at))[int((_DIRECTIONS @ side.outward).argmax())] else 0.0
-                for at in (side.start, side.at(side.length_m, 0.0))
-            )
+            nodes = (np.abs(self.nodes - at).sum(axis=1).argmin() for at in (side.start, side.at(side.length_m, 0.0)))
+            outward = int((_DIRECTIONS @ side.outward).argmax())
+            first, until_end = (_REACH_M if self.arms(int(node))[outward] else 0.0 for node in nodes)
             last = side.length_m - until_end
             at = np.linspace(first, last, max(2, 1 + round((last - first) / STONE_M)))
             yield from pairwise(side.start + at[:, None] * side.along + (HALF_WIDTH_M + middle) * side.outward)
         for node, one, other, streets in self.corners():
+            # An arc between the directions: inside a corner, or, where no street leads to either side, round an end.
+            at, ahead, aside, radius = node, one, other, HALF_WIDTH_M + middle
             if streets == 2:
-                yield from pairwise(_arc(node + _REACH_M * (one + other), -one, -other, _FILLET_M - middle))
-            elif streets == 0:
-                yield from pairwise(_arc(node, one, other, HALF_WIDTH_M + middle))
-
-    def _node(self, at: FloatArray) -> int:
-        return int(np.abs(self.nodes - at).sum(axis=1).argmin())
-
-
-def _arc(centre: FloatArray, one: FloatArray, other: FloatArray, radius: float) -> FloatArray:
-    """Points (N, 2) on a quarter of a circle between two directions."""
-    angle = np.linspace(0.0, 0.5 * np.pi, max(4, round(radius / 0.6)))[:, None]
-    return np.asarray(centre + radius * (np.cos(angle) * one + np.sin(angle) * other))
+                at, ahead, aside, radius = node + _REACH_M * (one + other), -one, -other, _FILLET_M - middle
+            angle = np.linspace(0.0, 0.5 * np.pi, max(4, round(radius / 0.6)))[:, None]
+            if streets != 1:
+                yield from pairwise(at + radius * (np.cos(angle) * ahead + np.sin(angle) * aside))
 
 
 def rectangle(low: Vector, high: Vector) -> FloatArray:
@@ -136,8 +129,7 @@ def rectangle(low: Vector, high: Vector) -> FloatArray:
 
 def draw_quarter(rng: np.random.Generator) -> Quarter:
     """One block of 80 to 110 m, or two of 56 to 66 m with a tour in a figure of eight."""
-    is_double = bool(rng.random() < 0.4)
-    pavement = rng.uniform(3.4, 4.2)
+    is_double, pavement = bool(rng.random() < 0.4), rng.uniform(3.4, 4.2)
     if is_double:
         west, east = -float(rng.integers(56, 66)), float(rng.integers(56, 66))
         outline = rectangle((west, 0.0), (east, float(rng.integers(52, 62))))
@@ -149,8 +141,7 @@ def draw_quarter(rng: np.random.Generator) -> Quarter:
         outline = rectangle((0.0, 0.0), (float(rng.integers(80, 111)), float(rng.integers(80, 111))))
         tour = outline if rng.random() < 0.5 else outline[::-1]
         oncoming, blocks = tour[::-1], outline[None, [0, 2]]
-    nodes, edges = _draw_streets(rng, outline, is_double)
-    return Quarter(nodes, edges, pavement, tour, oncoming, blocks)
+    return Quarter(*_draw_streets(rng, outline, is_double), pavement, tour, oncoming, blocks)
 
 
 def _draw_streets(
@@ -185,8 +176,7 @@ def _draw_streets(
     return np.array(nodes), tuple(edges)
 
 
-@dataclass(frozen=True, eq=False)
-class Lot:
+class Lot(NamedTuple):
     """Land for one house, to the left of its front."""
 
     origin: FloatArray  # (2,) left end of the house's front as seen from within
@@ -200,20 +190,19 @@ class Lot:
         """(2,) from the street into the house."""
         return left_of(self.along)
 
-    @cached_property
-    def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Its lowest and highest corner (2,)."""
-        far = self.origin + self.width * self.along + self.depth * self.inward
+    def bounds(self, further_m: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Its lowest and highest corner (2,), that much deeper than it is."""
+        far = self.origin + self.width * self.along + (self.depth + further_m) * self.inward
         return np.minimum(self.origin, far), np.maximum(self.origin, far)
 
     def is_free(self, plan: Quarter, others: list["Lot"]) -> bool:
         """Whether it is on no street and on no other lot."""
-        far = self.origin + self.width * self.along + (self.depth + self.setback_m) * self.inward
-        low, high = np.minimum(self.origin, far) + 0.02, np.maximum(self.origin, far) - 0.02
+        low, high = self.bounds(self.setback_m)
+        low, high = low + 0.02, high - 0.02
         ends = plan.middle_lines
         if ((low < ends[:, 1] + plan.front_m) & (high > ends[:, 0] - plan.front_m)).all(axis=1).any():
             return False
-        return not any((low < far).all() and (high > near).all() for near, far in (other.bounds for other in others))
+        return not any((low < far).all() and (high > near).all() for near, far in (other.bounds() for other in others))
 
 
 def draw_lots(plan: Quarter, rng: np.random.Generator) -> tuple[list[Lot], list[Lot]]:
@@ -231,7 +220,7 @@ def draw_lots(plan: Quarter, rng: np.random.Generator) -> tuple[list[Lot], list[
             if fitting is None:
                 at += 0.5
                 continue
-            lots.append(replace(fitting, origin=fitting.origin + fitting.setback_m * fitting.inward))
+            lots.append(fitting._replace(origin=fitting.origin + fitting.setback_m * fitting.inward))
             at += fitting.width
             if rng.random() < 0.22:
                 gap = Lot(start + at * along, along, rng.uniform(2.5, 7.0), 6.0)
@@ -303,10 +292,9 @@ def lay_ground(rng: np.random.Generator, plan: Quarter, hills_m: tuple[float, fl
     """Gentle slopes of that deviation, with the surface of the streets on them."""
     margin = plan.front_m + 20.0
     # Nodes are at whole metres, so that a kerb is at grid points.
-    low = np.floor(plan.nodes.min(axis=0) - margin)
-    nodes = paths.grid_nodes(low, plan.nodes.max(axis=0) + margin, RISE_M)
+    low, nodes = paths.grid_around(plan.nodes, margin, RISE_M)
     kerb = plan.kerb_distance(nodes.reshape(-1, 2)).reshape(nodes.shape[:2])
-    heights = rng.uniform(*hills_m) * smooth_noise(rng, kerb.shape, 40.0 / RISE_M)
+    heights = relief(rng, kerb.shape, (rng.uniform(*hills_m), 40.0 / RISE_M))
     return HeightField(low, RISE_M, pave(rng, heights, kerb, RISE_M, HALF_WIDTH_M))
 
 
@@ -314,8 +302,7 @@ def pave(
     rng: np.random.Generator, hills: FloatArray, kerb: FloatArray, cell_m: float, half_width_m: float
 ) -> FloatArray:
     """Hills (X, Y) with a cambered road, pavements a kerb higher, and roughness, by the kerb's distance (X, Y)."""
-    shape = hills.shape
-    heights = hills + (0.02 * smooth_noise(rng, shape, 3.0 / cell_m) + 0.005 * smooth_noise(rng, shape, 0.7))
+    heights = hills + relief(rng, hills.shape, (0.02, 3.0 / cell_m), (0.005, 0.7))
     heights += _KERB_HEIGHT_M * np.clip(kerb / cell_m, 0.0, 1.0)
     return np.asarray(heights + 0.08 * (1.0 - (1.0 - np.clip(-kerb / half_width_m, 0.0, 1.0)) ** 2))
 
@@ -342,7 +329,7 @@ def _is_open(plan: Quarter, lots: list[Lot], lot: Lot, x: float) -> bool:
     beside = lot.origin + x * lot.along + 3.0 * lot.inward
     if plan.kerb_distance(beside[None])[0] > plan.pavement_m + 8.0:
         return False
-    return not any((low < beside).all() and (beside < high).all() for low, high in (one.bounds for one in lots))
+    return not any((low < beside).all() and (beside < high).all() for low, high in (one.bounds() for one in lots))
 
 
 def _garden(grounds: Grounds, lot: Lot) -> None:
@@ -414,9 +401,7 @@ def furnish_pavement(
 def traffic(grounds: Grounds, plan: Quarter) -> list[Mover]:
     """Cars on the other lane, all equally fast, so that none catches up with another."""
     rng, waypoints = grounds.rng, paths.on_ground(lane_of(plan.oncoming, 0.25), grounds.ground)
-    count, speed = int(rng.integers(3, 6)), rng.uniform(4.0, 8.0)
-    starts = _starts(rng, count, waypoints)
-    return [Mover(outdoor.car(rng, round_wheels=False).boxes, waypoints, speed, at) for at in starts]
+    return _movers(rng, waypoints, (3, 6), (4.0, 8.0), partial(outdoor.car, round_wheels=False))
 
 
 def people(grounds: Grounds, plan: Quarter) -> list[Mover]:
@@ -426,13 +411,15 @@ def people(grounds: Grounds, plan: Quarter) -> list[Mover]:
         corners = rectangle(low + plan.front_m - 1.0, high - plan.front_m + 1.0)[:: rng.choice([-1, 1])]
         loop = paths.subdivide_loop(paths.round_corners(corners, np.full(4, 1.5), 0.25), 5.0)
         waypoints = paths.on_ground(loop, grounds.ground)
-        count, speed = int(rng.integers(2, 5)), rng.uniform(0.9, 1.5)
-        starts = _starts(rng, count, waypoints)
-        movers += [Mover(outdoor.pedestrian(rng).boxes, waypoints, speed, at) for at in starts]
+        movers += _movers(rng, waypoints, (2, 5), (0.9, 1.5), outdoor.pedestrian)
     return movers
 
 
-def _starts(rng: np.random.Generator, count: int, waypoints: FloatArray) -> list[float]:
-    """Start positions of `count` movers along a closed polyline, spread unevenly."""
-    at = paths.loop_length(waypoints) * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
-    return [float(one) for one in at]
+def _movers(
+    rng: np.random.Generator, waypoints: FloatArray, counts: tuple[int, int], speeds_mps: tuple[float, float],
+    draw: Callable[[np.random.Generator], Builder],
+) -> list[Mover]:  # fmt: skip
+    """Some of a kind on a closed polyline, equally fast, spread unevenly."""
+    count, speed = int(rng.integers(*counts)), rng.uniform(*speeds_mps)
+    starts = paths.loop_length(waypoints) * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
+    return [Mover(draw(rng).boxes, waypoints, speed, float(at)) for at in starts]

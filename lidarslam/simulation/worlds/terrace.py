@@ -20,7 +20,11 @@ _GRASS_M = 0.1
 def build(seed: int) -> World:
     """Two long terraces back to back, and the same across the street; lamp posts repeat with the houses."""
     rng = np.random.default_rng(seed)
-    plan = _draw_block(rng)
+    # One long, narrow block: two streets of about 400 m, and two short ones that join them.
+    outline = street.rectangle((0.0, 0.0), (float(rng.integers(380, 461)), float(rng.integers(56, 71))))
+    tour = outline if rng.random() < 0.5 else outline[::-1]
+    edges = tuple((k, (k + 1) % 4) for k in range(4))
+    plan = street.Quarter(outline, edges, rng.uniform(3.4, 4.2), tour, tour[::-1], outline[None, [0, 2]])
     ground = street.lay_ground(rng, plan, _HILLS_M)
     grounds = Grounds(rng, plan.tour, ground)
     width, depth = rng.uniform(5.2, 6.8), rng.uniform(8.0, 9.5)
@@ -43,11 +47,3 @@ def build(seed: int) -> World:
     verge = np.minimum(kerb - _VERGE_M[0], _VERGE_M[1] - kerb)
     grass = outdoor.grass(rng, ground, np.full(kerb.shape, _GRASS_M), verge)
     return World("terrace", seed, route, *grounds.solid.solids, (ground,), movers, map_spacing_m=0.1, grass=grass)
-
-
-def _draw_block(rng: np.random.Generator) -> street.Quarter:
-    """One long, narrow block: two streets of about 400 m, and two short ones that join them."""
-    outline = street.rectangle((0.0, 0.0), (float(rng.integers(380, 461)), float(rng.integers(56, 71))))
-    tour = outline if rng.random() < 0.5 else outline[::-1]
-    edges = tuple((k, (k + 1) % 4) for k in range(4))
-    return street.Quarter(outline, edges, rng.uniform(3.4, 4.2), tour, tour[::-1], outline[None, [0, 2]])

@@ -66,7 +66,12 @@ def build(seed: int) -> World:
     lane = lane_of(nodes[draw_tour(rng, len(nodes), streets)], 1.0)
     rng = np.random.default_rng(seed)  # what stands there does not depend on how long a tour was looked for
     course = Course.along(np.concatenate([lane, lane[:1]]))
-    ground = _ground(rng, course)
+    low = np.floor(course.points.min(axis=0) - _MARGIN_M)
+    high = course.points.max(axis=0) + _MARGIN_M
+    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
+    distance = np.asarray(course.tree.query(grid_nodes(low, high, cell))[0])
+    hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
+    ground = HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
     route = Route(on_ground(lane, ground), 2.0, FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
     taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
     rows = _Rows(Grounds(rng, course.points, ground), course, taken)
@@ -87,11 +92,11 @@ def draw_network(rng: np.random.Generator) -> tuple[FloatArray, list[tuple[int, 
     grid = np.arange(_ROWS * _ROWS).reshape(_ROWS, _ROWS)
     nodes = rng.uniform(*_SPACING_M) * np.stack(np.divmod(grid.ravel(), _ROWS), axis=1)
     nodes = nodes + rng.uniform(-_SHIFT_M, _SHIFT_M, nodes.shape)
-    pairs = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in
-                            ((grid[:-1], grid[1:]), (grid[:, :-1], grid[:, 1:]))])  # fmt: skip
-    streets = [(int(a), int(b)) for a, b in pairs]
+    ways = ((grid[:-1], grid[1:]), (grid[:, :-1], grid[:, 1:]))
+    pairs = [pair for a, b in ways for pair in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)]
+    streets = pairs
     for left_out in rng.permutation(len(pairs)).tolist():
-        fewer = [street for street in streets if street != tuple(pairs[left_out].tolist())]
+        fewer = [street for street in streets if street != pairs[left_out]]
         if len(pairs) - len(streets) < _LEFT_OUT and np.bincount(np.ravel(fewer), minlength=len(nodes)).min() > 1:
             streets = fewer
     return nodes, streets
@@ -104,28 +109,24 @@ def draw_tour(rng: np.random.Generator, crossings: int, streets: list[tuple[int,
     round has become longer, these choices end as a single round.
     """
     around = [[b if a == node else a for a, b in streets if node in (a, b)] for node in range(crossings)]
-    leaves = [_turns(rng, len(nodes)) for nodes in around]
+    leaves = {node: _turns(rng, len(nodes)) for node, nodes in enumerate(around)}
     tour = _round(around, leaves, streets[0])
     while len(tour) < 2 * len(streets):
         node = int(rng.integers(crossings))
-        before, leaves[node] = leaves[node], _turns(rng, len(around[node]))
-        other = _round(around, leaves, streets[0])
-        if len(other) < len(tour) and rng.random() > 0.1:
-            leaves[node] = before
-        else:
-            tour = other
+        tried = leaves | {node: _turns(rng, len(around[node]))}
+        other = _round(around, tried, streets[0])
+        if len(other) >= len(tour) or rng.random() <= 0.1:
+            leaves, tour = tried, other
     return tour
 
 
 def _turns(rng: np.random.Generator, count: int) -> NDArray[np.intp]:
     """(count,) the street by which to leave after arriving by each of `count`, never the same."""
-    while True:
-        leave = rng.permutation(count)
-        if (leave != np.arange(count)).all():
-            return leave
+    leave = rng.permutation(count)
+    return leave if (leave != np.arange(count)).all() else _turns(rng, count)
 
 
-def _round(around: list[list[int]], leaves: list[NDArray[np.intp]], first: tuple[int, int]) -> list[int]:
+def _round(around: list[list[int]], leaves: dict[int, NDArray[np.intp]], first: tuple[int, int]) -> list[int]:
     """The crossings from the first street until it is taken again."""
     tour, (start, end) = [first[0]], first
     while True:
@@ -181,15 +182,6 @@ class Course:
         """Distance (M,) of points (M, 2) from the nearest part of the course."""
         nearest = self.tree.query(xy)[0]
         return np.asarray(np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0)))  # nearer between two points
-
-
-def _ground(rng: np.random.Generator, course: Course) -> HeightField:
-    low = np.floor(course.points.min(axis=0) - _MARGIN_M)
-    high = course.points.max(axis=0) + _MARGIN_M
-    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
-    distance = np.asarray(course.tree.query(grid_nodes(low, high, cell))[0])
-    hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
-    return HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """A mine in rough rock: a loop of changing width and height, side galleries, and things left in them."""
 
-from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, minimum_filter1d
@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
 from lidarslam.simulation.worlds.building import UP, Builder, heading, left_of, smooth_noise
-from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, points_along
+from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along
 
 _SPACING_M = 0.25
+_STATION_M = 1.0
 _STEEPEST = 0.08
 _FREE_SIDE_M, _FREE_HEIGHT_M = 0.8, 2.05
 
@@ -21,17 +22,20 @@ def build(seed: int) -> World:
     """The tunnel of that seed: ground and roof as height fields that meet in the walls, a loop of 150 to 300 m."""
     rng = np.random.default_rng(seed)
     galleries, pillars = draw_mine(rng)
-    rock = carve(galleries, pillars, rng)
-    loop = galleries[0]
-    builder = _fit_out(_Stations.along(loop, rock, rng))
-    waypoints = loop.line[:: round(1.5 / _SPACING_M)].copy()
-    waypoints[:, 2] = rock.ground.height_at(waypoints[:, :2])
-    route = Route(waypoints, 0.4, _FREE_SIDE_M, _FREE_HEIGHT_M, 1.5)
-    return World("tunnel", seed, route, *builder.solids, (rock.ground, rock.roof))
+    ground, roof = carve(galleries, pillars, rng)
+    line, every = galleries[0].line, round(_STATION_M / _SPACING_M)
+    floor = on_ground(line[::every, :2], ground)
+    stations = _Stations(floor, _loop_lefts(line)[::every], galleries[0].half_widths[::every], ground, roof, rng)
+    for fit, (fewest, most) in ((_lay_pipe, (3, 6)), (_hang_cable, (2, 4)), (_set_supports, (2, 5))):
+        for _ in range(int(rng.integers(fewest, most))):
+            fit(stations)
+    for place in (_lay_rails, _hang_lamps, _drop_rocks, _leave_things):
+        place(stations)
+    route = Route(on_ground(line[:: round(1.5 / _SPACING_M), :2], ground), 0.4, _FREE_SIDE_M, _FREE_HEIGHT_M, 1.5)
+    return World("tunnel", seed, route, *stations.builder.solids, (ground, roof))
 
 
-@dataclass(frozen=True)
-class Gallery:
+class Gallery(NamedTuple):
     """A drift through the rock."""
 
     line: FloatArray  # (N, 3) middle of its floor, every `_SPACING_M`; the loop's last point is next to its first
@@ -44,11 +48,9 @@ def draw_mine(rng: np.random.Generator) -> tuple[list[Gallery], FloatArray]:
     loop, pillars = _with_chambers(_draw_loop(rng), rng)
     galleries = [loop, _draw_cut(loop, rng)]
     for _ in range(60):
-        if len(galleries) >= 11:
-            break
-        branch = _draw_branch(loop, rng, is_alcove=len(galleries) >= 6)
-        if _keeps_apart(branch, galleries):
-            galleries.append(branch)
+        if len(galleries) < 11:
+            branch = _draw_branch(loop, rng, is_alcove=len(galleries) >= 6)
+            galleries += [branch] if _keeps_apart(branch, galleries) else []
     return galleries, pillars
 
 
@@ -67,24 +69,21 @@ def _draw_loop(rng: np.random.Generator) -> Gallery:
         radius += size * rng.uniform(0.4, 1.0) * np.cos(k * angle + rng.uniform(0.0, 2.0 * np.pi))
     xy = np.stack([rng.uniform(1.0, 1.5) * radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     closed = np.concatenate([xy, xy[:1]])
-    along = lengths_along(closed)
-    length = rng.uniform(155.0, 260.0)
+    along, length = lengths_along(closed), rng.uniform(155.0, 260.0)
     n = round(length / _SPACING_M)
     at = np.arange(n, dtype=np.float64) * (length / n)
     line = points_along(closed * (length / along[-1]), along * length / along[-1], at)
-    z = _waves(rng, n, 3)
-    steepest = float(np.abs(np.roll(z, -1) - z).max()) * n / length
-    z *= rng.uniform(0.6, 1.0) * _STEEPEST / steepest
-    widths, heights = 2.25 + 0.5 * np.tanh(_waves(rng, n, 14)), 3.2 + 0.5 * np.tanh(_waves(rng, n, 9))
+
+    def waves(most: int) -> FloatArray:
+        """(N,) periodic random curve of unit deviation with up to `most` waves."""
+        phase, orders = np.arange(n) * (2.0 * np.pi / n), range(1, most + 1)
+        curve = sum((rng.normal() * np.cos(k * phase + rng.uniform(0.0, 2.0 * np.pi)) for k in orders), np.zeros(n))
+        return np.asarray(curve / curve.std())
+
+    z = waves(3)
+    z *= rng.uniform(0.6, 1.0) * _STEEPEST / (float(np.abs(np.roll(z, -1) - z).max()) * n / length)
+    widths, heights = 2.25 + 0.5 * np.tanh(waves(14)), 3.2 + 0.5 * np.tanh(waves(9))
     return Gallery(np.column_stack([line, z - z[0]]), widths, heights)
-
-
-def _waves(rng: np.random.Generator, n: int, most: int) -> FloatArray:
-    """(N,) periodic random curve of unit deviation with up to `most` waves."""
-    phase = np.arange(n) * (2.0 * np.pi / n)
-    orders = range(1, most + 1)
-    curve = sum((rng.normal() * np.cos(k * phase + rng.uniform(0.0, 2.0 * np.pi)) for k in orders), np.zeros(n))
-    return np.asarray(curve / curve.std())
 
 
 def _with_chambers(loop: Gallery, rng: np.random.Generator) -> tuple[Gallery, FloatArray]:
@@ -109,10 +108,8 @@ def _draw_cut(loop: Gallery, rng: np.random.Generator) -> Gallery:
     """A bowed gallery from one side of the loop to the other."""
     n = len(loop.line)
     start = int(rng.integers(n))
-    end = (start + n // 2 + int(rng.integers(-n // 10, n // 10))) % n
-    a, b = loop.line[start], loop.line[end]
-    across = np.array([a[1] - b[1], b[0] - a[0], 0.0])
-    bend = 0.5 * (a + b) + rng.uniform(-0.3, 0.3) * across
+    a, b = loop.line[start], loop.line[(start + n // 2 + int(rng.integers(-n // 10, n // 10))) % n]
+    bend = 0.5 * (a + b) + rng.uniform(-0.3, 0.3) * np.array([a[1] - b[1], b[0] - a[0], 0.0])
     t = np.linspace(0.0, 1.0, 400)[:, None]
     return _gallery((1 - t) ** 2 * a + 2 * t * (1 - t) * bend + t**2 * b, rng, (1.5, 2.1), (2.6, 3.3))
 
@@ -121,8 +118,7 @@ def _draw_branch(loop: Gallery, rng: np.random.Generator, is_alcove: bool) -> Ga
     """A dead end off the loop: a gallery of 8 to 16 m, or an alcove a few metres deep."""
     k, side = int(rng.integers(len(loop.line))), float(rng.choice([-1.0, 1.0]))
     yaw = heading(_loop_lefts(loop.line)[k] * side) + rng.uniform(-0.5, 0.5)
-    length = loop.half_widths[k] + (rng.uniform(1.2, 2.4) if is_alcove else rng.uniform(8.0, 16.0))
-    at = np.arange(0.0, length, _SPACING_M)
+    at = np.arange(0.0, loop.half_widths[k] + rng.uniform(*((1.2, 2.4) if is_alcove else (8.0, 16.0))), _SPACING_M)
     yaws = yaw + rng.uniform(-0.05, 0.05) * at
     xy = loop.line[k, :2] + np.cumsum(np.stack([np.cos(yaws), np.sin(yaws)], axis=1), axis=0) * _SPACING_M
     z = loop.line[k, 2] + (0.0 if is_alcove else rng.uniform(-_STEEPEST, _STEEPEST)) * np.maximum(at - 2.0, 0.0)
@@ -146,9 +142,9 @@ def _keeps_apart(branch: Gallery, others: list[Gallery]) -> bool:
     outer = branch.line[int(0.5 * len(branch.line)) :]
     for k, other in enumerate(others):
         gaps = np.linalg.norm(outer[:, None, :2] - other.line[None, ::4, :2], axis=2)
-        reach = other.half_widths[None, ::4] + branch.half_widths.max() + 1.2
+        gaps -= other.half_widths[None, ::4] + branch.half_widths.max() + 1.2
         # The loop is near by where the branch begins.
-        near = gaps[-1:] - reach if k == 0 else gaps - reach
+        near = gaps[-1:] if k == 0 else gaps
         if near.min() < (-1.5 if k == 0 and len(branch.line) < 24 else 0.0):
             return False
     return True
@@ -163,28 +159,10 @@ _CORE_M, _HEADROOM_M = 1.75, 2.35
 _BEND_M = 0.12
 # Further than this from a gallery, its rock is solid whatever its width and roughness.
 _REACH_M = 10.0
-_STATION_M = 1.0
 
 
-@dataclass(frozen=True)
-class Rock:
-    """The two surfaces; solid below the ground, above the roof, and where they have crossed."""
-
-    ground: HeightField
-    roof: HeightField
-
-    def reach(self, origins: FloatArray, directions: FloatArray, furthest: float = 6.0) -> FloatArray:
-        """Level distance (N,) from points (N, 3) in air along (N, 2) unit vectors to the rock, at most `furthest`."""
-        steps = np.arange(0.0, furthest, 0.05)
-        points = np.repeat(origins[:, None], len(steps), axis=1)
-        points[:, :, :2] += steps[:, None] * directions[:, None]
-        x_y, z = points[..., :2].reshape(-1, 2), points[..., 2].ravel()
-        solid = ((z < self.ground.height_at(x_y)) | (z > self.roof.height_at(x_y))).reshape(len(origins), len(steps))
-        return np.asarray(np.where(solid.any(axis=1), steps[solid.argmax(axis=1)], furthest))
-
-
-def carve(galleries: list[Gallery], pillars: FloatArray, rng: np.random.Generator) -> Rock:
-    """The rock around the galleries."""
+def carve(galleries: list[Gallery], pillars: FloatArray, rng: np.random.Generator) -> tuple[HeightField, HeightField]:
+    """Ground and roof of the galleries; rock is below the ground, above the roof, and where they have crossed."""
     lines = np.concatenate([gallery.line for gallery in galleries])
     low = lines[:, :2].min(axis=0) - _BORDER_M
     nodes = grid_nodes(low, lines[:, :2].max(axis=0) + _BORDER_M, _CELL_M)
@@ -206,7 +184,7 @@ def carve(galleries: list[Gallery], pillars: FloatArray, rng: np.random.Generato
     arch = 0.3 * height * np.clip(1.0 - depth / 1.9, 0.0, 1.0) ** 2
     roof = floor + height + bumps - arch - _rise(0.35 - depth)
     headroom = floor + _HEADROOM_M - _WALL_SLOPE * np.maximum(to_loop - 1.05, 0.0)
-    return Rock(HeightField(low, _CELL_M, ground), HeightField(low, _CELL_M, np.maximum(roof, headroom)))
+    return HeightField(low, _CELL_M, ground), HeightField(low, _CELL_M, np.maximum(roof, headroom))
 
 
 def _blend(galleries: list[Gallery], nodes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -224,11 +202,10 @@ def _blend(galleries: list[Gallery], nodes: FloatArray) -> tuple[FloatArray, Flo
     to_loop, deepest = distances[0], depths.max(axis=0)
     weights = np.exp((depths - deepest) / 0.5)
     weights /= weights.sum(axis=0)
-    floor, height = (weights * floors).sum(axis=0), (weights * heights).sum(axis=0)
     # On the loop the floor is the loop's own, so that the path has no steps at junctions.
     share = np.exp(-((to_loop / 1.5) ** 4))
-    floor = share * floors[0] + (1.0 - share) * floor
-    return deepest, gaussian_filter(floor, 2.0), gaussian_filter(height, 3.0), to_loop
+    floor = share * floors[0] + (1.0 - share) * (weights * floors).sum(axis=0)
+    return deepest, gaussian_filter(floor, 2.0), gaussian_filter((weights * heights).sum(axis=0), 3.0), to_loop
 
 
 def _rise(x: FloatArray) -> FloatArray:
@@ -236,23 +213,17 @@ def _rise(x: FloatArray) -> FloatArray:
     return np.asarray(_WALL_SLOPE * _BEND_M * np.logaddexp(0.0, x / _BEND_M))
 
 
-@dataclass(frozen=True)
 class _Stations:
     """Places along the loop, `_STATION_M` apart, numbered round and round, where things are fitted to the rock."""
 
-    floor: FloatArray  # (N, 3) on the ground in the middle
-    left: FloatArray  # (N, 2) unit vectors to the left
-    half_widths: FloatArray  # (N,) as planned
-    rock: Rock
-    rng: np.random.Generator
-    builder: Builder = field(default_factory=Builder)
-
-    @classmethod
-    def along(cls, loop: Gallery, rock: Rock, rng: np.random.Generator) -> "_Stations":
-        every = round(_STATION_M / _SPACING_M)
-        line, left = loop.line[::every].copy(), _loop_lefts(loop.line)[::every]
-        line[:, 2] = rock.ground.height_at(line[:, :2])
-        return cls(line, left, loop.half_widths[::every], rock, rng)
+    def __init__(
+        self, floor: FloatArray, left: FloatArray, half_widths: FloatArray, ground: HeightField, roof: HeightField,
+        rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        self.floor = floor  # (N, 3) on the ground in the middle
+        self.left = left  # (N, 2) unit vectors to the left
+        self.half_widths = half_widths  # (N,) as planned
+        self.ground, self.roof, self.rng, self.builder = ground, roof, rng, Builder()
 
     def __len__(self) -> int:
         return len(self.floor)
@@ -264,9 +235,7 @@ class _Stations:
 
     def on_ground(self, k: int, aside: float) -> FloatArray:
         """A point (3,) on the ground that far to the left of station k."""
-        point = self.at(k, aside, 0.0)
-        point[2] = float(self.rock.ground.height_at(point[None, :2])[0])
-        return point
+        return np.asarray(on_ground(self.at(k, aside, 0.0)[None, :2], self.ground)[0])
 
     def is_beside(self, point: FloatArray, reach: float) -> bool:
         """Whether a thing that reaches that far around a point (3,) is outside the free space along the path."""
@@ -275,8 +244,13 @@ class _Stations:
         return nearest > float(np.hypot(_FREE_SIDE_M + reach + 0.05, 0.5 * _STATION_M))
 
     def wall(self, side: float, up: float) -> FloatArray:
-        """(N,) distance to the wall on one side (+1 left, -1 right), at a height above the floor."""
-        return self.rock.reach(self.floor + up * UP, side * self.left)
+        """(N,) level distance to the rock on one side (+1 left, -1 right), at a height above the floor, at most 6 m."""
+        steps = np.arange(0.0, 6.0, 0.05)
+        points = np.repeat((self.floor + up * UP)[:, None], len(steps), axis=1)
+        points[:, :, :2] += steps[:, None] * (side * self.left)[:, None]
+        xy, z = points[..., :2].reshape(-1, 2), points[..., 2].ravel()
+        solid = ((z < self.ground.height_at(xy)) | (z > self.roof.height_at(xy))).reshape(len(self), len(steps))
+        return np.asarray(np.where(solid.any(axis=1), steps[solid.argmax(axis=1)], 6.0))
 
     def walls(self, up: float) -> dict[float, FloatArray]:
         """The distances to the walls of both sides."""
@@ -290,15 +264,6 @@ class _Stations:
         """Consecutive stations, drawn; the limits are shares of the loop."""
         start, length = int(self.rng.integers(len(self))), int(len(self) * self.rng.uniform(shortest, longest))
         return range(start, start + length)
-
-
-def _fit_out(stations: _Stations) -> Builder:
-    for fit, (fewest, most) in ((_lay_pipe, (3, 6)), (_hang_cable, (2, 4)), (_set_supports, (2, 5))):
-        for _ in range(int(stations.rng.integers(fewest, most))):
-            fit(stations)
-    for place in (_lay_rails, _hang_lamps, _drop_rocks, _leave_things):
-        place(stations)
-    return stations.builder
 
 
 def _lay_pipe(stations: _Stations) -> None:
@@ -315,7 +280,7 @@ def _lay_pipe(stations: _Stations) -> None:
         a, b = k % len(stations), (k + 1) % len(stations)
         if not goes_on[a]:
             continue
-        start, end = stations.at(a, side * aside[a], up), stations.at(b, side * aside[b], up)
+        start, end = (stations.at(j, side * aside[j], up) for j in (a, b))
         builder.cylinder(start, end, radius)
         # A pipe that ends turns into the rock.
         if k == stretch[0] or not goes_on[a - 1]:
@@ -335,8 +300,7 @@ def _hang_cable(stations: _Stations) -> None:
     aside = side * np.minimum(share * stations.wall(side, 1.8), stations.half_widths)
     for k in stations.stretch(0.3, 0.9)[::3]:
         a, b = k % len(stations), (k + 3) % len(stations)
-        ends = np.stack([stations.at(j, aside[j], 0.0) for j in (a, b)])
-        ends[:, 2] = stations.rock.roof.height_at(ends[:, :2]) - 0.06
+        ends = on_ground(np.stack([stations.at(j, aside[j], 0.0)[:2] for j in (a, b)]), stations.roof) - 0.06 * UP
         t, sag = np.linspace(0.0, 1.0, 4)[:, None], stations.rng.uniform(0.08, 0.2)
         points = ends[0] + t * (ends[1] - ends[0]) - 4.0 * sag * t * (1 - t) * UP
         over_way = points[:, 2].min() - max(stations.floor[a, 2], stations.floor[b, 2])
@@ -349,29 +313,27 @@ def _set_supports(stations: _Stations) -> None:
     """Frames of two props and a cap, of round timber or of steel, at even distances over a stretch."""
     rng, builder = stations.rng, stations.builder
     is_timber, every = rng.random() < 0.55, int(rng.integers(2, 5))
-    left, right = stations.wall(1.0, 1.0), stations.wall(-1.0, 1.0)
-    thick = rng.uniform(0.16, 0.24)
+    walls, thick = stations.walls(1.0), rng.uniform(0.16, 0.24)
     for k in stations.stretch(0.08, 0.22)[::every]:
         j = k % len(stations)
-        asides = (left[j] - 0.5 * thick, -(right[j] - 0.5 * thick))
-        is_wide = max(left[j], right[j]) > stations.half_widths[j] + 0.6
+        left, right = walls[1.0][j], walls[-1.0][j]
+        asides = (left - 0.5 * thick, -(right - 0.5 * thick))
+        is_wide = max(left, right) > stations.half_widths[j] + 0.6
         if is_wide or min(asides[0], -asides[1]) < _FREE_SIDE_M + thick:
             continue
         across = np.array([stations.at(j, a, 0.0) for a in np.linspace(asides[1] + 0.3, asides[0] - 0.3, 9)])
-        roof = float(stations.rock.roof.height_at(across[:, :2]).min())
+        roof = float(stations.roof.height_at(across[:, :2]).min())
         top = max(roof - 0.03, stations.floor[j, 2] + _FREE_HEIGHT_M + thick + 0.2)
+        feet = [stations.on_ground(j, a) - 0.45 * UP for a in asides]
         heads = [np.array([*stations.at(j, 0.9 * a, 0.0)[:2], top - thick]) for a in asides]
-        for aside, head in zip(asides, heads, strict=True):
-            foot = stations.on_ground(j, aside) - 0.45 * UP
-            if is_timber:
-                builder.cylinder(foot, head, 0.5 * thick)
-            else:
-                builder.beam(foot, head, 0.8 * thick, 0.8 * thick)
         lift = 0.5 * thick * UP
         if is_timber:
             cap = 0.15 * (heads[0] - heads[1]) / np.linalg.norm(heads[0] - heads[1])
-            builder.cylinder(heads[1] - cap + lift, heads[0] + cap + lift, 0.5 * thick)
+            for start, end in (*zip(feet, heads, strict=True), (heads[1] - cap + lift, heads[0] + cap + lift)):
+                builder.cylinder(start, end, 0.5 * thick)
         else:
+            for foot, head in zip(feet, heads, strict=True):
+                builder.beam(foot, head, 0.8 * thick, 0.8 * thick)
             builder.beam(heads[1] + lift, heads[0] + lift, 0.8 * thick, thick)
 
 
