@@ -141,7 +141,9 @@ def learn_point_time(
         is_clear = stamp is None or abs(stamp) > 2 * CLOCK_LIMIT_S
         if (found.model is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
             break
-    logger.info("time of a point: %s", learned.model)
+    model = learned.model
+    known = "none is known" if model is None else f"field {model.field!r} in {model.unit}, {model.reference}"
+    logger.info("time of a point: %s", known)
     return learned
 
 
