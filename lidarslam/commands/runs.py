@@ -344,8 +344,8 @@ def _keep_serving(page: "WebPage | None", out: Path | None = None) -> None:
     if page is not None:
         from lidarslam.storage.directory import RERUN
 
-        say(f"serving {page.address} until Ctrl-C{f'; later: lidarslam view {out / RERUN} --web' if out else ''}")
-        wait_for_interrupt()
+        later = f"; later: lidarslam view {out / RERUN} --web" if out else ""
+        wait_for_interrupt(f"serving {page.address} until Ctrl-C{later}")
 
 
 def _take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":

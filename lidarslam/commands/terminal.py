@@ -37,9 +37,11 @@ def serving() -> "Iterator[WebPage]":
         yield page
 
 
-def wait_for_interrupt() -> None:
-    """Keep serving until Ctrl-C or SIGTERM, the regular end."""
+def wait_for_interrupt(announcement: str | None = None) -> None:
+    """Announce it, and keep serving until Ctrl-C or SIGTERM, the regular end."""
     with contextlib.suppress(KeyboardInterrupt):
+        if announcement is not None:
+            say(announcement)
         while True:  # signal.pause would sleep on after a signal that came just before it
             time.sleep(0.5)
 
