@@ -96,7 +96,7 @@ class KeyframeDatabase(Stateful):
         self._config = config
         self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
         self.submaps = SubmapFile(directory)
-        self._descriptors: list[NDArray[np.complex64]] = []
+        self._descriptors = np.empty((0, 1, 1), dtype=np.complex64)  # (N, ...), with room for more keyframes
 
     def __len__(self) -> int:
         return len(self.submaps)
@@ -116,7 +116,12 @@ class KeyframeDatabase(Stateful):
     def keep(self, points: FloatArray) -> None:
         """Keep the submap (N, 3) of the next keyframe, whose estimate is known or follows."""
         self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))
-        self._descriptors.append(BirdsEyeView.of(self.submaps[-1]).descriptor(self.radius_m))
+        descriptor = BirdsEyeView.of(self.submaps[-1]).descriptor(self.radius_m)
+        if len(self) > len(self._descriptors):
+            room = np.zeros((max(64, 2 * len(self)), *descriptor.shape), dtype=np.complex64)
+            room[: len(self) - 1] = self._descriptors[: len(self) - 1].reshape(-1, *descriptor.shape)
+            self._descriptors = room
+        self._descriptors[len(self) - 1] = descriptor
 
     def cloud(self, index: int) -> SubmapCloud:
         """A keyframe with those before and after it in its segment."""
@@ -145,7 +150,9 @@ class KeyframeDatabase(Stateful):
             yield from self._alike(index, others)
 
     def _compare(self, view: BirdsEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        return compare(view.descriptor(self.radius_m), np.stack([self._descriptors[other] for other in others]))
+        is_run = others[-1] - others[0] == len(others) - 1  # as within one segment: a view of them is no copy
+        chosen = self._descriptors[slice(others[0], others[-1] + 1) if is_run else others]
+        return compare(view.descriptor(self.radius_m), chosen)
 
     def _nearby(self, index: int, others: NDArray[np.intp]) -> Iterator[Candidate]:
         """Earlier keyframes of the segment within reach of the estimate."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.geometry import inverse
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import (
@@ -87,9 +87,8 @@ class NearSearch:
 
     def contradicts(self, attempt: Attempt, caution: float = WEAK_CAUTION) -> bool:
         """Whether an attempt contradicts an odometry that was consistent so far, as the next step of stairs does."""
-        motion = inverse(self.matcher.last.T_world_lidar) @ attempt.T_world_lidar
         prior = replace(self.prior, caution=caution)
-        return self.state.odometry_noise.agrees(prior, motion, self.matcher.config) is False
+        return self.state.odometry_noise.agrees(prior, self._motion(attempt), self.matcher.config) is False
 
     def continued(self, prediction: Prediction) -> Prediction:
         """Where a scan without a registration is: by a proven odometry at its own covariance, else as predicted."""
@@ -237,9 +236,12 @@ class NearSearch:
 
     def _likely_quality(self, attempt: Attempt) -> float:
         """The quality of an attempt, times the likelihood of its motion by a proven odometry."""
-        motion = inverse(self.matcher.last.T_world_lidar) @ attempt.T_world_lidar
-        prior = replace(self.prior, caution=_LIKELIHOOD_CAUTION)
-        return attempt.quality * self.state.odometry_noise.likelihood(prior, motion, self.matcher.config)
+        prior, noise = replace(self.prior, caution=_LIKELIHOOD_CAUTION), self.state.odometry_noise
+        return attempt.quality * noise.likelihood(prior, self._motion(attempt), self.matcher.config)
+
+    def _motion(self, attempt: Attempt) -> FloatArray:
+        """(4, 4) since the last scan."""
+        return inverse(self.matcher.last.T_world_lidar) @ attempt.T_world_lidar
 
     @property
     def _is_open(self) -> bool:
