@@ -32,6 +32,9 @@ _LONG_S, TRIED, _SPACING_M_S = 0.15, 5, 1.0
 # Mean evidence of motions along a corridor, in units of the least: in one, 0.55 to 1 for the right velocity, 0.25 to
 # 0.35 for others.
 _LEAST_CONSTRAINT = 0.45
+# Walls of a corridor fit any motion along it: where the constraint is below the least, that of another start has to be
+# so many times as large, however it fits.
+_MORE_CONSTRAINED = 1.5
 _VELOCITIES = [np.zeros(3)] + [
     speed * np.array([np.cos(angle), np.sin(angle), 0.0])
     for speed, count in ((1.0, 6), (2.0, 8))
@@ -109,7 +112,8 @@ def smoothed_start(
     reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))
     backwards = _backwards(taken, _motions(known), reverse)
     earlier = len(taken) - len(known)  # scans; the first of them has nothing to fit
-    is_better = _quality(backwards[len(known) : -1]) >= _quality(forwards[1:earlier])
+    again, in_order = backwards[len(known) : -1], forwards[1:earlier]
+    is_better = _quality(again) >= _quality(in_order) or _constrains_better(again, in_order)
     if len(_tracked_at_last(backwards)) < len(backwards) or not is_better:
         return {}
     first = {taken[0].stamp: Prior(turn_rate=-backwards[-1].state.velocity[:3])} if ordered.is_bent else {}
@@ -129,6 +133,12 @@ def _quality(results: list[MappedScan]) -> float:
 def _constraint(results: list[MappedScan]) -> float:
     """How well inliers constrain the weakest direction, on average."""
     return float(np.mean([one.fit.constraint for one in results if one.fit is not None]))
+
+
+def _constrains_better(again: list[MappedScan], in_order: list[MappedScan]) -> bool:
+    """Whether scans that hardly constrained a direction in order constrain it another time."""
+    constraint = _constraint(in_order)
+    return constraint < 1.0 and _constraint(again) > _MORE_CONSTRAINED * constraint
 
 
 def _likeliest(

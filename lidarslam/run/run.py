@@ -325,7 +325,7 @@ def track(
 
 def _start(config: Config, recording: Recording, chosen: range, inertial: "Inertial | None") -> dict[float, Prior]:
     """The motions of the first scans, where they have to be smoothed."""
-    if config.mapping.method != "surfels" or len(chosen) < SHOWING:
+    if config.mapping.method not in ("surfels", "loam") or len(chosen) < SHOWING:
         return {}
     logger.info("the first scans are registered beforehand")
     with suppress(InputError):  # raised again when the scans are read

@@ -29,9 +29,10 @@ _MOST_EDGES, _EDGE_SPACING = 1000, 1.0
 _MOST_SPACING_M = 0.4
 # Curvature above which a point is an edge, square metres: that of the authors' program. All others are planar.
 _CURVATURE_M2 = 0.1
-# An edge needs this many times the median curvature as well. Flat surfaces seen with a range noise of more than one
-# centimetre exceed the published threshold all over, and these edges, on rings that move with the sensor, hold it back.
-_ABOVE_NOISE = 10.0
+# An edge needs this many times the median curvature as well, three standard deviations of the noise. Flat surfaces seen
+# with a range noise of more than one centimetre exceed the published threshold all over, and these edges, on rings that
+# move with the sensor, hold it back.
+_ABOVE_NOISE = 20.0
 # The median is taken over one in this many points.
 _SAMPLED = 4
 # A cloud is stored ring after ring when nearly all azimuths run in one sense, over at least this many rings.
@@ -123,16 +124,22 @@ def _pick_edges(
     points: FloatArray, curvature: FloatArray, edge_above: float, first: int, last: int, free: NDArray[np.bool_],
     kinds: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Mark the points of largest curvature of a sector [first, last) that are still free; exclude their neighbours."""
+    """Mark the points of largest curvature of a sector [first, last) that are still free; exclude their neighbours.
+
+    Those of an unreliable point are excluded, too: seen at a grazing angle, the last point of a wall is one, and those
+    before it have its gap among their neighbours. As edges, they would follow the sensor.
+    """
     picked = 0
     sharp = first + np.flatnonzero(curvature[first:last] > edge_above)
     for i in sharp[np.argsort(-curvature[sharp], kind="mergesort")]:
         if picked == _EDGES:
             break
-        if not free[i]:
+        if free[i]:
+            kinds[i] = EDGE
+            picked += 1
+        elif kinds[i] != 0:  # next to an edge, or hidden in part
             continue
-        kinds[i], free[i] = EDGE, False
-        picked += 1
+        free[i] = False
         for step in (-1, 1):
             for j in range(i, i + step * _REACH, step):
                 if not 0 <= j + step < len(points) or _squared_distance(points[j], points[j + step]) > _APART_M2:

@@ -1,7 +1,6 @@
 """Rings of a sweep, and its edge and planar features: curvature, reliability and choice."""
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -176,8 +175,19 @@ def test_a_surface_nearly_parallel_to_the_beam_has_no_features():
     assert (kinds[steep[5:]] == PLANE).all()
 
 
+def test_the_end_of_a_wall_seen_at_a_grazing_angle_is_no_edge():
+    """The last points are too far apart to be reliable; beyond them, a wall at 40 m."""
+    incidence = np.deg2rad(np.arange(60.0, 13.8, -0.2))
+    ranges = np.concatenate([1.0 / np.sin(incidence), np.full(50, 40.0)])
+    angles = np.concatenate([incidence, incidence[-1] - np.deg2rad(0.2) * np.arange(1, 51)])
+    kinds = kinds_of(on_sphere(angles, np.zeros(len(angles)), ranges))
+    assert kinds[len(incidence) - 1] == 0
+    assert (kinds[len(incidence) - 6 : len(incidence) - 3] == PLANE).all()
+    assert not (kinds == EDGE).any()
+
+
 def test_edges_are_the_sharpest_points_and_no_neighbours(rng):
-    """At most twenty in each sixth of a ring; closer than six points only across a gap."""
+    """At most twenty in each sixth of a ring, no two of them closer than six points."""
     rings = np.arange(3).repeat(3000)
     azimuth = np.tile(2.0 * np.pi * np.arange(3000) / 3000, 3)
     ranges = 6.0 + 0.05 * rng.standard_normal(9000)
@@ -188,11 +198,7 @@ def test_edges_are_the_sharpest_points_and_no_neighbours(rng):
         edges = first + np.flatnonzero(kinds[first : first + 500] == EDGE)
         assert len(edges) == 20
         assert sharpness[edges].min() > 0.1
-    edges = np.flatnonzero(kinds == EDGE)
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) ** 2
-    beside = [(a, b) for a, b in pairwise(edges) if b - a <= 5]
-    assert beside, "some are neighbours across a gap"
-    assert all(steps[a:b].max() > 0.05 for a, b in beside)
+    assert (np.diff(np.flatnonzero(kinds == EDGE)) > 5).all()
 
 
 def test_the_sharpest_of_neighbours_is_chosen(rng):
@@ -222,7 +228,7 @@ def distance_to_edges(room: Any, points: FloatArray) -> FloatArray:
     return distance
 
 
-@pytest.mark.parametrize(("sigma_m", "false_edges"), [(0.0, 0.01), (0.02, 0.04)])
+@pytest.mark.parametrize(("sigma_m", "false_edges"), [(0.0, 0.0005), (0.02, 0.0005)])
 def test_edges_of_a_room_are_its_edges(room, drive, rng, sigma_m, false_edges):
     T = drive(np.array([0.5]))[0]
     scan = room.ring_sweep(lambda time: np.broadcast_to(T, (*np.shape(time), 4, 4)), 0.5)
@@ -232,7 +238,7 @@ def test_edges_of_a_room_are_its_edges(room, drive, rng, sigma_m, false_edges):
     in_room = edges.points @ T[:3, :3].T + T[:3, 3]
     off = distance_to_edges(room, in_room) > 0.15
     assert np.count_nonzero(off) < false_edges * len(scan)
-    assert np.count_nonzero(~off) > 150
+    assert np.count_nonzero(~off) > 120
     assert len(planes) > 0.5 * len(scan)
 
 
