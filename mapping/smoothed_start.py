@@ -85,8 +85,8 @@ def smoothed_start(
     The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
     scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
     and the motions of the first half are those that this map shows, as is the first sweep's turn rate where the motion
-    to the second would bend it. None is known where that loses track, or fits worse than in order, as on stairs. A new
-    IMU's samples are used in both directions of time.
+    to the second would bend it. None is known where that loses track, or fits worse than in order, as on stairs, unless
+    the motions in order are hardly constrained. A new IMU's samples are used in both directions of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
     ordered, taken, needed, least = _Tracking(unlimited, inertial), list[Scan](), False, np.inf
