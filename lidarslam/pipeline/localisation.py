@@ -227,7 +227,7 @@ def make_localiser(
 ) -> Localiser:
     """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
 
-    With surfels, the error of the sensor's elevations is estimated as well, and the first scans may be smoothed.
+    The first scans may be smoothed; with surfels, the error of the sensor's elevations is estimated as well.
     """
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())

@@ -135,11 +135,10 @@ def _pick_edges(
         if picked == _EDGES:
             break
         if free[i]:
-            kinds[i] = EDGE
+            kinds[i], free[i] = EDGE, False
             picked += 1
         elif kinds[i] != 0:  # next to an edge, or hidden in part
             continue
-        free[i] = False
         for step in (-1, 1):
             for j in range(i, i + step * _REACH, step):
                 if not 0 <= j + step < len(points) or _squared_distance(points[j], points[j + step]) > _APART_M2:

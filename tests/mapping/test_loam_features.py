@@ -186,6 +186,13 @@ def test_the_end_of_a_wall_seen_at_a_grazing_angle_is_no_edge():
     assert not (kinds == EDGE).any()
 
 
+def test_an_edge_excludes_no_neighbours_across_a_gap():
+    """A step of 0.3 m, too small to hide anything: both of its sides are edges."""
+    azimuth = np.deg2rad(0.2 * np.arange(100))
+    kinds = kinds_of(on_sphere(azimuth, np.zeros(100), np.where(np.arange(100) < 50, 5.0, 5.3)))
+    assert np.flatnonzero(kinds == EDGE).tolist() == [49, 50]
+
+
 def test_edges_are_the_sharpest_points_and_no_neighbours(rng):
     """At most twenty in each sixth of a ring, no two of them closer than six points."""
     rings = np.arange(3).repeat(3000)
