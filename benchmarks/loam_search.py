@@ -58,23 +58,21 @@ def _cells(scans: list[Scan]) -> list[str]:
             for sweep in (sampled.sweep, sampled.keypoints)
         )
         if grid is not None and grid.cell_m == sampled.cell_m:
-            rows.append(_times(grid, planes, keypoints))
+            rows.append(_times(grid, planes, keypoints, state.T_world_lidar[:3, 3]))
         else:
             grid = VoxelGrid(sampled.cell_m)
-            grid.insert(planes)
+            grid.insert(planes, state.T_world_lidar[:3, 3])
     assert grid is not None
     return [f"{len(grid):,}", *(f"{value:.1f}" for value in np.median(rows[1:], axis=0))]
 
 
-def _times(grid: VoxelGrid, planes: FloatArray, keypoints: FloatArray) -> list[float]:
+def _times(grid: VoxelGrid, planes: FloatArray, keypoints: FloatArray, sensor: FloatArray) -> list[float]:
     means, found = grid.means, Surfaces.none(len(keypoints))
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(means), o3d.core.int32)
     index_ms = _timed(search.knn_index)
     theirs_ms = _timed(lambda: search.knn_search(o3d.core.Tensor.from_numpy(keypoints), NEIGHBOURS))
-    ours_ms = _timed(
-        lambda: match_features(keypoints, np.arange(len(keypoints)), False, grid.voxels, np.zeros(3), found)
-    )
-    insert_ms = _timed(lambda: grid.insert(planes))
+    ours_ms = _timed(lambda: match_features(keypoints, np.arange(len(keypoints)), False, grid.voxels, sensor, found))
+    insert_ms = _timed(lambda: grid.insert(planes, sensor))
     return [index_ms, theirs_ms, insert_ms, ours_ms]
 
 

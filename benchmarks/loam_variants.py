@@ -41,11 +41,11 @@ def published_edges() -> Iterator[None]:
 def published_planes() -> Iterator[None]:
     """One point a voxel, the mean of all, for a while."""
 
-    def add_mean(points: FloatArray, rows: Rows, sums: FloatArray) -> None:
-        add_moments(points, rows, sums)
+    def add_mean(points: FloatArray, rows: Rows, sensor: FloatArray, sums: FloatArray) -> None:
+        add_moments(points, rows, sensor, sums)
         means = sums[:, 1:4] / sums[:, :1]
         products = [means[:, i] * means[:, j] for i, j in SYMMETRIC]
-        sums[:, 4:] = sums[:, :1] * np.stack(products, axis=1)
+        sums[:, 4:10] = sums[:, :1] * np.stack(products, axis=1)
 
     with patch.object(feature_map, "add_moments", add_mean):
         yield

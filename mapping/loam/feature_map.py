@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
-from lidarslam.mapping.loam.features import EDGE
+from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -48,6 +48,8 @@ _MOST_TILT = 0.05
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
+# Mean cosine from which on a plane was seen from one side: a point on the other belongs to another, as of a thin wall.
+_SIDE_COSINE = 0.05
 # Points whose slots are prefetched.
 _PREFETCHED = 4
 # A voxel with this many points is frozen, so that drift does not smear it.
@@ -64,18 +66,22 @@ class Voxels(NamedTuple):
     # table_keys, table_rows: of the hash
     table_keys: Keys
     table_rows: Rows
-    sums: FloatArray  # (M, 10) number of points, sums of their coordinates in the world, and of the products of these
+    # sums: (M, 13) number of points, sums of their coordinates in the world, of the products of these, and of the unit
+    # views, the directions to the sensor
+    sums: FloatArray
 
 
 @compiled
-def add_moments(points: FloatArray, rows: Rows, sums: FloatArray) -> None:
-    """Add points (N, 3) to the sums (M, 10) of their rows (N,), unless these are frozen."""
+def add_moments(points: FloatArray, rows: Rows, sensor: FloatArray, sums: FloatArray) -> None:
+    """Add points (N, 3), seen from (3,), to the sums (M, 13) of their rows (N,), unless these are frozen."""
     for n in range(len(points)):
         cell = sums[rows[n]]
         if cell[0] < _MOST_POINTS:
             cell[0] += 1.0
+            range_m = math.sqrt(max(squared_distance(points[n], sensor), 1e-12))
             for axis in range(3):
                 cell[1 + axis] += points[n, axis]
+                cell[10 + axis] += (sensor[axis] - points[n, axis]) / range_m
             for entry in range(6):
                 i, j = SYMMETRIC[entry]
                 cell[4 + entry] += points[n, i] * points[n, j]
@@ -89,7 +95,7 @@ def match_features(
 
     `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
     normal, are moved to its beginning. A plane that is known better takes the place of another. The normal of a plane
-    faces the sensor (3,), the first of a line points from that to the point.
+    faces the sensor (3,), and so did the plane when it was seen; the first of a line points from that to the point.
 
     Returns:
         Number of the points that were moved.
@@ -118,12 +124,12 @@ def match_features(
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
                 if (
-                    tilt < _MOST_TILT
-                    and _cosine(mean, axis, sensor) > _LEAST_COSINE
-                    and _farthest(near[:count], voxels.sums, mean, axis) < most_off
+                    _turn_to(sensor, mean, axis) > _LEAST_COSINE
+                    and tilt < _MOST_TILT
+                    and _is_surface(near[:count], number, voxels.sums, mean, axis, most_off)
                 ):
                     if found.counts[n] == 0 or thickness_m < found.thickness_m[n, 0]:
-                        _write_plane(found, n, mean, axis, thickness_m, tilt, sensor)
+                        _write_plane(found, n, mean, axis, thickness_m, tilt)
                     if tilt < _CERTAIN_TILT:
                         continue
         unmatched[left] = n
@@ -192,25 +198,31 @@ def _moments(
 
 
 @compiled_part
-def _farthest(near: NDArray[np.int64], sums: FloatArray, mean: FloatArray, axis: FloatArray) -> float:
-    """Largest distance of the neighbours (K,) from the plane through their mean across an axis (3,)."""
-    farthest = 0.0
-    for row in near:
-        distance = 0.0
+def _turn_to(sensor: FloatArray, point: FloatArray, normal: FloatArray) -> float:
+    """Turn the normal (3,) of a plane to the sensor (3,); the cosine of its angle to the beam to a point (3,)."""
+    along = 0.0
+    for i in range(3):
+        along += (sensor[i] - point[i]) * normal[i]
+    if along < 0.0:
         for i in range(3):
-            distance += (sums[row, 1 + i] / sums[row, 0] - mean[i]) * axis[i]
-        farthest = max(farthest, abs(distance))
-    return farthest
+            normal[i] = -normal[i]
+    return abs(along) / math.sqrt(max(squared_distance(sensor, point), 1e-12))
 
 
 @compiled_part
-def _cosine(point: FloatArray, normal: FloatArray, sensor: FloatArray) -> float:
-    """Cosine of the angle between a normal (3,) and the beam from the sensor (3,) to a point (3,)."""
-    along, squared = 0.0, 0.0
-    for i in range(3):
-        beam = point[i] - sensor[i]
-        along, squared = along + beam * normal[i], squared + beam * beam
-    return abs(along) / math.sqrt(max(squared, 1e-12))
+def _is_surface(
+    near: NDArray[np.int64], number: float, sums: FloatArray, mean: FloatArray, normal: FloatArray, most_off: float
+) -> bool:  # fmt: skip
+    """Whether all neighbours (K,) are so near to the plane through their mean, and were not seen from behind it."""
+    seen = 0.0
+    for row in near:
+        distance = 0.0
+        for i in range(3):
+            distance += (sums[row, 1 + i] / sums[row, 0] - mean[i]) * normal[i]
+            seen += sums[row, 10 + i] * normal[i]
+        if abs(distance) >= most_off:
+            return False
+    return seen > -_SIDE_COSINE * number
 
 
 @compiled_part
@@ -230,15 +242,11 @@ def _uncertainty(across: float, along: float, number: float, spent: float) -> tu
 
 @compiled_part
 def _write_plane(
-    found: Surfaces, n: int, mean: FloatArray, normal: FloatArray, thickness_m: float, tilt: float, sensor: FloatArray
+    found: Surfaces, n: int, mean: FloatArray, normal: FloatArray, thickness_m: float, tilt: float
 ) -> None:
     found.thickness_m[n, 0], found.tilt[n, 0] = thickness_m, tilt
-    facing = 0.0
     for i in range(3):
-        facing += (sensor[i] - mean[i]) * normal[i]
-    for i in range(3):
-        found.points[n, i] = mean[i]
-        found.normals[n, 0, i] = normal[i] if facing >= 0.0 else -normal[i]
+        found.points[n, i], found.normals[n, 0, i] = mean[i], normal[i]
     found.counts[n] = 1
 
 
@@ -274,11 +282,11 @@ class VoxelGrid(Stateful):
 
     cell_m: float
     _keys: Annotated[NDArray[np.int64], Shape(None)]  # (M,) of the voxels, by row
-    _sums: Annotated[FloatArray, Shape(None, 10)]  # (M, 10) see `Voxels`
+    _sums: Annotated[FloatArray, Shape(None, 13)]  # (M, 13) see `Voxels`
 
     def __init__(self, cell_m: float) -> None:
         self.cell_m = cell_m
-        self._keys, self._sums = np.empty(0, dtype=np.int64), np.empty((0, 10))
+        self._keys, self._sums = np.empty(0, dtype=np.int64), np.empty((0, 13))
         self._hash = VoxelHash()
 
     def __len__(self) -> int:
@@ -289,21 +297,21 @@ class VoxelGrid(Stateful):
         """(M, 3) in the world."""
         return np.asarray(self._sums[:, 1:4] / self._sums[:, :1], dtype=np.float64)
 
-    def insert(self, points: FloatArray) -> None:
-        """Insert points (N, 3) of the world."""
+    def insert(self, points: FloatArray, sensor: FloatArray) -> None:
+        """Insert points (N, 3) of the world, seen from (3,)."""
         keys = point_keys(points, self.cell_m)
         rows = self._hash.insert(keys)
         new = len(self._hash) - len(self._keys)
         if new:
             self._keys = np.concatenate([self._keys, np.empty(new, dtype=np.int64)])
             self._keys[rows] = keys
-            self._sums = np.concatenate([self._sums, np.zeros((new, 10))])
-        add_moments(np.ascontiguousarray(points), rows, self._sums)
+            self._sums = np.concatenate([self._sums, np.zeros((new, 13))])
+        add_moments(np.ascontiguousarray(points), rows, np.array(sensor), self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:
         """Insert the voxels of another grid, with their numbers of points."""
         rows = self._hash.insert(point_keys(other.means, self.cell_m))
-        self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 10))
+        self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 13))
         self._keys[rows] = point_keys(other.means, self.cell_m)
         np.add.at(self._sums, rows, other._sums)
 
@@ -371,7 +379,7 @@ class FeatureMap(LocalMap):
         is_edge = _edges_of(scan.sweep)
         for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
             for grid in grids:
-                grid.insert(chosen)
+                grid.insert(chosen, sensor)
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
@@ -386,7 +394,8 @@ class FeatureMap(LocalMap):
         return np.concatenate([self._edges[1].means, self._planes[1].means])
 
     def level_normals(self) -> FloatArray:
-        normals, spread_m = self.coarse_planes(self._planes[-1].means, np.zeros(3))
+        sensor = np.zeros(3) if self._centre is None else self._centre
+        normals, spread_m = self.coarse_planes(self._planes[-1].means, sensor)
         return normals[np.isfinite(spread_m)]
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:

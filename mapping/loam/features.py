@@ -141,13 +141,14 @@ def _pick_edges(
             continue
         for step in (-1, 1):
             for j in range(i, i + step * _REACH, step):
-                if not 0 <= j + step < len(points) or _squared_distance(points[j], points[j + step]) > _APART_M2:
+                if not 0 <= j + step < len(points) or squared_distance(points[j], points[j + step]) > _APART_M2:
                     break
                 free[j + step] = False
 
 
 @compiled_part
-def _squared_distance(p: FloatArray, q: FloatArray) -> float:
+def squared_distance(p: FloatArray, q: FloatArray) -> float:
+    """Of two points (3,)."""
     return float((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
 
 

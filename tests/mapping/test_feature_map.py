@@ -84,11 +84,24 @@ def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng):
         assert found.tilt[row] == pytest.approx(np.sqrt(variance / (number * values[1])))
 
 
-def test_the_normal_of_a_plane_faces_the_sensor(rng):
-    feature_map, asked = map_of(NONE, on_plane(rng, 20_000)), on_plane(rng, 50)
-    for z, side in ((5.0, 1.0), (-5.0, -1.0)):
+def test_a_plane_is_matched_from_the_side_it_was_seen_from_and_its_normal_faces_that(rng):
+    points, asked = on_plane(rng, 20_000), on_plane(rng, 50)
+    for z in (5.0, -5.0):
+        feature_map = FeatureMap(CELL_M, 100.0)
+        add(feature_map, NONE, points, np.array([0.0, 0.0, z]))
         found = feature_map.match(asked, exp([0, 0, 0, 0, 0, z]))
-        np.testing.assert_allclose(found.normals, np.tile([0.0, 0.0, side], (50, 1)), atol=1e-6)
+        np.testing.assert_allclose(found.normals, np.tile([0.0, 0.0, np.sign(z - 1.0)], (50, 1)), atol=1e-6)
+        assert len(feature_map.match(asked, exp([0, 0, 0, 0, 0, -z]))) == 0
+
+
+def test_a_point_on_the_other_side_of_a_thin_wall_is_not_matched_to_this_one(rng):
+    near, far = (across_x(rng, x, 1.0, 20_000) for x in (2.0, 2.12))
+    feature_map, behind = map_of(NONE, near, 0.05), exp([0, 0, 0, 4.0, 0, 0])
+    assert len(feature_map.match(far[::50], behind)) == 0
+    add(feature_map, NONE, far, behind[:3, 3])
+    found = feature_map.match(far[::50], behind)
+    assert len(found) > 390
+    assert np.abs(found.residuals(far[::50][found.index])).max() < 1e-6
 
 
 def test_a_line_has_two_residuals_the_first_along_the_distance(rng):
