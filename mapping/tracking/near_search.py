@@ -1,6 +1,5 @@
 """Search for a scan's pose near its prediction: one strategy after another, each for what the others miss."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -200,7 +199,8 @@ class NearSearch:
     def from_odometry(self, near: Attempt) -> Attempt:
         """Where the prediction is uncertain along the weakest direction: from the odometry's motion.
 
-        Of several optima, as on stairs, the prediction's may be the next step's.
+        Of several optima, as on stairs, the prediction's may be the next step's. Where nothing constrains the scan any
+        more, as off the faces of a few boxes in a corridor, any pose fits.
         """
         prior, prediction = self.prior, near.prediction
         if prior.T_prev_curr is None or prediction.is_inertial or not near.fit.is_constrained:  # an IMU's is better
@@ -213,7 +213,8 @@ class NearSearch:
         if prediction.sigma_along(direction) < apart_m or away_m < apart_m:
             return near
         start = replace(prediction, T_world_lidar=T_world_lidar)
-        return _clearly_best(near, [self.matcher.attempt(prediction, start, coarse_first=False)])
+        other = self.matcher.attempt(prediction, start, coarse_first=False)
+        return other if other.fit.is_constrained and other.quality > _CLEARLY_BETTER * near.quality else near
 
     def along_weakest(self, near: Attempt) -> Attempt:
         """Where the scan fits poorly: a few cells away along its weakest direction.
@@ -256,9 +257,3 @@ class NearSearch:
 
 def _apart_m(one: Attempt, other: Attempt) -> float:
     return float(np.linalg.norm(one.T_world_lidar[:3, 3] - other.T_world_lidar[:3, 3]))
-
-
-def _clearly_best(near: Attempt, others: Iterable[Attempt]) -> Attempt:
-    """An attempt, or the best of others where that is clearly better."""
-    best = max(others, key=lambda attempt: attempt.quality, default=near)
-    return best if best.quality > _CLEARLY_BETTER * near.quality else near
