@@ -129,8 +129,9 @@ def _is_ranked(cell: TableCell) -> bool:
 
 
 MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
-"""`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with a partial result. The last four:
-no result but the message; `not run`: the comparison was interrupted before, or something is missing that it needs."""
+"""`lost`: finished, but tracking was lost, or the path is unreliable. `stopped`: ended early with a partial result. The
+last four: no result but the message; `not run`: the comparison was interrupted before, or something is missing that it
+needs."""
 
 TimesCover = Literal["reading, registration and map", "registration"]
 """The stages that the times of a scan include."""

@@ -170,5 +170,7 @@ def _lost_table(sequence: SequenceComparison) -> Table:
 
 
 def _status(method: MethodResult) -> str:
-    lost = f", {method.lost_scans} of {method.scans} scans" if method.status == "lost" and method.lost_scans else ""
-    return f"{_SYMBOLS.get(method.status, '✕')} {method.status}{lost}"
+    text: str = method.status
+    if text == "lost":
+        text = f"lost, {method.lost_scans} of {method.scans} scans" if method.lost_scans else "unreliable"
+    return f"{_SYMBOLS.get(method.status, '✕')} {text}"

@@ -37,7 +37,7 @@ from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.run import execute
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY, RunDirectory
-from lidarslam.storage.finished_run import read_summary
+from lidarslam.storage.finished_run import read_summary, where_astray
 
 # Between two samples of the memory; a sample costs a millisecond or two of a core.
 _PERIOD_S = 0.2
@@ -269,7 +269,7 @@ def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> tuple[Meth
     if ending.cause == "interrupt":
         return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
     if has_result and ending.status in (0, _LOST):
-        return ("lost", _where_lost(folder)) if ending.status else ("ok", "")
+        return ("lost", where_astray(read_summary(folder)) or "") if ending.status else ("ok", "")
     return _failed(ending.status, has_result, log)
 
 
@@ -284,15 +284,6 @@ def _failed(status: int, has_result: bool, log: Path) -> tuple[MethodStatus, str
     if status < 0:
         return "failed", f"{signal.strsignal(-status)} (signal {-status}){said and f': {said}'}"
     return ("stopped" if has_result else "failed"), said or f"ended with status {status} and said nothing"
-
-
-def _where_lost(folder: Path) -> str:
-    summary = read_summary(folder)
-    for first in summary["lost"]:
-        return f"first lost on scan {first['first']}: {first['reason']}"
-    for slid in summary["map_contradictions"]:
-        return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"
-    return f"{summary['unconstrained_m']:.1f} m of its way are hardly constrained"
 
 
 def main() -> int:

@@ -24,7 +24,7 @@ from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RERUN
-from lidarslam.storage.finished_run import is_unconstrained, read_summary
+from lidarslam.storage.finished_run import read_summary, where_astray
 from lidarslam.storage.unfinished import About, Unfinished
 
 logger = logging.getLogger(__name__)
@@ -61,8 +61,7 @@ def lost_when_finished(request: RunRequest) -> bool | None:
         was_run = tree.pop(files.RUN_SECTION)
         was = Config.model_validate(tree).model_dump(exclude=WITHOUT_EFFECT)
         summary = read_summary(out)
-        lost = summary["lost_scans"] > 0 or len(summary.get("map_contradictions", [])) > 0
-        lost |= is_unconstrained(summary.get("unconstrained_m", 0.0), summary.get("length_m", 0.0))
+        lost = where_astray(summary) is not None
     except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
     if request.config.reader.elevation_correction_deg == "auto":

@@ -195,6 +195,18 @@ def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
     return unconstrained_m > _MOST_UNCONSTRAINED * max(length_m, _SHORTEST_M)
 
 
+def where_astray(summary: Mapping[str, Any]) -> str | None:
+    """Why a run ends with exit status 3, by its summary.json; None where it is reliable."""
+    for first in summary["lost"]:
+        return f"first lost on scan {first['first']}: {first['reason']}"
+    for slid in summary.get("map_contradictions", []):
+        return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"
+    unconstrained_m = summary.get("unconstrained_m", 0.0)
+    if is_unconstrained(unconstrained_m, summary.get("length_m", 0.0)):
+        return f"{unconstrained_m:.1f} m of its path are hardly constrained"
+    return None
+
+
 def read_summary(path: Path) -> dict[str, Any]:
     """The content of a run's summary.json, empty when there is none; InputError where it is damaged."""
     file = path / files.SUMMARY

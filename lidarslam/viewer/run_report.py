@@ -23,7 +23,7 @@ from lidarslam.evaluation.report.report import render_run
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import MAP_TILES, SCANS_CSV, RunDirectory
-from lidarslam.storage.finished_run import read_scans, read_summary, read_trajectory
+from lidarslam.storage.finished_run import read_scans, read_summary, read_trajectory, where_astray
 from lidarslam.viewer.picture import draw_runs, fit_frame, load_drawn_runs
 
 logger = logging.getLogger(__name__)
@@ -86,9 +86,9 @@ def _write_picture(directory: RunDirectory, name: str, pixels: NDArray[np.uint8]
 def _page(run: Path, errors: MethodResult, reference_name: str, notes: Sequence[str], picture: str | None) -> str:
     summary, settings = read_summary(run), (run / files.CONFIG).read_text(encoding="utf-8")
     described = read_yaml(run / files.CONFIG).get(files.RUN_SECTION) or {}
-    name, is_lost = run.resolve().name, bool(summary["lost_scans"])
-    result = replace(errors, name=name, status="lost" if is_lost else "ok", peak_rss_mb=summary["peak_rss_mb"])
-    result = with_run(result, run)
+    name, where = run.resolve().name, where_astray(summary)
+    result = replace(errors, name=name, status="ok" if where is None else "lost", message=where or "")
+    result = with_run(replace(result, peak_rss_mb=summary["peak_rss_mb"]), run)
     result = replace(result, trajectory=errors.trajectory or result.trajectory, series=_series(run, result.scans))
     reference = None if errors.metrics is None else errors.metrics.association.reference
     return render_run(
