@@ -114,6 +114,15 @@ def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_m
     np.testing.assert_allclose([[band["x0"], band["x1"]] for band in bands], [[0.1, 0.3], [0.4, 0.5]], atol=1e-6)
 
 
+def test_the_status_of_a_run_of_which_much_is_unconstrained_is_not_ok(finished_run: Path) -> None:
+    summary = json.loads((finished_run / "summary.json").read_text())
+    (finished_run / "summary.json").write_text(json.dumps(summary | {"unconstrained_m": 0.9 * summary["length_m"] + 1}))
+    assert leave_report(finished_run, NO_ERRORS)
+    html = (finished_run / "report.html").read_text()
+    assert "unreliable" in html
+    assert "of its path are hardly constrained" in html
+
+
 def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path: Path, whole_run: Path) -> None:
     methods = {"a": {"run": "room/a"}, "b": {"run": "room/b"}, "failed": {"run": None}}
     for name in "ab":
