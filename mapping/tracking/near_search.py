@@ -53,6 +53,9 @@ _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
 _LIKELIHOOD_CAUTION = 2.0
 # Distance of another optimum, cells.
 _APART_CELLS = 1.0
+# Standard deviations of the prediction within which rivals are looked for along the least constrained direction, where
+# one is at least so many cells; their spacing and largest distance from the prediction, cells.
+_RIVAL_SIGMAS, _LEAST_RIVAL_CELLS, _RIVAL_CELLS, _MOST_RIVAL_CELLS = 2.0, 2.0, 2.0, 16.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,7 @@ class NearSearch:
             self.at_any_speed,
             self.from_odometry,
             self.along_weakest,
+            self.against_rivals,
         ):
             if self.matcher.budget.is_spent:
                 break
@@ -234,6 +238,31 @@ class NearSearch:
         others = [other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m]
         best = max(others, key=self._likely_quality, default=near)
         return best if self._likely_quality(best) > _CLEARLY_BETTER * self._likely_quality(near) else near
+
+    def against_rivals(self, near: Attempt) -> Attempt:
+        """Where an odometry leaves the weakest direction uncertain: a rival within that is a place that fits, too.
+
+        At low rates on stairs, the odometry is uncertain by more than the next step, and half of the steps fit.
+        """
+        prediction, cell_m, direction = near.prediction, self.matcher.local_map.cell_m, near.fit.weakest
+        is_measured = self.prior.T_prev_curr is not None and self.state.velocity_known
+        if near.status is Status.LOST or direction is None or not is_measured:
+            return near
+        sigma_m = prediction.sigma_along(np.array(direction))
+        if sigma_m < _LEAST_RIVAL_CELLS * cell_m:
+            return near
+        away_m = float(np.array(direction) @ (near.T_world_lidar - prediction.T_world_lidar)[:3, 3])
+        count = int(min(_RIVAL_SIGMAS * sigma_m / cell_m, _MOST_RIVAL_CELLS) / _RIVAL_CELLS)
+        offsets_m = np.arange(-count, count + 1) * _RIVAL_CELLS * cell_m - away_m
+        here = replace(prediction, T_world_lidar=near.T_world_lidar)
+        for offset_m in sorted(offsets_m[np.abs(offsets_m) > _RIVAL_CELLS * cell_m], key=abs):
+            if self.matcher.budget.is_spent:
+                break
+            start = here.displaced(offset_m * np.array(direction))
+            rival = near.rival_of([self.matcher.attempt(prediction, start, coarse_first=False)])
+            if rival is not None:
+                return replace(near, rival=rival)
+        return near
 
     def _likely_quality(self, attempt: Attempt) -> float:
         """The quality of an attempt, times the likelihood of its motion by a proven odometry."""
