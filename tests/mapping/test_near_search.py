@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,10 +28,10 @@ HERE, LOWER = np.eye(4), make_transform(np.eye(3), [0.0, 0.0, -1.5 * SHELVES_M])
 Scene = Callable[[np.random.Generator, int], FloatArray]
 
 
-def finned_corridor(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points (N, 3) on walls, floor and fins."""
+def finned_corridor(rng: np.random.Generator, count: int, share: float = 0.4) -> FloatArray:
+    """Points (N, 3) on walls, floor and, this share of them, fins."""
     points, kind = rng.uniform(-2.0, 2.0, (count, 3)), rng.random(count)
-    on_fin, on_wall, on_floor = kind < 0.4, (kind > 0.4) & (kind < 0.8), kind > 0.8
+    on_fin, on_wall, on_floor = kind < share, (kind > share) & (kind < 0.8), kind > 0.8
     points[:, 0] *= 1.5
     points[on_fin, 0] = FINS_M * rng.integers(-5, 6, on_fin.sum())
     points[on_fin, 1] = np.sign(points[on_fin, 1]) * rng.uniform(1.6, 2.0, on_fin.sum())
@@ -102,6 +103,23 @@ def test_a_motion_that_is_known_has_no_rival(in_corridor, prior, sigma_m):
     found = at_any_speed(in_corridor, prior, sigma_m)
     assert found.rival is None
     assert found.unconstrained == ()
+
+
+@pytest.mark.parametrize(("prior", "sigma_m"), [(Prior(HERE), 0.35), (Prior(HERE), 0.05), (Prior(), 0.35)])
+def test_another_place_is_a_rival_where_an_odometry_leaves_the_motion_open(prior, sigma_m):
+    matcher = matcher_of(partial(finned_corridor, share=0.1), 1.5)
+    in_view = np.flatnonzero(np.abs(matcher.scan.keypoints.points[:, 0]) < 2.3)
+    matcher = replace(matcher, scan=replace(matcher.scan, keypoints=matcher.scan.keypoints.take(in_view)))
+    near = registered(matcher, HERE, (sigma_m, 0.04, 0.04))
+    state = replace(TrackingState(), velocity_known=True)
+    found = NearSearch(matcher, state, prior, near.prediction).against_rivals(near)
+    assert found.T_world_lidar is near.T_world_lidar
+    if prior.T_prev_curr is None or sigma_m < 0.1:
+        assert found.rival is None
+    else:
+        assert 4.0 * CELL_M < abs(found.rival[0]) < 2.0 * sigma_m
+        np.testing.assert_allclose(found.rival[1:], 0.0, atol=0.02)
+        assert found.unconstrained == ("x",)
 
 
 def from_odometry(matcher: ScanMatcher, near: Attempt, T_told: FloatArray | None) -> Attempt:
