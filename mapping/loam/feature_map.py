@@ -48,7 +48,7 @@ _MOST_TILT = 0.05
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
-# Mean cosine from which on a plane was seen from one side: a point on the other belongs to another, as of a thin wall.
+# Mean cosine of the views beyond which a plane faces away from the sensor, as the other face of a thin wall does.
 _SIDE_COSINE = 0.05
 # Points whose slots are prefetched.
 _PREFETCHED = 4

@@ -240,25 +240,26 @@ class NearSearch:
         return best if self._likely_quality(best) > _CLEARLY_BETTER * self._likely_quality(near) else near
 
     def against_rivals(self, near: Attempt) -> Attempt:
-        """Where an odometry leaves the weakest direction uncertain: a rival within that is a place that fits, too.
+        """Where an odometry leaves the weakest direction uncertain: another place along it that fits is a rival.
 
         At low rates on stairs, the odometry is uncertain by more than the next step, and half of the steps fit.
         """
-        prediction, cell_m, direction = near.prediction, self.matcher.local_map.cell_m, near.fit.weakest
+        prediction, cell_m = near.prediction, self.matcher.local_map.cell_m
         is_measured = self.prior.T_prev_curr is not None and self.state.velocity_known
-        if near.status is Status.LOST or direction is None or not is_measured:
+        if near.status is Status.LOST or near.fit.weakest is None or not is_measured:
             return near
-        sigma_m = prediction.sigma_along(np.array(direction))
+        direction = np.array(near.fit.weakest)
+        sigma_m = prediction.sigma_along(direction)
         if sigma_m < _LEAST_RIVAL_CELLS * cell_m:
             return near
-        away_m = float(np.array(direction) @ (near.T_world_lidar - prediction.T_world_lidar)[:3, 3])
+        away_m = float(direction @ (near.T_world_lidar - prediction.T_world_lidar)[:3, 3])
         count = int(min(_RIVAL_SIGMAS * sigma_m / cell_m, _MOST_RIVAL_CELLS) / _RIVAL_CELLS)
         offsets_m = np.arange(-count, count + 1) * _RIVAL_CELLS * cell_m - away_m
         here = replace(prediction, T_world_lidar=near.T_world_lidar)
         for offset_m in sorted(offsets_m[np.abs(offsets_m) > _RIVAL_CELLS * cell_m], key=abs):
             if self.matcher.budget.is_spent:
                 break
-            start = here.displaced(offset_m * np.array(direction))
+            start = here.displaced(offset_m * direction)
             rival = near.rival_of([self.matcher.attempt(prediction, start, coarse_first=False)])
             if rival is not None:
                 return replace(near, rival=rival)
