@@ -44,6 +44,9 @@ _SHARED = 120.0
 # Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
 # ring, five points make planes of any direction, and these move with the rings.
 _MOST_TILT = 0.05
+# Least width of a plane, a standard deviation: per distance along it from the sensor, and at most. A ring that is swept
+# a little, as by a sensor that starts to move, makes a plane that errors of attitude tilt, the more the narrower it is.
+_LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 114.0, 0.08
 # From this on, a plane of coarser voxels is asked for.
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
@@ -89,13 +92,15 @@ def add_moments(points: FloatArray, rows: Rows, sensor: FloatArray, sums: FloatA
 
 @compiled
 def match_features(
-    points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, voxels: Voxels, sensor: FloatArray, found: Surfaces
+    points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, voxels: Voxels, sensor: FloatArray,
+    least_width: float, found: Surfaces,
 ) -> int:  # fmt: skip
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
     `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
     normal, are moved to its beginning. A plane that is known better takes the place of another. The normal of a plane
     faces the sensor (3,), and so did the plane when it was seen; the first of a line points from that to the point.
+    Planes are at least as wide as a share of their distance along them, `least_width`.
 
     Returns:
         Number of the points that were moved.
@@ -123,8 +128,12 @@ def match_features(
             if not is_line and variances[1] > max(_PLANE_RATIO * variances[2], _FLAT_RATIO * variances[0]):
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
+                cosine = _turn_to(sensor, mean, axis)
+                along_m = math.sqrt(squared_distance(sensor, mean) * (1.0 - cosine * cosine))
+                width_m = min(least_width * along_m, _LEAST_WIDTH_M)
                 if (
-                    _turn_to(sensor, mean, axis) > _LEAST_COSINE
+                    cosine > _LEAST_COSINE
+                    and variances[1] > width_m * width_m
                     and tilt < _MOST_TILT
                     and _is_surface(near[:count], number, voxels.sums, mean, axis, most_off)
                 ):
@@ -338,11 +347,12 @@ class FeatureMatcher(Matcher):
 
     Args:
         edges, planes: grids of voxels, the finest first.
+        least_width: see `match_features`.
         sweep: with the kinds of its points; without, all points are planar.
     """
 
-    def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], sweep: Sweep) -> None:
-        self._edges, self._planes = edges, planes
+    def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], least_width: float, sweep: Sweep) -> None:
+        self._edges, self._planes, self._least_width = edges, planes, least_width
         self._is_edge = _edges_of(sweep)
         self._matched = np.full((len(sweep), 3), np.inf)  # where the points were matched
         self.surfaces = Surfaces.none(len(sweep))
@@ -357,18 +367,22 @@ class FeatureMatcher(Matcher):
             for grid in grids:
                 if not len(unmatched):
                     break
-                left = match_features(points, unmatched, is_line, grid.voxels, sensor, self.surfaces)
+                given = sensor, self._least_width, self.surfaces
+                left = match_features(points, unmatched, is_line, grid.voxels, *given)
                 unmatched = unmatched[:left]
 
 
 class FeatureMap(LocalMap):
     """Edges and planar points within a radius of the sensor."""
 
+    velocity_gains = np.full(6, 0.3)  # features do not swing, and in fields they are noisier
     _edges: list[VoxelGrid]
     _planes: list[VoxelGrid]
+    _least_width: float  # of planes; none where points do not lie in rings
 
     def __init__(self, cell_m: float, radius_m: float) -> None:
         super().__init__(cell_m, radius_m)
+        self._least_width = 0.0
         self._edges, self._planes = ([VoxelGrid(cell_m * level) for level in LEVELS] for _ in range(2))
 
     @property
@@ -376,16 +390,17 @@ class FeatureMap(LocalMap):
         return [*self._edges, *self._planes]
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
-        is_edge = _edges_of(scan.sweep)
+        is_edge, self._least_width = _edges_of(scan.sweep), _LEAST_WIDTH if scan.has_rings else 0.0
         for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
             for grid in grids:
                 grid.insert(chosen, sensor)
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
-        return FeatureMatcher(self._edges[level:], self._planes[level:], sweep)
+        return FeatureMatcher(self._edges[level:], self._planes[level:], self._least_width, sweep)
 
     def resample(self, other: "FeatureMap") -> None:
+        self._least_width = other._least_width
         for grids, finest in ((self._edges, other._edges[0]), (self._planes, other._planes[0])):
             for grid in grids:
                 grid.insert_means(finest)
@@ -401,7 +416,8 @@ class FeatureMap(LocalMap):
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))
         voxels = self._planes[-1].voxels
-        match_features(np.ascontiguousarray(points), unmatched, False, voxels, np.array(sensor), found)
+        given = np.array(sensor), self._least_width, found
+        match_features(np.ascontiguousarray(points), unmatched, False, voxels, *given)
         return found.normals[:, 0], np.where(found.counts > 0, found.thickness_m[:, 0], np.inf)
 
 

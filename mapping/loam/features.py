@@ -10,7 +10,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.sampled_scan import MAP_SPACING, Sampler
+from lidarslam.mapping.registration.sampled_scan import MAP_SPACING, MOST_SPACING_M, Sampler
 
 EDGE, PLANE = 1, 2
 # Neighbours to either side that the curvature of a point is of, and that a chosen point excludes.
@@ -25,8 +25,6 @@ _GAP_M2, _BESIDE = 0.1, 0.1
 _PARALLEL = 0.0002
 # Largest number of edges that are registered, and their spacing in cells.
 _MOST_EDGES, _EDGE_SPACING = 1000, 1.0
-# Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
-_MOST_SPACING_M = 0.4
 # Curvature above which a point is an edge, square metres: that of the authors' program. All others are planar.
 _CURVATURE_M2 = 0.1
 # An edge needs this many times the median curvature as well, three standard deviations of the noise. Flat surfaces seen
@@ -86,8 +84,16 @@ def classify(
             for sector in range(_SECTORS):
                 first = begin + (end - begin) * sector // _SECTORS
                 last = begin + (end - begin) * (sector + 1) // _SECTORS
-                _pick_edges(points, curvature, edge_above, first, last, free, kinds)
+                above = max(edge_above, _ABOVE_NOISE * _median(curvature[first:last:_SAMPLED]))
+                _pick_edges(points, curvature, above, first, last, free, kinds)
             begin = end
+
+
+@compiled_part
+def _median(values: FloatArray) -> float:
+    """Of those that are finite; 0 where none is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 @compiled_part
@@ -155,9 +161,9 @@ def squared_distance(p: FloatArray, q: FloatArray) -> float:
 class FeatureSampler(Sampler):
     """Edges and planar points."""
 
-    def _cell_m(self, squared: FloatArray) -> float:
-        cell_m = super()._cell_m(squared)
-        return cell_m if self._config.cell_m is not None else min(cell_m, _MOST_SPACING_M)
+    @property
+    def _most_cell_m(self) -> float:
+        return MOST_SPACING_M
 
     def _choose(self, scan: Scan, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
         if self._has_rings is not False:
@@ -190,10 +196,7 @@ def find_features(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
     ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
     curvature, kinds = np.empty(len(points)), np.empty(len(points), dtype=np.int8)
     write_curvatures(points, rings, curvature)
-    known = curvature[::_SAMPLED]
-    known = known[np.isfinite(known)]
-    noise_m2 = float(np.median(known)) if len(known) else 0.0
-    classify(points, ranges, rings, curvature, max(_CURVATURE_M2, _ABOVE_NOISE * noise_m2), kinds)
+    classify(points, ranges, rings, curvature, _CURVATURE_M2, kinds)
     return order, kinds
 
 

@@ -14,11 +14,6 @@ from lidarslam.core.state import Shape
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import MotionState
 
-# Share of a difference by which the correction changes with a sweep, rotation first. The map receives the corrected
-# sweeps, and the next velocity is estimated from that: with a gain g, both together swing with a damping ratio of half
-# its square root. With surfels, a third let an office's pitch swing ever wider; in the sparse sweeps of a Mid-360, more
-# is noise. LOAM's features do not swing, and in fields they are noisier.
-_GAINS = {"surfels": np.array([0.8] * 3 + [0.5] * 3), "loam": np.full(6, 0.3)}
 # The largest difference that counts, rad/s and m/s: a sudden acceleration makes a larger one, and is no bias.
 _MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
 # Sweeps follow one another where they cover this share of the interval between their stamps.
@@ -40,17 +35,19 @@ class VelocityBias:
 
     correction: Annotated[FloatArray, Shape(6)] = field(default_factory=lambda: np.zeros(6))  # rotation first
 
-    def updated(self, last: MotionState, state: MotionState, seen_from_s: float, method: str) -> "VelocityBias":
-        """The bias after another sweep, as a method estimated it, and the corrected one before; none after a gap.
+    def updated(self, last: MotionState, state: MotionState, seen_from_s: float, gains: FloatArray) -> "VelocityBias":
+        """The bias after another sweep, as it was estimated, and the corrected one before; none after a gap.
 
-        The sweep begins `seen_from_s` before its stamp.
+        The sweep begins `seen_from_s` before its stamp. The gains (6,) are shares of the difference, rotation first.
+        The map receives the corrected sweeps, and the next velocity is estimated from that: with a gain g, both
+        together swing with a damping ratio of half its square root.
         """
         interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
         if not covered_s > _COVERED * interval_s > 0.0:
             return VelocityBias()
         now = replace(state, velocity=state.velocity + self.correction)
         error = velocity_error(last, now, last.seen_until_s / covered_s)
-        return VelocityBias(self.correction + _GAINS[method] * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE))
+        return VelocityBias(self.correction + gains * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE))
 
     def corrected(self, state: MotionState) -> MotionState:
         """The state with the corrected velocity, and the pose that is most likely given that."""

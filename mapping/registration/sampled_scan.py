@@ -19,7 +19,9 @@ MIN_POINTS = 60
 # Cells per median range, and bounds of their size. Where walls are closer than a few metres, the cells are the
 # smallest: steps and door frames are as large in a wider stairwell.
 _CELLS_PER_RANGE = 30.0
-_CELL_BOUNDS_M = (0.05, 1.0)
+_LEAST_CELL_M, _MOST_CELL_M = 0.05, 1.0
+# Largest cells for planes through neighbours: in sparser maps, these are too far apart.
+MOST_SPACING_M = 0.4
 _CLOSE_M = 3.0
 # The cell size changes when the smoothed median range has changed by this factor.
 _RANGE_CHANGE = 2.0
@@ -95,9 +97,9 @@ class Sampler(Stateful):
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
         squared = squared_ranges(scan.points)
-        cell_m = self._cell_m(squared)
         if self._has_rings is None and len(scan) >= _INSTANTS:
             self._has_rings = has_rings(scan)
+        cell_m = self._cell_m(squared)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
         kept, kinds = self._choose(scan, cell_m)
         inside = squared.take(kept)
@@ -125,8 +127,12 @@ class Sampler(Stateful):
         if self._range_m > 0.0 and not low_m <= self._range_m <= high_m:
             self._cell_range_m = self._range_m
         if self._cell_range_m < _CLOSE_M:
-            return _CELL_BOUNDS_M[0]
-        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
+            return _LEAST_CELL_M
+        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, _LEAST_CELL_M, self._most_cell_m))
+
+    @property
+    def _most_cell_m(self) -> float:
+        return MOST_SPACING_M if self._has_rings is False else _MOST_CELL_M
 
     def _choose(self, scan: Scan, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
         """Indices (N,) of the points for the map, and their kinds (N,), if there are several."""

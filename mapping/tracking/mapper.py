@@ -194,8 +194,9 @@ class Mapper(Stateful):
 
     def _new_map(self, scan: SampledScan, state: MotionState) -> LocalMap:
         """A map of one scan."""
-        kind = FeatureMap if self._config.method == "loam" else SurfelMap
-        local_map = kind(scan.cell_m, self._config.radius_m)
+        # Of sparse strokes, few cells have more than one; a plane through neighbouring voxels spans several.
+        is_surfels = self._config.method == "surfels" and scan.has_rings
+        local_map = (SurfelMap if is_surfels else FeatureMap)(scan.cell_m, self._config.radius_m)
         logger.info("new local map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
         self._map_since = self._scans
         self._insert(scan, state, local_map)

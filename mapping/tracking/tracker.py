@@ -91,7 +91,7 @@ class Tracker(Stateful):
         if relocalised or jumped or not tracking.velocity_known or prior.inertial is not None:
             bias = VelocityBias()
         elif is_timed:
-            bias = bias.updated(last, state, scan.seen_from_s, self._config.method)
+            bias = bias.updated(last, state, scan.seen_from_s, attempt.local_map.velocity_gains)
             state = bias.corrected(state)
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not relocalised:
