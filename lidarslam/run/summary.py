@@ -268,7 +268,7 @@ def _unconstrained_m(log: ScanLog) -> float:
     """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
 
     A degraded first motion counts with what it lacks of a walking speed: amid people who walk along, it appears to be
-    none.
+    none. Where the second one differs by half of it, all of it counts.
     """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
@@ -276,7 +276,8 @@ def _unconstrained_m(log: ScanLog) -> float:
     lengths_m = np.linalg.norm(moved * open_axes, axis=1)
     if log.statuses[1:2] == [Status.DEGRADED]:
         walked_m = _WALKING_MPS * (log.stamps[1] - log.stamps[0])
-        lengths_m[0] = max(lengths_m[0], walked_m - np.linalg.norm(moved[0]))
+        first_m, change_m = np.linalg.norm([moved[0], moved[0] - moved[min(1, len(moved) - 1)]], axis=1)
+        lengths_m[0] = max(lengths_m[0], walked_m - first_m, first_m if change_m > 0.5 * first_m else 0.0)
     return float(lengths_m.sum())
 
 
