@@ -30,6 +30,7 @@ from lidarslam.mapping.loam.feature_map import NEIGHBOURS, VoxelGrid, match_feat
 from lidarslam.mapping.loam.features import PLANE
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.registration.local_map import Surfaces
+from lidarslam.mapping.surfels.surfel_kernels import views_of
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.threads import in_order
 
@@ -61,18 +62,18 @@ def _cells(scans: list[Scan]) -> list[str]:
             rows.append(_times(grid, planes, keypoints, state.T_world_lidar[:3, 3]))
         else:
             grid = VoxelGrid(sampled.cell_m)
-            grid.insert(planes, state.T_world_lidar[:3, 3])
+            grid.insert(planes, views_of(planes, state.T_world_lidar[:3, 3]))
     assert grid is not None
     return [f"{len(grid):,}", *(f"{value:.1f}" for value in np.median(rows[1:], axis=0))]
 
 
 def _times(grid: VoxelGrid, planes: FloatArray, keypoints: FloatArray, sensor: FloatArray) -> list[float]:
-    means, found = grid.means, Surfaces.none(len(keypoints))
+    means, found, given = grid.means, Surfaces.none(len(keypoints)), (grid.voxels, sensor, 0.0)
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(means), o3d.core.int32)
     index_ms = _timed(search.knn_index)
     theirs_ms = _timed(lambda: search.knn_search(o3d.core.Tensor.from_numpy(keypoints), NEIGHBOURS))
-    ours_ms = _timed(lambda: match_features(keypoints, np.arange(len(keypoints)), False, grid.voxels, sensor, found))
-    insert_ms = _timed(lambda: grid.insert(planes, sensor))
+    ours_ms = _timed(lambda: match_features(keypoints, np.arange(len(keypoints)), False, *given, found))
+    insert_ms = _timed(lambda: grid.insert(planes, views_of(planes, sensor)))
     return [index_ms, theirs_ms, insert_ms, ours_ms]
 
 

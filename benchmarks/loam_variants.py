@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 from mapping_accuracy import add_simulation_arguments, localise, print_header, print_row, recordings
+from numpy.typing import NDArray
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray
@@ -41,8 +42,8 @@ def published_edges() -> Iterator[None]:
 def published_planes() -> Iterator[None]:
     """One point a voxel, the mean of all, for a while."""
 
-    def add_mean(points: FloatArray, rows: Rows, sensor: FloatArray, sums: FloatArray) -> None:
-        add_moments(points, rows, sensor, sums)
+    def add_mean(points: FloatArray, views: NDArray[np.float32], rows: Rows, sums: FloatArray) -> None:
+        add_moments(points, views, rows, sums)
         means = sums[:, 1:4] / sums[:, :1]
         products = [means[:, i] * means[:, j] for i, j in SYMMETRIC]
         sums[:, 4:10] = sums[:, :1] * np.stack(products, axis=1)

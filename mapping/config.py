@@ -34,7 +34,9 @@ class MappingConfig(Settings):
     """Scan-to-map registration."""
 
     method: Annotated[str, BeforeValidator(MAPPINGS.check)] = Field(
-        "surfels", description="surfels, loam (LOAM's mapping), off (the odometry alone), or another package's"
+        "surfels",
+        description="surfels (without rings: LOAM's planes), loam (LOAM's mapping), off (the odometry alone), or another"
+        " package's",
     )
     cell_m: float | None = Field(
         None, ge=0.02, le=10.0, description="edge of the finest cells, LOAM's spacing; null: 1/30 of the median range"

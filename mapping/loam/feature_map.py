@@ -16,6 +16,7 @@ from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.surfels.surfel_kernels import views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 from lidarslam.mapping.surfels.voxel_hash import (
     ABSENT,
@@ -75,16 +76,15 @@ class Voxels(NamedTuple):
 
 
 @compiled
-def add_moments(points: FloatArray, rows: Rows, sensor: FloatArray, sums: FloatArray) -> None:
-    """Add points (N, 3), seen from (3,), to the sums (M, 13) of their rows (N,), unless these are frozen."""
+def add_moments(points: FloatArray, views: NDArray[np.float32], rows: Rows, sums: FloatArray) -> None:
+    """Add points and their views (N, 3) to the sums (M, 13) of their rows (N,), unless these are frozen."""
     for n in range(len(points)):
         cell = sums[rows[n]]
         if cell[0] < _MOST_POINTS:
             cell[0] += 1.0
-            range_m = math.sqrt(max(squared_distance(points[n], sensor), 1e-12))
             for axis in range(3):
                 cell[1 + axis] += points[n, axis]
-                cell[10 + axis] += (sensor[axis] - points[n, axis]) / range_m
+                cell[10 + axis] += views[n, axis]
             for entry in range(6):
                 i, j = SYMMETRIC[entry]
                 cell[4 + entry] += points[n, i] * points[n, j]
@@ -306,8 +306,8 @@ class VoxelGrid(Stateful):
         """(M, 3) in the world."""
         return np.asarray(self._sums[:, 1:4] / self._sums[:, :1], dtype=np.float64)
 
-    def insert(self, points: FloatArray, sensor: FloatArray) -> None:
-        """Insert points (N, 3) of the world, seen from (3,)."""
+    def insert(self, points: FloatArray, views: NDArray[np.float32]) -> None:
+        """Insert points (N, 3) of the world, with unit views (N, 3) towards the sensor."""
         keys = point_keys(points, self.cell_m)
         rows = self._hash.insert(keys)
         new = len(self._hash) - len(self._keys)
@@ -315,7 +315,7 @@ class VoxelGrid(Stateful):
             self._keys = np.concatenate([self._keys, np.empty(new, dtype=np.int64)])
             self._keys[rows] = keys
             self._sums = np.concatenate([self._sums, np.zeros((new, 13))])
-        add_moments(np.ascontiguousarray(points), rows, np.array(sensor), self._sums)
+        add_moments(points, views, rows, self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:
         """Insert the voxels of another grid, with their numbers of points."""
@@ -390,13 +390,14 @@ class FeatureMap(LocalMap):
         return [*self._edges, *self._planes]
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
-        is_edge, self._least_width = _edges_of(scan.sweep), _LEAST_WIDTH if scan.has_rings else 0.0
-        for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
+        self._least_width = _LEAST_WIDTH if scan.has_rings else 0.0
+        views, is_edge = views_of(points, sensor), _edges_of(scan.sweep)
+        for grids, chosen in ((self._edges, is_edge), (self._planes, ~is_edge)):
             for grid in grids:
-                grid.insert(chosen, sensor)
+                grid.insert(points[chosen], views[chosen])
         self._count(sensor)
 
-    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
+    def matcher(self, sweep: Sweep, level: int = 0) -> FeatureMatcher:
         return FeatureMatcher(self._edges[level:], self._planes[level:], self._least_width, sweep)
 
     def resample(self, other: "FeatureMap") -> None:

@@ -27,12 +27,12 @@ _PARALLEL = 0.0002
 _MOST_EDGES, _EDGE_SPACING = 1000, 1.0
 # Curvature above which a point is an edge, square metres: that of the authors' program. All others are planar.
 _CURVATURE_M2 = 0.1
-# An edge needs this many times the median curvature as well, three standard deviations of the noise. Flat surfaces seen
-# with a range noise of more than one centimetre exceed the published threshold all over, and these edges, on rings that
-# move with the sensor, hold it back.
+# An edge needs this many times the median curvature of its sector as well, three standard deviations of the noise. Flat
+# surfaces seen with a range noise of more than one centimetre exceed the published threshold all over, and so does
+# rough ground seen at a grazing angle; these edges, on rings that move with the sensor, hold it back.
 _ABOVE_NOISE = 20.0
-# The median is taken over one in this many points.
-_SAMPLED = 4
+# The median is taken over about so many of its points.
+_SAMPLED = 64
 # A cloud is stored ring after ring when nearly all azimuths run in one sense, over at least this many rings.
 _SAME_WAY, _FEWEST_RINGS = 0.95, 4
 # Width of the bins of elevation in which rings are peaks, and least height of a peak as a share of the mean.
@@ -65,7 +65,7 @@ def write_curvatures(points: FloatArray, rings: NDArray[np.intp], curvature: Flo
 
 @compiled
 def classify(
-    points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], curvature: FloatArray, edge_above: float,
+    points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], curvature: FloatArray, above_noise: float,
     kinds: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Write whether points are edges, planar, or neither.
@@ -73,7 +73,8 @@ def classify(
     Args:
         points, ranges: (N, 3) and (N,), ring after ring.
         rings, curvature: (N,) of the points.
-        edge_above: threshold of the curvature, square metres; the others are planar where they are reliable.
+        above_noise: multiple of its sector's median curvature that an edge needs; the others are planar where they are
+            reliable.
         kinds: (N,) written.
     """
     free = np.empty(len(points), dtype=np.bool_)
@@ -84,15 +85,16 @@ def classify(
             for sector in range(_SECTORS):
                 first = begin + (end - begin) * sector // _SECTORS
                 last = begin + (end - begin) * (sector + 1) // _SECTORS
-                above = max(edge_above, _ABOVE_NOISE * _median(curvature[first:last:_SAMPLED]))
-                _pick_edges(points, curvature, above, first, last, free, kinds)
+                edge_above = max(_CURVATURE_M2, above_noise * _median(curvature[first:last]))
+                _pick_edges(points, curvature, edge_above, first, last, free, kinds)
             begin = end
 
 
 @compiled_part
 def _median(values: FloatArray) -> float:
-    """Of those that are finite; 0 where none is."""
-    known = values[np.isfinite(values)]
+    """Of a sample of those that are finite; 0 where none is."""
+    sample = values[:: max(1, len(values) // _SAMPLED)]
+    known = sample[np.isfinite(sample)]
     return float(np.median(known)) if len(known) else 0.0
 
 
@@ -196,7 +198,7 @@ def find_features(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
     ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
     curvature, kinds = np.empty(len(points)), np.empty(len(points), dtype=np.int8)
     write_curvatures(points, rings, curvature)
-    classify(points, ranges, rings, curvature, _CURVATURE_M2, kinds)
+    classify(points, ranges, rings, curvature, _ABOVE_NOISE, kinds)
     return order, kinds
 
 

@@ -98,6 +98,13 @@ def write_views(points: FloatArray, sensor: FloatArray, views: Floats) -> None:
         views[n, 0], views[n, 1], views[n, 2] = x * scale, y * scale, z * scale
 
 
+def views_of(points: FloatArray, sensor: FloatArray) -> NDArray[np.float32]:
+    """The unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
+    views = np.empty((len(points), 3), dtype=np.float32)
+    write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
+    return views
+
+
 @compiled
 def add_moments(
     points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,

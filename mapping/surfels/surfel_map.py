@@ -18,7 +18,7 @@ from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
-from lidarslam.mapping.surfels.surfel_kernels import is_steep, write_views
+from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 
 # A single ring bent around a corner spans a plane too, that of its own rays. A plane seen at a grazing angle counts
@@ -156,12 +156,11 @@ class SurfelMatcher(Matcher):
     """Surfels of the cells that N points lie in, of grids that do not change meanwhile, the finest first.
 
     A point that has stayed in its cell keeps its surface: once an iteration moves by a small part of a cell, few are
-    looked up again. With `keeps_finest`, planes of uncertain normals are kept: in a young map coarser ones are of a
-    few strokes. Without an IMU, whose prediction they would contradict, they still hold a fast start.
+    looked up again.
     """
 
-    def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
-        self._grids, self._certain_tilt = grids, np.inf if keeps_finest else _CERTAIN_TILT
+    def __init__(self, grids: Sequence[SurfelGrid], count: int) -> None:
+        self._grids = grids
         self._cells = np.full(count, _NOWHERE, dtype=np.int64)
         self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)
@@ -181,7 +180,7 @@ class SurfelMatcher(Matcher):
             if finest is None:
                 finest = np.empty(len(points), dtype=np.int32), surfels
                 finest[0][unmatched] = rows
-            given = self._spread_m, self._certain_tilt, self.surfaces
+            given = self._spread_m, _CERTAIN_TILT, self.surfaces
             unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, *given)]
         assert finest is not None
         match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
@@ -228,9 +227,7 @@ class SurfelMap(LocalMap):
 
     def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
         """Insert a scan: points (N, 3) of the world with elevations (N,), radians, seen from a position (3,)."""
-        views = np.empty((len(points), 3), dtype=np.float32)
-        write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
-        self.insert_seen(points, elevations, views)
+        self.insert_seen(points, elevations, views_of(points, sensor))
         self._count(sensor)
         if self.scans % _TIDIED_AFTER == 0:
             for grid in self._grids:
@@ -246,8 +243,8 @@ class SurfelMap(LocalMap):
         for grid in self._grids:
             grid.insert(points, elevations, views, weight)
 
-    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
-        return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
+    def matcher(self, sweep: Sweep, level: int = 0) -> SurfelMatcher:
+        return SurfelMatcher(self._grids[level:], len(sweep))
 
     def level_normals(self) -> FloatArray:
         grid = self._grids[-1]
@@ -279,10 +276,8 @@ def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: floa
     The points, in the LiDAR frame, have elevations (N,) above the sensor's equator, radians.
     """
     points, origin = np.ascontiguousarray(points), np.zeros(3)
-    views = np.empty((len(points), 3), dtype=np.float32)
-    write_views(points, origin, views)
     grid = SurfelGrid(_SCAN_CELLS * cell_m)
-    grid.insert(points, elevations, views)
+    grid.insert(points, elevations, views_of(points, origin))
     rows, surfaces = grid.find(points), Surfaces.none(len(points))
     spread_m = np.empty(len(points))
     match_planes(points, np.arange(len(points)), rows, grid.refreshed(rows), origin, spread_m, np.inf, surfaces)

@@ -156,7 +156,7 @@ class NearSearch:
         is_open = not self.state.velocity_known or self._is_open
         if not is_open and not self._is_poor(near):
             return near
-        displaced = self.matcher.budget.run(self._displaced(near))
+        displaced = self.matcher.budget.run(self._displaced())
         if displaced is None:
             return near
         best, (others,) = near, displaced
@@ -165,7 +165,7 @@ class NearSearch:
                 best = other
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
 
-    def _displaced(self, near: Attempt) -> Steps[list[Attempt]]:
+    def _displaced(self) -> Steps[list[Attempt]]:
         """Attempts that fit, from displacements since the last scan in every horizontal direction.
 
         A sensor at speed at the first scan, or with a wrong odometry, is out of reach of the predicted pose, and most
@@ -195,10 +195,7 @@ class NearSearch:
             moving = replace(last, velocity=velocity, covariance=UNKNOWN_VELOCITY)
             prediction = predict(moving, scan.stamp, Prior(), ProcessNoise(), self.matcher.config, scan.seen_from_s)
             attempts.append(self.matcher.attempt(prediction, prediction, patient=True))
-        # The map of one sparse sweep is thin, so that even the right place fits poorly.
-        is_thin = local_map.is_young and not scan.has_rings and near.status is Status.LOST
-        least = Status.DEGRADED if is_thin else Status.OK
-        return [attempt for attempt in attempts if attempt.status in (Status.OK, least)]
+        return [attempt for attempt in attempts if attempt.status is Status.OK]
 
     def from_odometry(self, near: Attempt) -> Attempt:
         """Where the prediction is uncertain along the weakest direction: from the odometry's motion.

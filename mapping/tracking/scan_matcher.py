@@ -18,8 +18,6 @@ from lidarslam.mapping.tracking.mapped_scan import Attempt
 
 # Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
-# Evidence below which the first sweeps without rings are held along a direction: their strokes seldom cross.
-_STROKES_EVIDENCE = 10.0
 # Evidence below which a direction is held at an IMU's prediction.
 _HELD_EVIDENCE = 4.0
 # Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
@@ -78,12 +76,12 @@ class ScanMatcher:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
         is_known = start.is_inertial and evidence < _HELD_EVIDENCE and start.sigma_along(direction) < _KNOWN_M
-        if is_known and (found := self._found_along(prediction, start, direction, keypoints)) is not None:
-            return found
-        if not is_known and (self.scan.has_rings or not self.local_map.is_young or evidence > _STROKES_EVIDENCE):
+        if not is_known:
             return attempt
+        if (found := self._found_along(prediction, start, direction, keypoints)) is not None:
+            return found
         held = self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
-        if not is_known or held.registration is None:
+        if held.registration is None:
             return held
         return replace(held, registration=held.registration.without(direction, start))
 

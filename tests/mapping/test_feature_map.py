@@ -138,6 +138,23 @@ def test_the_plane_of_a_ring_s_beams_is_no_surface(rng, heights_m):
         assert np.abs(found.normals[:, 0]).min() > 0.95
 
 
+@pytest.mark.parametrize(
+    ("half_m", "has_rings", "is_found"), [(0.08, True, False), (0.3, True, True), (0.08, False, True)]
+)
+def test_the_plane_of_a_ring_that_was_swept_a_little_is_tilted_by_attitudes(rng, half_m, has_rings, is_found):
+    """A floor six metres ahead: 0.1 degrees lift it by a centimetre."""
+    count = 6000
+    floor = np.column_stack(
+        [rng.uniform(-half_m, half_m, count) + 6.0, rng.uniform(-2.0, 2.0, count), np.full(count, -1.7)]
+    )
+    feature_map, sweep = FeatureMap(CELL_M, 100.0), Sweep(floor, None, kinds_of(NONE, floor))
+    elevations = np.full(count, -0.28 if has_rings else 0.0)
+    feature_map.add(SampledScan(0.0, CELL_M, 1.0, sweep, elevations, sweep), floor, ORIGIN)
+    asked = np.column_stack([np.full(50, 6.0), rng.uniform(-1.5, 1.5, 50), np.full(50, -1.7)])
+    found = feature_map.match(asked, np.eye(4))
+    assert (len(found) == 50) == is_found
+
+
 def test_across_a_corner_a_plane_is_uncertain(rng):
     sides = rng.uniform(0.0, 1.0, (2, 4000, 3)) * [1.0, 1.0, 2.0]
     sides[0, :, 0], sides[1, :, 1] = 0.0, 0.0

@@ -136,11 +136,11 @@ def test_a_curvature_is_of_one_ring():
     np.testing.assert_array_equal(np.isnan(found), ~np.isin(np.arange(40) % 20, np.arange(5, 15)))
 
 
-def kinds_of(points: FloatArray, rings: NDArray[np.intp] | None = None) -> NDArray[np.int8]:
-    """Whether points (N, 3), ring after ring, are edges, planar or neither, by the published thresholds."""
+def kinds_of(points: FloatArray, rings: NDArray[np.intp] | None = None, above_noise: float = 0.0) -> NDArray[np.int8]:
+    """Whether points (N, 3), ring after ring, are edges, planar or neither, by default by the published thresholds."""
     rings = np.zeros(len(points), dtype=np.intp) if rings is None else rings
     kinds = np.full(len(points), 9, dtype=np.int8)
-    classify(points, np.linalg.norm(points, axis=1), rings, curvatures(points, rings), 0.1, kinds)
+    classify(points, np.linalg.norm(points, axis=1), rings, curvatures(points, rings), above_noise, kinds)
     return kinds
 
 
@@ -152,6 +152,15 @@ def test_the_corner_of_two_walls_is_one_edge():
     assert np.flatnonzero(kinds == EDGE).tolist() == [50]
     assert (kinds[5:40] == PLANE).all()
     assert (kinds[61:110] == PLANE).all()
+
+
+def test_waves_of_a_ring_on_rough_ground_are_no_edges(rng):
+    """Relief of 3 cm seen at 10 degrees moves the points of a ring by decimetres: beyond the published threshold."""
+    azimuth = np.deg2rad(np.arange(0.0, 360.0, 0.3))
+    relief_m = np.convolve(rng.standard_normal(len(azimuth) + 6), np.full(7, 7.0**-0.5), "valid") * 0.03
+    ring = on_sphere(azimuth, np.full(len(azimuth), np.deg2rad(-10.0)), 10.0 + relief_m / np.tan(np.deg2rad(10.0)))
+    assert np.count_nonzero(kinds_of(ring) == EDGE) > 40
+    assert np.count_nonzero(kinds_of(ring, above_noise=20.0) == EDGE) < 5
 
 
 def test_the_edge_of_a_near_surface_is_an_edge_and_that_of_what_it_hides_is_none():
@@ -245,7 +254,7 @@ def test_edges_of_a_room_are_its_edges(room, drive, rng, sigma_m, false_edges):
     in_room = edges.points @ T[:3, :3].T + T[:3, 3]
     off = distance_to_edges(room, in_room) > 0.15
     assert np.count_nonzero(off) < false_edges * len(scan)
-    assert np.count_nonzero(~off) > 120
+    assert np.count_nonzero(~off) > 110
     assert len(planes) > 0.5 * len(scan)
 
 

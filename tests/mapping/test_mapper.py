@@ -12,7 +12,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig, TrackingConfig
+from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 
@@ -91,6 +93,13 @@ def test_the_first_scan_is_the_world(config, ring_scans):
     np.testing.assert_array_equal(first.state.T_world_lidar, np.eye(4))
     assert (first.status, first.registered, first.added, first.fit) == (Status.OK, False, True, None)
     assert min(len(grid) for grid in mapper.local_map.grids) > 10
+
+
+@pytest.mark.parametrize(("sensor", "kind"), [("vlp-16", SurfelMap), ("mid-360", FeatureMap)])
+def test_without_rings_planes_pass_through_neighbouring_voxels(scan_room, sensor, kind):
+    mapper = Mapper(SURFELS)
+    process(mapper, [scan_room(sensor)])
+    assert isinstance(mapper.local_map, kind)
 
 
 def test_poses_and_velocities_are_true_without_any_prior(mapper, rest_scans, rest_truth):
