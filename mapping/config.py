@@ -35,8 +35,8 @@ class MappingConfig(Settings):
 
     method: Annotated[str, BeforeValidator(MAPPINGS.check)] = Field(
         "surfels",
-        description="surfels (without rings: LOAM's planes), loam (LOAM's mapping), off (the odometry alone), or another"
-        " package's",
+        description="surfels (without rings: LOAM's planes), loam (LOAM's mapping), off (the odometry alone), or"
+        " another package's",
     )
     cell_m: float | None = Field(
         None, ge=0.02, le=10.0, description="edge of the finest cells, LOAM's spacing; null: 1/30 of the median range"
