@@ -253,6 +253,8 @@ def summarise(
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
 _WALKING_MPS = 1.5
+# Of a vehicle, m/s^2.
+_MOST_ACCELERATION = 5.0
 
 
 def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
@@ -268,7 +270,8 @@ def _unconstrained_m(log: ScanLog) -> float:
     """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
 
     A degraded first motion counts with what it lacks of a walking speed: amid people who walk along, it appears to be
-    none. Where the second one differs by half of it, all of it counts.
+    none. A first motion that the second contradicts counts, as no earlier one confirms it: where they differ by half of
+    it, and by more than a vehicle accelerates.
     """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
@@ -276,8 +279,13 @@ def _unconstrained_m(log: ScanLog) -> float:
     lengths_m = np.linalg.norm(moved * open_axes, axis=1)
     if log.statuses[1:2] == [Status.DEGRADED]:
         walked_m = _WALKING_MPS * (log.stamps[1] - log.stamps[0])
-        first_m, change_m = np.linalg.norm([moved[0], moved[0] - moved[min(1, len(moved) - 1)]], axis=1)
-        lengths_m[0] = max(lengths_m[0], walked_m - first_m, first_m if change_m > 0.5 * first_m else 0.0)
+        lengths_m[0] = max(lengths_m[0], walked_m - np.linalg.norm(moved[0]))
+    intervals_s = np.diff(log.stamps)[:2]
+    if len(intervals_s) == 2 and (intervals_s > 0.0).all():
+        first, second = np.diff(log.trajectory.positions[:3], axis=0) / intervals_s[:, None]
+        change = np.linalg.norm(second - first)
+        if change > max(0.5 * np.linalg.norm(first), _MOST_ACCELERATION * intervals_s.mean()):
+            lengths_m[0] = np.linalg.norm(moved[0])
     return float(lengths_m.sum())
 
 
