@@ -129,7 +129,7 @@ def match_features(
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
                 cosine = _turn_to(sensor, mean, axis)
-                along_m = math.sqrt(squared_distance(sensor, mean) * (1.0 - cosine * cosine))
+                along_m = math.sqrt(squared_distance(sensor, mean) * max(1.0 - cosine * cosine, 0.0))
                 width_m = min(least_width * along_m, _LEAST_WIDTH_M)
                 if (
                     cosine > _LEAST_COSINE

@@ -193,7 +193,7 @@ class SurfelMap(LocalMap):
     compact object in the finest grid, along the axes of small extent.
     """
 
-    # With a third, an office's pitch swings ever wider; with more, sparse sweeps are noisy.
+    # With a third, an office's pitch swings ever wider.
     velocity_gains = np.array([0.8] * 3 + [0.5] * 3)
     _grids: list[SurfelGrid]
 
