@@ -397,7 +397,7 @@ class FeatureMap(LocalMap):
                 grid.insert(points[chosen], views[chosen])
         self._count(sensor)
 
-    def matcher(self, sweep: Sweep, level: int = 0) -> FeatureMatcher:
+    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
         return FeatureMatcher(self._edges[level:], self._planes[level:], self._least_width, sweep)
 
     def resample(self, other: "FeatureMap") -> None:

@@ -109,7 +109,7 @@ class LocalMap(Stateful, ABC):
         """Insert the points of a scan, at (N, 3) of the world, seen from a position (3,)."""
 
     @abstractmethod
-    def matcher(self, sweep: Sweep, level: int = 0) -> Matcher:
+    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> Matcher:
         """Finds correspondences of the points of a sweep; valid until the map changes.
 
         The level is the finest resolution that is used, for points that may be off by more than a cell.

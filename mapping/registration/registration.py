@@ -112,7 +112,7 @@ def register(
         inflation = uniform = np.ones(len(sweep))
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
             cell_m = local_map.cell_m * LEVELS[level]
-            matcher = local_map.matcher(sweep, level)
+            matcher = local_map.matcher(sweep, level, prediction.is_inertial)
             for _ in range(coarse if level else most - iterations):
                 points = sweep.compensated(velocity)
                 matcher.match(transform_points(T_world_lidar, points), T_world_lidar)

@@ -156,11 +156,12 @@ class SurfelMatcher(Matcher):
     """Surfels of the cells that N points lie in, of grids that do not change meanwhile, the finest first.
 
     A point that has stayed in its cell keeps its surface: once an iteration moves by a small part of a cell, few are
-    looked up again.
+    looked up again. With `keeps_finest`, planes of uncertain normals are kept: in a young map, coarser ones are of a
+    few rings, and contradict an IMU's prediction.
     """
 
-    def __init__(self, grids: Sequence[SurfelGrid], count: int) -> None:
-        self._grids = grids
+    def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
+        self._grids, self._certain_tilt = grids, np.inf if keeps_finest else _CERTAIN_TILT
         self._cells = np.full(count, _NOWHERE, dtype=np.int64)
         self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)
@@ -180,7 +181,7 @@ class SurfelMatcher(Matcher):
             if finest is None:
                 finest = np.empty(len(points), dtype=np.int32), surfels
                 finest[0][unmatched] = rows
-            given = self._spread_m, _CERTAIN_TILT, self.surfaces
+            given = self._spread_m, self._certain_tilt, self.surfaces
             unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, *given)]
         assert finest is not None
         match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
@@ -243,8 +244,8 @@ class SurfelMap(LocalMap):
         for grid in self._grids:
             grid.insert(points, elevations, views, weight)
 
-    def matcher(self, sweep: Sweep, level: int = 0) -> SurfelMatcher:
-        return SurfelMatcher(self._grids[level:], len(sweep))
+    def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
+        return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
 
     def level_normals(self) -> FloatArray:
         grid = self._grids[-1]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
+from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
@@ -139,8 +140,11 @@ def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(rng, roll_deg, pitch_
     np.testing.assert_array_equal(surfel_map_of(wall, CELL).vertical(), [0.0, 0.0, 1.0])  # without a floor the world's
 
 
-def test_in_grass_a_wider_plane_is_taken(rng):
-    """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off."""
+def test_in_grass_a_wider_plane_is_taken_and_with_an_imu_the_finest_of_a_young_map(rng):
+    """Of blades of 20 cm, the finest cells have normals of any direction: here 1.6 degrees off.
+
+    Few sweeps of few rings make planes of any direction in coarse cells.
+    """
     points, normal = grass_on_a_slope(rng, 0.2)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
     grass_map = surfel_map_of(points, CELL)
@@ -149,6 +153,9 @@ def test_in_grass_a_wider_plane_is_taken(rng):
     assert len(matches) == len(asked)
     assert np.median(errors_deg) < 0.6
     assert np.median(matches.tilt) < 0.01
+    matcher = grass_map.matcher(Sweep(asked), is_inertial=True)
+    matcher.match(asked, HERE)
+    assert np.median(matcher.correspondences().tilt) > 0.02
 
 
 @pytest.mark.parametrize("tidied_after", [1_000, 3])
