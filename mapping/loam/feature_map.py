@@ -47,7 +47,7 @@ _SHARED = 120.0
 _MOST_TILT = 0.05
 # Least width of a plane, a standard deviation: per distance along it from the sensor, and at most. A ring that is swept
 # a little, as by a sensor that starts to move, makes a plane that errors of attitude tilt, the more the narrower it is.
-_LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 114.0, 0.07
+_LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 80.0, 0.08
 # From this on, a plane of coarser voxels is asked for.
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
