@@ -276,16 +276,16 @@ def _unconstrained_m(log: ScanLog) -> float:
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)
-    lengths_m = np.linalg.norm(moved * open_axes, axis=1)
+    lengths_m, first_m = np.linalg.norm(moved * open_axes, axis=1), np.linalg.norm(moved[:1])
     if log.statuses[1:2] == [Status.DEGRADED]:
         walked_m = _WALKING_MPS * (log.stamps[1] - log.stamps[0])
-        lengths_m[0] = max(lengths_m[0], walked_m - np.linalg.norm(moved[0]))
+        lengths_m[0] = max(lengths_m[0], walked_m - first_m)
     intervals_s = np.diff(log.stamps)[:2]
     if len(intervals_s) == 2 and (intervals_s > 0.0).all():
         first, second = np.diff(log.trajectory.positions[:3], axis=0) / intervals_s[:, None]
         change = np.linalg.norm(second - first)
         if change > max(0.5 * np.linalg.norm(first), _MOST_ACCELERATION * intervals_s.mean()):
-            lengths_m[0] = np.linalg.norm(moved[0])
+            lengths_m[0] = first_m
     return float(lengths_m.sum())
 
 

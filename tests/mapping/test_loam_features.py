@@ -254,7 +254,7 @@ def test_edges_of_a_room_are_its_edges(room, drive, rng, sigma_m, false_edges):
     in_room = edges.points @ T[:3, :3].T + T[:3, 3]
     off = distance_to_edges(room, in_room) > 0.15
     assert np.count_nonzero(off) < false_edges * len(scan)
-    assert np.count_nonzero(~off) > 110
+    assert np.count_nonzero(~off) > 120
     assert len(planes) > 0.5 * len(scan)
 
 
