@@ -267,26 +267,30 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 
 
 def _unconstrained_m(log: ScanLog) -> float:
-    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
-
-    A degraded first motion counts with what it lacks of a walking speed: amid people who walk along, it appears to be
-    none. A first motion that the second contradicts counts, as no earlier one confirms it: where they differ by half of
-    it, and by more than a vehicle accelerates.
-    """
+    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends."""
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)
-    lengths_m, first_m = np.linalg.norm(moved * open_axes, axis=1), np.linalg.norm(moved[:1])
-    if log.statuses[1:2] == [Status.DEGRADED]:
-        walked_m = _WALKING_MPS * (log.stamps[1] - log.stamps[0])
-        lengths_m[0] = max(lengths_m[0], walked_m - first_m)
-    intervals_s = np.diff(log.stamps)[:2]
+    lengths_m = np.linalg.norm(moved * open_axes, axis=1)
+    lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))
+    return float(lengths_m.sum())
+
+
+def _unconfirmed_start_m(log: ScanLog) -> float:
+    """The unconfirmed distance of the first motion, which has no earlier one to agree with.
+
+    A degraded one lacks a walking speed: amid people who walk along, it appears to be none. One that the second
+    contradicts counts in full: where they differ by half of it, and by more than a vehicle accelerates.
+    """
+    moved, intervals_s = np.diff(log.trajectory.positions[:3], axis=0), np.diff(log.stamps)[:2]
     if len(intervals_s) == 2 and (intervals_s > 0.0).all():
-        first, second = np.diff(log.trajectory.positions[:3], axis=0) / intervals_s[:, None]
+        first, second = moved / intervals_s[:, None]
         change = np.linalg.norm(second - first)
         if change > max(0.5 * np.linalg.norm(first), _MOST_ACCELERATION * intervals_s.mean()):
-            lengths_m[0] = first_m
-    return float(lengths_m.sum())
+            return float(np.linalg.norm(moved[0]))
+    if log.statuses[1:2] == [Status.DEGRADED]:
+        return float(_WALKING_MPS * intervals_s[0] - np.linalg.norm(moved[0]))
+    return 0.0
 
 
 def _warnings(
