@@ -62,18 +62,18 @@ def _cells(scans: list[Scan]) -> list[str]:
             rows.append(_times(grid, planes, keypoints, state.T_world_lidar[:3, 3]))
         else:
             grid = VoxelGrid(sampled.cell_m)
-            grid.insert(planes, views_of(planes, state.T_world_lidar[:3, 3]))
+            grid.insert(planes, views_of(planes, state.T_world_lidar[:3, 3]), np.zeros(len(planes)))
     assert grid is not None
     return [f"{len(grid):,}", *(f"{value:.1f}" for value in np.median(rows[1:], axis=0))]
 
 
 def _times(grid: VoxelGrid, planes: FloatArray, keypoints: FloatArray, sensor: FloatArray) -> list[float]:
-    means, found, given = grid.means, Surfaces.none(len(keypoints)), (grid.voxels, sensor, 0.0)
+    means, found, given = grid.means, Surfaces.none(len(keypoints)), (grid.voxels, sensor, False)
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(means), o3d.core.int32)
     index_ms = _timed(search.knn_index)
     theirs_ms = _timed(lambda: search.knn_search(o3d.core.Tensor.from_numpy(keypoints), NEIGHBOURS))
     ours_ms = _timed(lambda: match_features(keypoints, np.arange(len(keypoints)), False, *given, found))
-    insert_ms = _timed(lambda: grid.insert(planes, views_of(planes, sensor)))
+    insert_ms = _timed(lambda: grid.insert(planes, views_of(planes, sensor), np.zeros(len(planes))))
     return [index_ms, theirs_ms, insert_ms, ours_ms]
 
 

@@ -42,8 +42,10 @@ def published_edges() -> Iterator[None]:
 def published_planes() -> Iterator[None]:
     """One point a voxel, the mean of all, for a while."""
 
-    def add_mean(points: FloatArray, views: NDArray[np.float32], rows: Rows, sums: FloatArray) -> None:
-        add_moments(points, views, rows, sums)
+    def add_mean(
+        points: FloatArray, views: NDArray[np.float32], elevations: FloatArray, rows: Rows, sums: FloatArray
+    ) -> None:
+        add_moments(points, views, elevations, rows, sums)
         means = sums[:, 1:4] / sums[:, :1]
         products = [means[:, i] * means[:, j] for i, j in SYMMETRIC]
         sums[:, 4:10] = sums[:, :1] * np.stack(products, axis=1)

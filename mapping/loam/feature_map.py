@@ -52,6 +52,9 @@ _LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 80.0, 0.08
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
+# Below this cosine, a plane's points have to differ so much in height across the rings: the relief along a single ring,
+# seen at a grazing angle, moves with the sensor.
+_FACED_COSINE, _LEAST_HEIGHT_M = 0.17, 0.07
 # Mean cosine of the views beyond which a plane faces away from the sensor, as the other face of a thin wall does.
 _SIDE_COSINE = 0.05
 # Points whose slots are prefetched.
@@ -70,18 +73,22 @@ class Voxels(NamedTuple):
     # table_keys, table_rows: of the hash
     table_keys: Keys
     table_rows: Rows
-    # sums: (M, 13) number of points, sums of their coordinates in the world, of the products of these, and of the unit
-    # views, the directions to the sensor
+    # sums: (M, 15) number of points, sums of their coordinates in the world, of the products of these, of the unit
+    # views, the directions to the sensor, and of the elevations and their squares
     sums: FloatArray
 
 
 @compiled
-def add_moments(points: FloatArray, views: NDArray[np.float32], rows: Rows, sums: FloatArray) -> None:
-    """Add points and their views (N, 3) to the sums (M, 13) of their rows (N,), unless these are frozen."""
+def add_moments(
+    points: FloatArray, views: NDArray[np.float32], elevations: FloatArray, rows: Rows, sums: FloatArray
+) -> None:
+    """Add points, their views (N, 3) and elevations (N,) to the sums (M, 15) of their rows (N,), if not frozen."""
     for n in range(len(points)):
         cell = sums[rows[n]]
         if cell[0] < _MOST_POINTS:
             cell[0] += 1.0
+            cell[13] += elevations[n]
+            cell[14] += elevations[n] * elevations[n]
             for axis in range(3):
                 cell[1 + axis] += points[n, axis]
                 cell[10 + axis] += views[n, axis]
@@ -93,14 +100,14 @@ def add_moments(points: FloatArray, views: NDArray[np.float32], rows: Rows, sums
 @compiled
 def match_features(
     points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, voxels: Voxels, sensor: FloatArray,
-    least_width: float, found: Surfaces,
+    has_rings: bool, found: Surfaces,
 ) -> int:  # fmt: skip
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
     `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
     normal, are moved to its beginning. A plane that is known better takes the place of another. The normal of a plane
     faces the sensor (3,), and so did the plane when it was seen; the first of a line points from that to the point.
-    Planes are at least as wide as a share of their distance along them, `least_width`.
+    With `has_rings`, planes that may be those of a single ring do not count.
 
     Returns:
         Number of the points that were moved.
@@ -129,12 +136,13 @@ def match_features(
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
                 cosine = _turn_to(sensor, mean, axis)
-                along_m = math.sqrt(squared_distance(sensor, mean) * max(1.0 - cosine * cosine, 0.0))
-                width_m = min(least_width * along_m, _LEAST_WIDTH_M)
                 if (
                     cosine > _LEAST_COSINE
-                    and variances[1] > width_m * width_m
                     and tilt < _MOST_TILT
+                    and (
+                        not has_rings
+                        or _spans_rings(near[:count], number, voxels.sums, variances[1], cosine, sensor, mean)
+                    )
                     and _is_surface(near[:count], number, voxels.sums, mean, axis, most_off)
                 ):
                     if found.counts[n] == 0 or thickness_m < found.thickness_m[n, 0]:
@@ -235,6 +243,27 @@ def _is_surface(
 
 
 @compiled_part
+def _spans_rings(
+    near: NDArray[np.int64], number: float, sums: FloatArray, width: float, cosine: float, sensor: FloatArray,
+    mean: FloatArray,
+) -> bool:  # fmt: skip
+    """Whether the points of rings in neighbours (K,) are more than the relief along a single ring.
+
+    Their plane has a mean (3,) and the variance `width` along it, and meets the beam at a cosine to its normal.
+    """
+    along_m = math.sqrt(squared_distance(sensor, mean) * max(1.0 - cosine * cosine, 0.0))
+    least_m = min(_LEAST_WIDTH * along_m, _LEAST_WIDTH_M)
+    if width <= least_m * least_m:
+        return False
+    elevation = squared = 0.0
+    for row in near:
+        elevation += sums[row, 13] / number
+        squared += sums[row, 14] / number
+    spread = math.sqrt(max(squared - elevation * elevation, 0.0))
+    return cosine > _FACED_COSINE or spread * along_m > _LEAST_HEIGHT_M
+
+
+@compiled_part
 def _uncertainty(across: float, along: float, number: float, spent: float) -> tuple[float, float]:
     """Standard deviations of a line or plane across it, with that of its position, and of its direction.
 
@@ -291,11 +320,11 @@ class VoxelGrid(Stateful):
 
     cell_m: float
     _keys: Annotated[NDArray[np.int64], Shape(None)]  # (M,) of the voxels, by row
-    _sums: Annotated[FloatArray, Shape(None, 13)]  # (M, 13) see `Voxels`
+    _sums: Annotated[FloatArray, Shape(None, 15)]  # (M, 15) see `Voxels`
 
     def __init__(self, cell_m: float) -> None:
         self.cell_m = cell_m
-        self._keys, self._sums = np.empty(0, dtype=np.int64), np.empty((0, 13))
+        self._keys, self._sums = np.empty(0, dtype=np.int64), np.empty((0, 15))
         self._hash = VoxelHash()
 
     def __len__(self) -> int:
@@ -306,21 +335,21 @@ class VoxelGrid(Stateful):
         """(M, 3) in the world."""
         return np.asarray(self._sums[:, 1:4] / self._sums[:, :1], dtype=np.float64)
 
-    def insert(self, points: FloatArray, views: NDArray[np.float32]) -> None:
-        """Insert points (N, 3) of the world, with unit views (N, 3) towards the sensor."""
+    def insert(self, points: FloatArray, views: NDArray[np.float32], elevations: FloatArray) -> None:
+        """Insert points (N, 3) of the world, with unit views (N, 3) to the sensor, and elevations (N,), radians."""
         keys = point_keys(points, self.cell_m)
         rows = self._hash.insert(keys)
         new = len(self._hash) - len(self._keys)
         if new:
             self._keys = np.concatenate([self._keys, np.empty(new, dtype=np.int64)])
             self._keys[rows] = keys
-            self._sums = np.concatenate([self._sums, np.zeros((new, 13))])
-        add_moments(points, views, rows, self._sums)
+            self._sums = np.concatenate([self._sums, np.zeros((new, 15))])
+        add_moments(points, views, elevations, rows, self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:
         """Insert the voxels of another grid, with their numbers of points."""
         rows = self._hash.insert(point_keys(other.means, self.cell_m))
-        self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 13))
+        self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 15))
         self._keys[rows] = point_keys(other.means, self.cell_m)
         np.add.at(self._sums, rows, other._sums)
 
@@ -347,12 +376,12 @@ class FeatureMatcher(Matcher):
 
     Args:
         edges, planes: grids of voxels, the finest first.
-        least_width: see `match_features`.
+        has_rings: whether points of the map lie in rings.
         sweep: with the kinds of its points; without, all points are planar.
     """
 
-    def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], least_width: float, sweep: Sweep) -> None:
-        self._edges, self._planes, self._least_width = edges, planes, least_width
+    def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], has_rings: bool, sweep: Sweep) -> None:
+        self._edges, self._planes, self._has_rings = edges, planes, has_rings
         self._is_edge = _edges_of(sweep)
         self._matched = np.full((len(sweep), 3), np.inf)  # where the points were matched
         self.surfaces = Surfaces.none(len(sweep))
@@ -367,7 +396,7 @@ class FeatureMatcher(Matcher):
             for grid in grids:
                 if not len(unmatched):
                     break
-                given = sensor, self._least_width, self.surfaces
+                given = sensor, self._has_rings, self.surfaces
                 left = match_features(points, unmatched, is_line, grid.voxels, *given)
                 unmatched = unmatched[:left]
 
@@ -378,11 +407,11 @@ class FeatureMap(LocalMap):
     velocity_gains = np.full(6, 0.3)  # features do not swing, and in fields they are noisier
     _edges: list[VoxelGrid]
     _planes: list[VoxelGrid]
-    _least_width: float  # of planes; none where points do not lie in rings
+    _has_rings: bool
 
     def __init__(self, cell_m: float, radius_m: float) -> None:
         super().__init__(cell_m, radius_m)
-        self._least_width = 0.0
+        self._has_rings = False
         self._edges, self._planes = ([VoxelGrid(cell_m * level) for level in LEVELS] for _ in range(2))
 
     @property
@@ -390,18 +419,18 @@ class FeatureMap(LocalMap):
         return [*self._edges, *self._planes]
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
-        self._least_width = _LEAST_WIDTH if scan.has_rings else 0.0
+        self._has_rings = scan.has_rings
         views, is_edge = views_of(points, sensor), _edges_of(scan.sweep)
         for grids, chosen in ((self._edges, is_edge), (self._planes, ~is_edge)):
             for grid in grids:
-                grid.insert(points[chosen], views[chosen])
+                grid.insert(points[chosen], views[chosen], scan.elevations[chosen])
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002
-        return FeatureMatcher(self._edges[level:], self._planes[level:], self._least_width, sweep)
+        return FeatureMatcher(self._edges[level:], self._planes[level:], self._has_rings, sweep)
 
     def resample(self, other: "FeatureMap") -> None:
-        self._least_width = other._least_width
+        self._has_rings = other._has_rings
         for grids, finest in ((self._edges, other._edges[0]), (self._planes, other._planes[0])):
             for grid in grids:
                 grid.insert_means(finest)
@@ -417,7 +446,7 @@ class FeatureMap(LocalMap):
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))
         voxels = self._planes[-1].voxels
-        given = np.array(sensor), self._least_width, found
+        given = np.array(sensor), self._has_rings, found
         match_features(np.ascontiguousarray(points), unmatched, False, voxels, *given)
         return found.normals[:, 0], np.where(found.counts > 0, found.thickness_m[:, 0], np.inf)
 

@@ -108,7 +108,7 @@ def register(
     coarse, most = _PATIENT_ITERATIONS if patient else _ITERATIONS
     unknown = prediction.covariance
     try:
-        prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
+        prior = predicted = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
         inflation = uniform = np.ones(len(sweep))
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
             cell_m = local_map.cell_m * LEVELS[level]
@@ -134,7 +134,8 @@ def register(
                         break
                     # An odometry saw the same small surfaces.
                     inflation, unknown, prior = found, prediction.covariance, prior / _INFLATION**2
-        covariance = solution.covariance(_INFORMATION_SHARE)
+        # Where no large surface observes a direction, the pose is still known by the prediction.
+        covariance = replace(solution, prior=_heavy_tailed(predicted, error)).covariance(_INFORMATION_SHARE)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
     T_world_lidar, error = orthonormalize(T_world_lidar), velocity - prediction.velocity

@@ -53,6 +53,14 @@ def test_a_crowd_that_walks_along_does_not_hold_the_sensor(crowd):
     np.testing.assert_allclose(found.T_world_lidar[:3, 3], WALKED, atol=0.02)
 
 
+def test_what_walls_do_not_measure_is_known_as_well_as_it_was_predicted():
+    surfel_map, sweep = scene(ALL, 5_000)
+    assert inflation(surfel_map, sweep) is not None
+    predicted = np.diag([0.1] * 3 + [0.3] * 3 + [1.0] * 6) ** 2
+    found = register(sweep, Prediction(0.0, np.eye(4), np.zeros(6), predicted), surfel_map, with_velocity=False)
+    np.testing.assert_allclose(found.covariance[6:, 6:], predicted[6:, 6:])
+
+
 def test_small_surfaces_are_less_certain_where_walls_contradict_the_pose():
     surfel_map, sweep = scene(ALL, 6_000)
     factors = inflation(surfel_map, sweep)
