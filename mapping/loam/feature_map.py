@@ -253,14 +253,14 @@ def _spans_rings(
     """
     along_m = math.sqrt(squared_distance(sensor, mean) * max(1.0 - cosine * cosine, 0.0))
     least_m = min(_LEAST_WIDTH * along_m, _LEAST_WIDTH_M)
-    if width <= least_m * least_m:
-        return False
+    is_wide = width > least_m * least_m
+    if not is_wide or cosine > _FACED_COSINE:
+        return is_wide
     elevation = squared = 0.0
     for row in near:
         elevation += sums[row, 13] / number
         squared += sums[row, 14] / number
-    spread = math.sqrt(max(squared - elevation * elevation, 0.0))
-    return cosine > _FACED_COSINE or spread * along_m > _LEAST_HEIGHT_M
+    return math.sqrt(max(squared - elevation * elevation, 0.0)) * along_m > _LEAST_HEIGHT_M
 
 
 @compiled_part

@@ -139,7 +139,7 @@ def test_the_plane_of_a_ring_s_beams_is_no_surface(rng, heights_m):
 
 
 def floor_ahead(rng: np.random.Generator, away_m: float, half_m: float, elevations: FloatArray) -> bool:
-    """Whether points on a strip of floor across the way ahead, with some of these elevations, make planes."""
+    """Whether points on a strip of floor ahead, with any of these elevations, make planes."""
     count = 6000
     floor = np.column_stack(
         [rng.uniform(-half_m, half_m, count) + away_m, rng.uniform(-2.0, 2.0, count), np.full(count, -1.7)]
