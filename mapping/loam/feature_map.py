@@ -16,7 +16,7 @@ from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import SampledScan
-from lidarslam.mapping.surfels.surfel_kernels import views_of
+from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 from lidarslam.mapping.surfels.voxel_hash import (
     ABSENT,
@@ -52,9 +52,9 @@ _LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 80.0, 0.08
 _CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
-# Below this cosine, a plane's points have to differ so much in height across the rings: the relief along a single ring,
-# seen at a grazing angle, moves with the sensor.
-_FACED_COSINE, _LEAST_HEIGHT_M = 0.17, 0.07
+# Seen at a grazing angle, a plane's points have to differ so much in height across the rings: the relief along a single
+# ring moves with the sensor.
+_LEAST_HEIGHT_M = 0.07
 # Mean cosine of the views beyond which a plane faces away from the sensor, as the other face of a thin wall does.
 _SIDE_COSINE = 0.05
 # Points whose slots are prefetched.
@@ -254,7 +254,7 @@ def _spans_rings(
     along_m = math.sqrt(squared_distance(sensor, mean) * max(1.0 - cosine * cosine, 0.0))
     least_m = min(_LEAST_WIDTH * along_m, _LEAST_WIDTH_M)
     is_wide = width > least_m * least_m
-    if not is_wide or cosine > _FACED_COSINE:
+    if not is_wide or is_steep(cosine, 1.0):
         return is_wide
     elevation = squared = 0.0
     for row in near:
