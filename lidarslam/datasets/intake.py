@@ -90,7 +90,11 @@ def _new_measurements(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
 
 
 def _is_repeated(points: FloatArray, before: FloatArray) -> bool:
-    return np.array_equal(points, before) and bool(np.ptp(points, axis=0).any())
+    return np.array_equal(points, before) and not _is_one_place(points)
+
+
+def _is_one_place(points: FloatArray) -> bool:
+    return bool((points == points[0]).all())
 
 
 def _turn_looked_at(scan: Scan, faults: Faults) -> Scan:
@@ -118,9 +122,10 @@ def look_at(scan: Scan, faults: Faults) -> Scan:
         faults.note(_THINNED, f"{len(scan):,} points at {scan.stamp:.9f}")
         scan = scan.select(one_per_cell(scan.points, _CELL_M))
     if len(scan) > _FEW_POINTS:
-        if (reach := _implausible_ranges(scan.points[:: max(1, len(scan) // _SAMPLE)])) is not None:
+        sample = scan.points[:: max(1, len(scan) // _SAMPLE)]
+        if (reach := _implausible_ranges(sample)) is not None:
             faults.note(_NOT_METRES, f"{reach} at {scan.stamp:.9f}")
-        elif not np.ptp(scan.points, axis=0).any():
+        elif _is_one_place(sample) and _is_one_place(scan.points):
             faults.note(_ONE_PLACE, f"{len(scan)} points at {scan.stamp:.9f}")
         _look_at_times(scan, faults)
     return scan

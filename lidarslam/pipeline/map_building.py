@@ -12,7 +12,7 @@ from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.consistency import ConsistencyCheck
-from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
@@ -26,7 +26,8 @@ logger = logging.getLogger(__name__)
 class MapBuilder(Stateful):
     """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration.
 
-    The store has the tiles of the map that do not fit into memory; without one, a temporary file has them.
+    With a pose graph, the submaps of its keyframes are added instead. The store has the tiles of the map that do not
+    fit into memory; without one, a temporary file has them.
     """
 
     # of the map; derived from the first scan with points unless it is configured, None until then
@@ -38,9 +39,9 @@ class MapBuilder(Stateful):
     _pending: tuple[Scan, ScanEstimate] | None
     _scans: int
 
-    def __init__(self, config: GlobalMapConfig, store: TileStore | None = None) -> None:
+    def __init__(self, config: GlobalMapConfig, store: TileStore | None = None, takes_submaps: bool = False) -> None:
         self._config = config
-        self._store = store
+        self._store, self._takes_submaps = store, takes_submaps
         self._pending = None
         self._scans = 0
         self.voxel_size_m = config.voxel_size_m
@@ -94,11 +95,17 @@ class MapBuilder(Stateful):
         if self.global_map is None:
             self.global_map = self._new_map(self.voxel_size_m)
         number, attributes = self._scans - 1, thinned.attributes(self._config.fields)
-        self.global_map.add(points, estimate.T_world_lidar, attributes)
+        if not self._takes_submaps:
+            self.global_map.add(points, estimate.T_world_lidar, attributes)
         self.slides.add(points, number, estimate.T_world_lidar)
         if self._config.leave_out_moved:
             self.views.add(points, number)
         return points, estimate.T_world_lidar, self.voxel_size_m, attributes
+
+    def add_submap(self, means: VoxelMeans, T_world_keyframe: FloatArray) -> None:
+        """Add a submap that is complete, at the pose (4, 4) of its keyframe as registered."""
+        if self.global_map is not None:
+            self.global_map.add_means(means, T_world_keyframe)
 
 
 class MapCorrection(Stateful):

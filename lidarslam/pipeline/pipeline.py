@@ -79,7 +79,7 @@ class Pipeline(Stateful):
         mapper = localiser.mapper
         self._correction = None if graph is None or mapper is None or not mapper.kept_scans else MapCorrection(mapper)
         self._measured_stamp = None
-        self.map = MapBuilder(config, store)
+        self.map = MapBuilder(config, store, takes_submaps=graph is not None)
         self.held = None
         self._error: LidarSlamError | None = None  # that ended the scans
 
@@ -203,7 +203,7 @@ class Pipeline(Stateful):
         if self._graph is not None:
             arrived = graph_scan(odometry, estimate)
             cell_m = None if self._correction is None else estimate.cell_m
-            drawing = self._graph_worker.submit(_give, self._graph, arrived, cell_m)
+            drawing = self._graph_worker.submit(_give, self._graph, self.map, arrived, cell_m)
             if self._correction is not None:
                 self._correction.add(drawing)
         return replace(estimate, stage_ms=estimate.stage_ms | {"deskew": deskew_ms, "map": _ms_since(started)})
@@ -214,9 +214,12 @@ class Pipeline(Stateful):
             self._graph_worker.submit(self._graph.draw, *added)
 
 
-def _give(graph: KeyframeGraph, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
-    """Give the graph a scan; the local map of surfels, where there is one and loop closures change it."""
+def _give(graph: KeyframeGraph, built: MapBuilder, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
+    """Give the graph a scan, and the map a submap that is complete; the local map where loop closures change it."""
+    complete = len(graph.store)
     graph.add(scan)
+    for key in range(complete, len(graph.store)):
+        built.add_submap(graph.store[key], graph.scan_poses[graph.keyframes[key].scan])
     return None if cell_m is None else graph.redrawn_local_map(cell_m)
 
 
