@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.global_map.point_cloud import PointCloud, estimate_normals
@@ -24,7 +24,7 @@ from lidarslam.mapping.global_map.voxels import (
     row_cells,
     write_sums,
 )
-from lidarslam.mapping.surfels.voxel_hash import EMPTY, key_cells, point_keys, reach_m
+from lidarslam.mapping.surfels.voxel_hash import EMPTY, key_cells
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
@@ -91,23 +91,18 @@ class GlobalMap(Stateful):
     def add(self, points: FloatArray, T_world_lidar: FloatArray, attributes: PointAttributes | None = None) -> None:
         """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp, with their attributes."""
         attributes = attributes or PointAttributes()
-        layout = Layout.of(attributes)
-        keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
-        write_sums(np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar), self.voxel_size_m, keys, sums)
-        layout.write(attributes, sums)
-        self._wait(Voxels(keys, sums, layout), keys == EMPTY)
+        voxels = self._one_each(points, T_world_lidar, Layout.of(attributes))
+        voxels.layout.write(attributes, voxels.sums)
+        self._wait(voxels)
 
     def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
         """Add the voxels of another map, as if its points were added here."""
-        world = transform_points(T_world_map, means_points(means))
-        sums = means.rows.copy()
-        keys = point_keys(world, self.voxel_size_m)
-        # Within the voxel float32 is exact enough.
-        sums[:, POSITION] = world - key_cells(keys) * self.voxel_size_m
-        sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
-        sums[:, :COUNT] *= means.rows[:, COUNT, None]
-        is_beyond = np.abs(world).max(axis=1, initial=0.0) >= reach_m(self.voxel_size_m)
-        self._wait(Voxels(keys, sums, means.layout), is_beyond)
+        voxels = self._one_each(means_points(means), T_world_map, means.layout)
+        sums, rows = voxels.sums, means.rows
+        sums[:, VIEW] = rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
+        sums[:, :COUNT] *= rows[:, COUNT, None]
+        sums[:, COUNT:] = rows[:, COUNT:]
+        self._wait(voxels)
 
     def means(self, left_out: NDArray[np.bool_] | None = None) -> VoxelMeans:
         """The voxels so far, but for some (M,)."""
@@ -176,7 +171,14 @@ class GlobalMap(Stateful):
             normals[rows] = estimate_normals(part.points())[part.lies_in(tile)]
         return normals
 
-    def _wait(self, voxels: Voxels, is_beyond: NDArray[np.bool_]) -> None:
+    def _one_each(self, points: FloatArray, T_world_lidar: FloatArray, layout: Layout) -> Voxels:
+        """A row for each point (N, 3), with columns of that layout, its attributes not written yet."""
+        keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
+        write_sums(np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar), self.voxel_size_m, keys, sums)
+        return Voxels(keys, sums, layout)
+
+    def _wait(self, voxels: Voxels) -> None:
+        is_beyond = voxels.keys == EMPTY
         with self._lock:
             if is_beyond.any():
                 self.beyond += int(np.count_nonzero(is_beyond))
