@@ -173,7 +173,7 @@ class GlobalMap(Stateful):
 
     def _one_each(self, points: FloatArray, T_world_lidar: FloatArray, layout: Layout) -> Voxels:
         """A row for each point (N, 3), with columns of that layout, its attributes not written yet."""
-        keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
+        keys, sums = np.empty(len(points), dtype=np.int64), np.zeros((len(points), layout.width), dtype=np.float32)
         write_sums(np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar), self.voxel_size_m, keys, sums)
         return Voxels(keys, sums, layout)
 
