@@ -125,6 +125,7 @@ class _Notes:
 
     def __init__(self) -> None:
         self.told: list[Any] = []
+        self.store: list[Any] = []  # of submaps
 
     def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, _attributes: object) -> None:
         assert voxel_size_m == 0.1
