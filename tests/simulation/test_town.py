@@ -49,7 +49,7 @@ def small() -> World:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(town, "_ROWS", 3)
         patch.setattr(town, "_LEFT_OUT", 2)
-        return town.build(0)
+        return town.town(0)
 
 
 @pytest.mark.slow

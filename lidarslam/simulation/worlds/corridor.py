@@ -19,7 +19,7 @@ _ENTRY_M, _FROM_WALLS_M = 4.0, 5.5  # the path round the yard: distance from the
 _CELL_M, _MARGIN_M = 0.5, 12.0
 
 
-def build(seed: int) -> World:
+def corridor(seed: int) -> World:
     """The corridor of that seed, 24 to 40 m long, and its yard; the route leads out, round the yard and back in.
 
     The corridor's middle is x from -length to 0 at y = 0; there the yard begins.

@@ -24,7 +24,7 @@ _JITTER_M = 0.15
 _HEAD_START_M = 1.9
 
 
-def build(seed: int) -> World:
+def crowd(seed: int) -> World:
     """The foyer of that seed; the floor is at z = 0, and at the start of the first lap thirty people are near."""
     rng = np.random.default_rng(seed)
     room, height = Room(np.zeros(2), rng.uniform([26.0, 20.0], [32.0, 24.0])), rng.uniform(3.6, 5.0)

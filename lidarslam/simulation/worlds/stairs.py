@@ -57,7 +57,7 @@ class StairPlan:
         return builder.shifted(x, y, number * self.climb, yaw=np.pi * back)
 
 
-def build(seed: int) -> World:
+def stairs(seed: int) -> World:
     """The stairwell of that seed: four to six storeys up and down again; the ground floor is at z = 0."""
     rng = np.random.default_rng(seed)
     storeys, steps = int(rng.integers(4, 7)), int(rng.integers(9, 11))
@@ -117,5 +117,5 @@ def _draw_shell(plan: StairPlan, builder: Builder, clearance: Clearance, rng: np
     put, lobby = Furnisher(builder, clearance, rng), Room(np.array([low, 0.0]), np.array([-plan.landing, plan.across]))
     clearance.take(np.array([-plan.landing - 1.0, 0.0, 0.0]), np.array([high, plan.across, height]))
     for _ in range(2):
-        put.at_wall(lobby, put.drawn(((0.6, 1.2), (0.3, 0.5), (0.9, 1.8))), interior.cabinet)
-        put.at_wall(lobby, put.drawn(((0.6, 1.5), 0.05, 1.0)), interior.board, z=1.0)
+        put.place(lobby, put.drawn(((0.6, 1.2), (0.3, 0.5), (0.9, 1.8))), interior.cabinet)
+        put.place(lobby, put.drawn(((0.6, 1.5), 0.05, 1.0)), interior.board, z=1.0)
