@@ -12,7 +12,7 @@ from lidarslam.simulation.mesh import Caster, box_mesh, cylinder_mesh, merge
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import WORLDS, World, build_world
 from lidarslam.simulation.worlds.building import UP
-from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, STANDING
+from lidarslam.simulation.worlds.hard_places import COMPANIONS, CROSSING, STANDING
 from lidarslam.simulation.worlds.paths import Clearance, loop_length, subdivide_loop
 
 from .conftest import cached_world, cast, caster_of

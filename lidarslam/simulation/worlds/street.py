@@ -12,7 +12,6 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
 from lidarslam.simulation.worlds.building import Builder, Vector, heading, left_of, relief
-from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
 
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
@@ -266,7 +265,7 @@ def street(seed: int) -> World:
     for lot in lots:
         sides = (_is_open(plan, lots, lot, -1.5), _is_open(plan, lots, lot, lot.width + 1.5))
         pose = house_pose(ground, lot.origin, lot.along, lot.width)
-        grounds.solid.place(house(rng, lot.width, lot.depth, sides), pose)
+        grounds.solid.place(outdoor.house(rng, lot.width, lot.depth, sides), pose)
     for lot in [*gaps, *(lot for lot in lots if lot.setback_m > 2.0)]:
         _garden(grounds, lot)
     park_cars(grounds, plan, (0.35, 0.85))
@@ -290,7 +289,7 @@ def terrace(seed: int) -> World:
     grounds = Grounds(rng, plan.tour, ground)
     width, depth = rng.uniform(5.2, 6.8), rng.uniform(8.0, 9.5)
     lay_kerbs(grounds.solid, plan.kerb_stones(), ground)
-    alike = house(rng, width, depth, (False, False), (2, 3))
+    alike = outdoor.house(rng, width, depth, (False, False), (2, 3))
     for lot in repeated_lots(plan, width, depth):
         grounds.solid.place(alike, house_pose(ground, lot.origin, lot.along, lot.width))
     spacing_m = 5 * width

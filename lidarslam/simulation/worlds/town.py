@@ -18,7 +18,6 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths, street
 from lidarslam.simulation.worlds.building import heading, left_of, smooth_noise
-from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
 
 # Crossings, before some streets are left out: rows and columns, their distance, and the largest displacement of each.
@@ -214,7 +213,7 @@ class _Rows:
                 self.grounds.put(tree, where, 0.0, is_green=True)
                 continue
             is_plain = bool(rng.random() > _FULLNESS)
-            part = house(rng, front - 0.02, depth, (not is_plain, not is_plain), is_plain=is_plain)
+            part = outdoor.house(rng, front - 0.02, depth, (not is_plain, not is_plain), is_plain=is_plain)
             self.grounds.solid.place(part, street.house_pose(ground, start, along, front - 0.02))
 
     def cars_and_pavement(self, side: Course) -> None:
