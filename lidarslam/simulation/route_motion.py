@@ -207,10 +207,8 @@ def motion_along_route(name: str, world: World, seed: int, speed_mps: float | No
 def _seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
     """The carrier's sines with random phases, frequencies within a tenth and amplitudes within a fifth of nominal."""
     gait, sines = rng.uniform(0.9, 1.1), carrier.sway
-    sizes = [swing.amplitude * rng.uniform(0.8, 1.2) for swing in sines]
-    sizes = [
-        float(np.deg2rad(a)) if s.axis in ("roll", "pitch", "yaw") else a for s, a in zip(sines, sizes, strict=True)
-    ]
+    units = [np.pi / 180.0 if swing.axis in ("roll", "pitch", "yaw") else 1.0 for swing in sines]
+    sizes = [s.amplitude * rng.uniform(0.8, 1.2) * unit for s, unit in zip(sines, units, strict=True)]
     rates_hz = [s.frequency_hz * (gait if s.stepwise else rng.uniform(0.9, 1.1)) for s in sines]
     phases = [rng.uniform(0.0, 2.0 * np.pi) for _ in sines]
     axes = [CHANNELS.index(swing.axis) for swing in sines]

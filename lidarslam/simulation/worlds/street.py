@@ -292,7 +292,7 @@ def terrace(seed: int) -> World:
     alike = outdoor.house(rng, width, depth, (False, False), (2, 3))
     for lot in repeated_lots(plan, width, depth):
         grounds.solid.place(alike, house_pose(ground, lot.origin, lot.along, lot.width))
-    spacing_m = 5 * width
+    spacing_m = 5 * width  # houses to a lamp post
     for side in plan.sides():  # lamp posts on the verges of both sides, opposite one another
         count = int((side.length_m - 2.0 * spacing_m) / spacing_m)
         for at in 0.5 * side.length_m + spacing_m * (np.arange(count + 1) - 0.5 * count):
