@@ -19,7 +19,6 @@ _BOXES = 12
 _DEEPEST_BOX_M = 0.45  # leaves the route's free side free
 _FRONT_M = 5.5  # height of the building that the corridor leads out of
 _ENTRY_M, _FROM_WALLS_M = 4.0, 5.5  # the path round the yard: distance from the mouth, and from the other sides
-_YARD_CELL_M, _YARD_MARGIN_M = 0.5, 12.0
 
 
 def corridor(seed: int) -> World:
@@ -27,14 +26,13 @@ def corridor(seed: int) -> World:
 
     The corridor's middle is x from -length to 0 at y = 0; there the yard begins.
     """
-    rng = np.random.default_rng(seed)
+    rng, cell = np.random.default_rng(seed), 0.5
     length, depth, width = rng.uniform(24.0, 40.0), rng.uniform(25.0, 40.0), rng.uniform(25.0, 40.0)
     yard = Room(np.array([0.0, -0.5 * width]), np.array([depth, 0.5 * width]))
     # Level in the corridor and along the front, a little uneven in the yard.
-    low = np.floor(yard.low - [length, 0.0] - _YARD_MARGIN_M)
-    nodes = paths.grid_nodes(low, yard.high + _YARD_MARGIN_M, _YARD_CELL_M)
-    hills = building.relief(rng, nodes.shape[:2], (0.12, 8.0 / _YARD_CELL_M), (0.01, 0.7))
-    ground = HeightField(low, _YARD_CELL_M, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
+    low, nodes = paths.grid_around(np.array([yard.low - [length, 0.0], yard.high]), 12.0, cell)
+    hills = building.relief(rng, nodes.shape[:2], (0.12, 8.0 / cell), (0.01, 0.7))
+    ground = HeightField(low, cell, hills * np.clip((nodes[..., 0] - 1.0) / 4.0, 0.0, 1.0))
     route = _corridor_route(length, yard, ground)
     grounds = Grounds(rng, route.waypoints[:, :2], ground)
     _draw_corridor(length, grounds.solid, rng)
