@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion import CHANNELS, Motion, Sway
+from lidarslam.simulation.motion import CHANNELS, Motion
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World
+from lidarslam.simulation.world import Boxes, HeightField, Mover, Route, World
+from lidarslam.simulation.worlds.building import Builder
 
 Cover = Literal["empty", "near", "stray"]
 
@@ -111,7 +112,7 @@ def standing_still(position: FloatArray, yaw: float, sensor_height_m: float) -> 
     """A body that stays at a place (3,) on the ground."""
     base = np.zeros((3, len(CHANNELS)))
     base[:, :3], base[:, 5] = position, yaw
-    return Motion("still", np.array([0.0, 1.0, 2.0]), base, Sway(), sensor_height_m, repeats=False)
+    return Motion("still", np.array([0.0, 1.0, 2.0]), base, sensor_height_m, repeats=False)
 
 
 def passing_by(
@@ -138,28 +139,18 @@ def passing_by(
 
 def even_tunnel(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> World:
     """A straight tunnel along x, even from `begin_m` to `end_m`; before and behind that, niches and cabinets."""
-    half = 0.5 * length_m + _BEYOND_M
-    middle = 0.5 * length_m
-    shell = [((middle, 0.0, -0.5 * _THICK_M), (half, 6.0, 0.5 * _THICK_M))]
-    shell += [((middle, 0.0, _HIGH_M + 0.5 * _THICK_M), (half, 6.0, 0.5 * _THICK_M))]
-    beside_m = _WIDE_M + 0.5 * _THICK_M
-    shell += [((middle, y, 0.5 * _HIGH_M), (half, 0.5 * _THICK_M, 3.0)) for y in (-beside_m, beside_m)]
-    centres, halves = (np.array(rows) for rows in zip(*shell, strict=True))
+    builder, middle, length = Builder(), 0.5 * length_m, length_m + 2.0 * _BEYOND_M
+    for z in (-0.5 * _THICK_M, _HIGH_M + 0.5 * _THICK_M):
+        builder.box((middle, 0.0, z), (length, 12.0, _THICK_M))
+    for side in (-1.0, 1.0):
+        builder.box((middle, side * (_WIDE_M + 0.5 * _THICK_M), 0.5 * _HIGH_M), (length, _THICK_M, 6.0))
     rng = np.random.default_rng([seed, 1])
     places = _places(rng, begin_m, end_m, length_m, 1.6)
-    side = rng.choice([-1.0, 1.0], len(places))
-    depth, width, tall = (
-        rng.uniform(0.1, 0.35, len(places)),
-        rng.uniform(0.2, 0.7, len(places)),
-        rng.uniform(0.6, 2.2, len(places)),
-    )
-    fittings = np.stack([places, side * (_WIDE_M - depth), tall], axis=-1)
-    boxes = Boxes(
-        np.concatenate([centres, fittings]),
-        np.concatenate([halves, np.stack([width, depth, tall], axis=-1)]),
-        np.tile(np.eye(3), (len(centres) + len(places), 1, 1)),
-    )
-    return World("even-tunnel", seed, _route(length_m), boxes)
+    sides = rng.choice([-1.0, 1.0], len(places))
+    halves = [rng.uniform(*limits, len(places)) for limits in ((0.1, 0.35), (0.2, 0.7), (0.6, 2.2))]
+    for x, side, depth, width, tall in zip(places, sides, *halves, strict=True):
+        builder.box((x, side * (_WIDE_M - depth), tall), (2.0 * width, 2.0 * depth, 2.0 * tall))
+    return World("even-tunnel", seed, _route(length_m), builder.boxes)
 
 
 def open_plain(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> World:
@@ -172,11 +163,12 @@ def open_plain(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> 
     beside = rng.choice([-1.0, 1.0], len(places)) * rng.uniform(4.0, 15.0, len(places))
     xy = np.stack([places, beside], axis=-1)
     sheds = np.arange(len(places)) % 4 == 0
-    starts = np.column_stack([xy[~sheds], np.full((~sheds).sum(), -0.5)])
-    trunks = Cylinders(starts, starts + np.array([0.0, 0.0, 6.0]), rng.uniform(0.1, 0.4, len(starts)))
-    halves = rng.uniform([0.5, 0.5, 1.5], [2.0, 2.0, 3.0], (sheds.sum(), 3))
-    boxes = Boxes(np.column_stack([xy[sheds], halves[:, 2] - 0.1]), halves, np.tile(np.eye(3), (len(halves), 1, 1)))
-    return World("open-plain", seed, _route(length_m), boxes, trunks, (ground,), map_spacing_m=0.1)
+    builder, trunks = Builder(), xy[~sheds]
+    for trunk, radius in zip(trunks, rng.uniform(0.1, 0.4, len(trunks)), strict=True):
+        builder.pole(trunk, (-0.5, 5.5), radius)
+    for shed, half in zip(xy[sheds], rng.uniform([0.5, 0.5, 1.5], [2.0, 2.0, 3.0], (sheds.sum(), 3)), strict=True):
+        builder.box((*shed, half[2] - 0.1), 2.0 * half)
+    return World("open-plain", seed, _route(length_m), *builder.solids, (ground,), map_spacing_m=0.1)
 
 
 def straight_drive(length_m: float, speed_mps: float, sensor_height_m: float) -> Trajectory:

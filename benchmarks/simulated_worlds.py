@@ -14,12 +14,6 @@ from lidarslam.odometry.config import KissConfig
 from lidarslam.simulation.world import WORLDS
 
 
-def run_one(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None) -> str:
-    """One cell of the table."""
-    outcome = run_kiss(simulate(world, motion, sensor, scans, seed, speed_mps), KissConfig())
-    return f"{outcome.ate_m:.2f} ({outcome.length_m:.0f} m)"
-
-
 def main() -> None:
     """Parse the command line and print the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -27,10 +21,11 @@ def main() -> None:
     arguments = parser.parse_args()
     print_header(["world", *arguments.motions])
     for world in arguments.worlds:
-        cells = [
-            run_one(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)
-            for motion in arguments.motions
-        ]
+        cells = []
+        for motion in arguments.motions:
+            simulation = simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)
+            outcome = run_kiss(simulation, KissConfig())
+            cells.append(f"{outcome.ate_m:.2f} ({outcome.length_m:.0f} m)")
         print_row([world, *cells])
 
 

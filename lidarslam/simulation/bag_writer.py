@@ -15,20 +15,8 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
-from lidarslam.datasets.ros.bag_message import (
-    CUSTOM_MESSAGE_DEFINITION,
-    CUSTOM_POINT_DEFINITION,
-    TRANSFORMS_DEFINITION,
-    TRANSFORMS_TYPE,
-)
-from lidarslam.datasets.ros.made_messages import (
-    POINT_CLOUD2_TYPE,
-    header,
-    point_cloud,
-    transforms,
-    vector,
-    write_chunk_checksums,
-)
+from lidarslam.datasets.ros import bag_message
+from lidarslam.datasets.ros import made_messages as made
 from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_ns
 
 Records = NDArray[np.void]
@@ -45,7 +33,7 @@ class DriverCloud:
     record: np.dtype[np.void]  # type of a point, padding included
     imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one next to it
     imu_frame_id: str = "imu_link"
-    message_type: str = POINT_CLOUD2_TYPE
+    message_type: str = made.POINT_CLOUD2_TYPE
 
     def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
         """The points (N,) of a sweep whose message is stamped `stamp_ns`."""
@@ -126,7 +114,7 @@ def write_bag(
     except sqlite3.Error as error:
         raise OutputError(f"{bag.path}: cannot be written ({error}); is the disk full?") from error
     if kind == "mcap":
-        write_chunk_checksums(folder / f"{folder.name}.mcap")
+        made.write_chunk_checksums(folder / f"{folder.name}.mcap")
 
 
 Messages = Iterator[tuple[Any, int, bytes]]  # connection, time of recording in nanoseconds, bytes; in order of time
@@ -151,22 +139,22 @@ def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", ri
     if imu is None:
         return
     if imu.T_lidar_imu is not None:
-        placed = bag.add_connection(_STATIC_TRANSFORMS, TRANSFORMS_TYPE, typestore=store)
-        parent = header(store, CLOCK_START_NS, driver.frame_id)
-        message = transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
-        yield placed, CLOCK_START_NS, serializer.serialized(message, TRANSFORMS_TYPE)
+        placed = bag.add_connection(_STATIC_TRANSFORMS, bag_message.TRANSFORMS_TYPE, typestore=store)
+        parent = made.header(store, CLOCK_START_NS, driver.frame_id)
+        message = made.transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
+        yield placed, CLOCK_START_NS, serializer.serialized(message, bag_message.TRANSFORMS_TYPE)
     connection = bag.add_connection(driver.imu_topic, _IMU_TYPE, typestore=store)
     orientation, unknown = store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
     no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition requires
     for number, stamp in enumerate(imu.stamps):
         stamp_ns = clock_ns(stamp)
         sample = store.types[_IMU_TYPE](
-            header=header(store, stamp_ns, driver.imu_frame_id, number),
+            header=made.header(store, stamp_ns, driver.imu_frame_id, number),
             orientation=orientation,
             orientation_covariance=no_orientation,
-            angular_velocity=vector(store, imu.angular_velocities[number]),
+            angular_velocity=made.vector(store, imu.angular_velocities[number]),
             angular_velocity_covariance=unknown,
-            linear_acceleration=vector(store, imu.accelerations[number]),
+            linear_acceleration=made.vector(store, imu.accelerations[number]),
             linear_acceleration_covariance=unknown,
         )
         yield connection, stamp_ns, serializer.serialized(sample, _IMU_TYPE)
@@ -178,16 +166,16 @@ class MessageSerializer:
     def __init__(self, ros2: bool) -> None:
         self._ros2 = ros2
         self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-        self.store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
-        self.store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
+        self.store.register(get_types_from_msg(bag_message.CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
+        self.store.register(get_types_from_msg(bag_message.CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
         if not ros2:  # ROS 2's store has it
-            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+            self.store.register(get_types_from_msg(bag_message.TRANSFORMS_DEFINITION, bag_message.TRANSFORMS_TYPE))
 
     def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
         """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
-        message_header = header(self.store, stamp_ns, driver.frame_id, sequence)
+        message_header = made.header(self.store, stamp_ns, driver.frame_id, sequence)
         if driver.message_type != _CUSTOM_MESSAGE:
-            return self.serialized(point_cloud(self.store, message_header, records), driver.message_type)
+            return self.serialized(made.point_cloud(self.store, message_header, records), driver.message_type)
         rsvd = np.zeros(3, np.uint8)
         message = self.store.types[_CUSTOM_MESSAGE](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
         # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the

@@ -15,19 +15,11 @@ from lidarslam.simulation.world import World, choose
 CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "activity")
 
 
-@dataclass(frozen=True, eq=False)
-class Sway:
-    """K sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest."""
+Sway = tuple[tuple[int, float, float, float], ...]
+"""Sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest.
 
-    # Each: the index into x, y, z, roll, pitch, yaw; amplitude in metres or radians; frequency in Hz; phase.
-    sines: tuple[tuple[int, float, float, float], ...] = ()
-
-    def at(self, times: FloatArray) -> FloatArray:
-        """Deflections (N, 6) at times (N,), full size."""
-        deflections = np.zeros((len(times), 6))
-        for axis, amplitude, frequency_hz, phase in self.sines:
-            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency_hz * times + phase)
-        return deflections
+Each: the index into x, y, z, roll, pitch, yaw; amplitude in metres or radians; frequency in Hz; phase.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +33,8 @@ class Motion:
     name: str  # of the carrier, or "given"
     times: FloatArray  # (K,) from 0 to `duration_s`
     base: FloatArray  # (K, 7)
-    sway: Sway
     sensor_height_m: float  # of a LiDAR above the body's origin
+    sway: Sway = ()
     repeats: bool = True  # another lap follows a lap; else the body stays where it is in the end
     rests: bool = True  # a lap begins and ends at rest; else its last pose is its first, whole turns of yaw aside
 
@@ -62,7 +54,10 @@ class Motion:
         since = np.maximum(times, 0.0)
         lap_time = np.mod(since, self.duration_s) if self.repeats else np.minimum(since, self.duration_s)
         state = self._spline(lap_time)
-        x, y, z, roll, pitch, yaw = (state[:, :6] + state[:, 6:] * self.sway.at(times)).T
+        deflections = np.zeros((len(times), 6))
+        for axis, amplitude, frequency_hz, phase in self.sway:
+            deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency_hz * times + phase)
+        x, y, z, roll, pitch, yaw = (state[:, :6] + state[:, 6:] * deflections).T
         # Sway along x and y is the body's, not the world's.
         c, s = np.cos(yaw), np.sin(yaw)
         dx, dy = x - state[:, 0], y - state[:, 1]
@@ -225,4 +220,4 @@ def motion_along(trajectory: Trajectory) -> Motion:
     """
     yaw, pitch, roll = np.unwrap(Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_euler("ZYX"), axis=0).T
     base = np.column_stack([trajectory.positions, roll, pitch, yaw, np.zeros(len(trajectory))])
-    return Motion("given", trajectory.stamps - trajectory.stamps[0], base, Sway(), 0.0, repeats=False)
+    return Motion("given", trajectory.stamps - trajectory.stamps[0], base, 0.0, repeats=False)

@@ -22,8 +22,8 @@ from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_
 from lidarslam.simulation.reference_map import KeyArray, SeenSurfaces, sample_seen
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
-from lidarslam.simulation.writers import FORMATS, as_records, find_format, write_ply
+from lidarslam.simulation.world import build_world, choose
+from lidarslam.simulation.writers import FORMATS, as_records, write_ply
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ _IMU = """\
 
 def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
     """The README as Markdown; its command makes the same recording again."""
-    made = find_format(request.format)
+    made = FORMATS[request.format]
     words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
     words += ["--motion", request.motion]
     words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
@@ -252,7 +252,7 @@ def record(request: RecordRequest, progress: Callable[[int, int], None]) -> Reco
             route, or the format holds no IMU.
         OutputError: the folder holds something already, or cannot be written.
     """
-    chosen = find_format(request.format)
+    chosen = choose("recording format", request.format, FORMATS)
     if request.imu and not chosen.imu:
         raise InputError(f"the format {request.format} has no place for an IMU; choose another, or leave out --imu")
     with new_folder(request.out, request.overwrite) as folder:

@@ -84,24 +84,20 @@ def corner_windows(vertices: FloatArray, corner_m: float, cut_m: float) -> Float
 def straightened(vertices: FloatArray, tolerance_m: float) -> FloatArray:
     """The fewest vertices of a closed polyline (M, 3) that keep it within `tolerance_m` (Douglas and Peucker)."""
     closed = np.concatenate([vertices, vertices[:1]])
-    farthest = int(np.linalg.norm(vertices - vertices[0], axis=1).argmax())
-    keep = np.zeros(len(closed), dtype=bool)
-    keep[[0, farthest]] = True
-    pending = [(0, farthest), (farthest, len(closed) - 1)]
-    while pending:
-        first, last = pending.pop()
-        if last - first < 2:
-            continue
+
+    def kept(first: int, last: int) -> list[int]:
+        """The vertices to keep, from the first to before the last."""
         chord = closed[last] - closed[first]
         offsets = closed[first + 1 : last] - closed[first]
         along = np.clip(offsets @ chord / max(float(chord @ chord), 1e-12), 0.0, 1.0)
         distance = np.linalg.norm(offsets - along[:, None] * chord, axis=1)
-        worst = int(distance.argmax())
-        if distance[worst] > tolerance_m:
-            middle = first + 1 + worst
-            keep[middle] = True
-            pending += [(first, middle), (middle, last)]
-    return np.asarray(vertices[keep[:-1]])
+        if distance.max(initial=0.0) <= tolerance_m:
+            return [first]
+        middle = first + 1 + int(distance.argmax())
+        return kept(first, middle) + kept(middle, last)
+
+    farthest = int(np.linalg.norm(vertices - vertices[0], axis=1).argmax())
+    return np.asarray(vertices[kept(0, farthest) + kept(farthest, len(vertices))])
 
 
 TIME_STEP_S = 0.01
@@ -205,21 +201,18 @@ def motion_along_route(name: str, world: World, seed: int, speed_mps: float | No
         world = replace(world, route=replace(world.route, speed_limit_mps=speed_mps))
     base = _circuit(carrier, world) if carrier.keeps_going else _from_rest(carrier, world)
     times = np.linspace(0.0, TIME_STEP_S * (len(base) - 1), len(base))
-    sway = _seeded_sway(carrier, rng)
-    return Motion(name, times, base, sway, carrier.sensor_height_m, rests=not carrier.keeps_going)
+    return Motion(name, times, base, carrier.sensor_height_m, _seeded_sway(carrier, rng), rests=not carrier.keeps_going)
 
 
 def _seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
     """The carrier's sines with random phases, frequencies within a tenth and amplitudes within a fifth of nominal."""
     gait, sines = rng.uniform(0.9, 1.1), carrier.sway
-    sizes = [swing.amplitude * rng.uniform(0.8, 1.2) for swing in sines]
-    sizes = [
-        float(np.deg2rad(a)) if s.axis in ("roll", "pitch", "yaw") else a for s, a in zip(sines, sizes, strict=True)
-    ]
+    units = [np.pi / 180.0 if swing.axis in ("roll", "pitch", "yaw") else 1.0 for swing in sines]
+    sizes = [s.amplitude * rng.uniform(0.8, 1.2) * unit for s, unit in zip(sines, units, strict=True)]
     rates_hz = [s.frequency_hz * (gait if s.stepwise else rng.uniform(0.9, 1.1)) for s in sines]
     phases = [rng.uniform(0.0, 2.0 * np.pi) for _ in sines]
     axes = [CHANNELS.index(swing.axis) for swing in sines]
-    return Sway(tuple(zip(axes, sizes, rates_hz, phases, strict=True)))
+    return tuple(zip(axes, sizes, rates_hz, phases, strict=True))
 
 
 def _circuit(carrier: Carrier, world: World) -> FloatArray:

@@ -132,10 +132,12 @@ class World:
         return self.height_fields[0].height_at(xy) if self.height_fields else np.zeros(len(xy))
 
 
-# Each is a module of lidarslam.simulation.worlds with `build(seed: int) -> World`.
-WORLDS = (
-    "street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace", "town", "corridor", "stairs", "crowd",
-)  # fmt: skip
+# Each with the module of lidarslam.simulation.worlds that has a function of its name, which takes the seed.
+WORLDS = {
+    "street": "street", "office": "office", "tunnel": "tunnel", "forest": "countryside", "hall": "hall",
+    "park": "countryside", "fields": "countryside", "terrace": "street", "town": "town", "corridor": "hard_places",
+    "stairs": "hard_places", "crowd": "hard_places",
+}  # fmt: skip
 
 
 def choose(kind: str, name: str, table: Mapping[str, T]) -> T:
@@ -147,5 +149,5 @@ def choose(kind: str, name: str, table: Mapping[str, T]) -> T:
 
 def build_world(name: str, seed: int) -> World:
     """The world of that name and seed; the same two give the same world, bit for bit."""
-    modules = {world: f"lidarslam.simulation.worlds.{world}" for world in WORLDS}
-    return cast(World, import_module(choose("world", name, modules)).build(seed))
+    module = import_module(f"lidarslam.simulation.worlds.{choose('world', name, WORLDS)}")
+    return cast(World, getattr(module, name)(seed))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,6 @@ from lidarslam.core.trajectory import format_kitti
 from lidarslam.datasets.imu_samples import COLUMNS, EXTRINSIC, IMU_FILE
 from lidarslam.datasets.mounting import KITTI_DEG, correct_elevation
 from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_s
-from lidarslam.simulation.world import choose
 
 Writer = Callable[[Path, Iterable[SimulatedScan], Rig], None]
 """Makes the folder, which does not exist yet, and writes the scans, holding one of them at a time."""
@@ -171,13 +171,12 @@ _IMU_TABLE = "imu.csv has its samples, stamped by the same clock, and T_lidar_im
 _IMU_MESSAGES = "its messages are sensor_msgs/Imu on the topic of the sensor's driver, and /tf_static has T_lidar_imu"
 
 
-def _bag_writer(kind: Literal["rosbag1", "rosbag2", "mcap"]) -> Writer:
-    def write(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
-        from lidarslam.simulation.bag_writer import write_bag
+def _write_bag(
+    folder: Path, scans: Iterable[SimulatedScan], rig: Rig, kind: Literal["rosbag1", "rosbag2", "mcap"]
+) -> None:
+    from lidarslam.simulation.bag_writer import write_bag
 
-        write_bag(folder, scans, rig, kind)
-
-    return write
+    write_bag(folder, scans, rig, kind)
 
 
 _PLY_FILES = ("scan_*.ply", "timestamps.txt", "imu.csv")
@@ -185,13 +184,10 @@ FORMATS: dict[str, Format] = {
     "kitti": Format(write_kitti, _KITTI_LAYOUT, ("sequences", "poses"), clock_start_ns=0),
     "ply": Format(write_ply_scans, _PLY_LAYOUT, _PLY_FILES, imu=_IMU_TABLE),
     "rosbag1": Format(
-        _bag_writer("rosbag1"), f"a ROS 1 bag {_BAG_MESSAGES}", ("*.bag",), source="{name}.bag", imu=_IMU_MESSAGES
+        partial(_write_bag, kind="rosbag1"), f"a ROS 1 bag {_BAG_MESSAGES}", ("*.bag",), "{name}.bag", _IMU_MESSAGES
     ),
-    "rosbag2": Format(_bag_writer("rosbag2"), _ROSBAG2_LAYOUT, ("metadata.yaml", "*.db3"), imu=_IMU_MESSAGES),
-    "mcap": Format(_bag_writer("mcap"), _MCAP_LAYOUT, ("metadata.yaml", "*.mcap"), imu=_IMU_MESSAGES),
+    "rosbag2": Format(
+        partial(_write_bag, kind="rosbag2"), _ROSBAG2_LAYOUT, ("metadata.yaml", "*.db3"), imu=_IMU_MESSAGES
+    ),
+    "mcap": Format(partial(_write_bag, kind="mcap"), _MCAP_LAYOUT, ("metadata.yaml", "*.mcap"), imu=_IMU_MESSAGES),
 }
-
-
-def find_format(name: str) -> Format:
-    """The format of that name."""
-    return choose("recording format", name, FORMATS)

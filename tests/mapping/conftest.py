@@ -10,7 +10,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion import Motion, Sway, mount_pose
+from lidarslam.simulation.motion import Motion, mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
@@ -37,7 +37,7 @@ def scan_room() -> Scanner:
     world = _room()
     base = np.zeros((3, 7))
     base[:, :3] = STAND
-    still = Motion("still", np.array([0.0, 1.0, 2.0]), base, Sway(), 0.0, repeats=False)
+    still = Motion("still", np.array([0.0, 1.0, 2.0]), base, 0.0, repeats=False)
 
     def scan(sensor: str, mount: str = "upright", sigma_m: float = 0.0) -> Scan:
         model = replace(find_sensor(sensor), ranging=replace(EXACT, sigma_m=sigma_m))

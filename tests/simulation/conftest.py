@@ -14,6 +14,7 @@ from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World, build_world
+from lidarslam.simulation.worlds.building import rotation_z
 
 EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 
@@ -44,11 +45,6 @@ def in_world(simulation: Simulation, scan: Scan) -> FloatArray:
     return np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
 
 
-def _turn(yaw: float) -> FloatArray:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
 @pytest.fixture(scope="session")
 def yard() -> World:
     """A rolling yard of 60 x 50 m within walls, with blocks, poles and a car that goes round.
@@ -62,7 +58,7 @@ def yard() -> World:
     blocks = [((0, 0), (6, 3)), ((20, 18), (3, 2)), ((-21, -17), (2, 3)), ((22, -16), (1.5, 1.5))]
     centres = np.array([[*xy, 1.0] for xy, _ in walls + blocks], dtype=float)
     half_sizes = np.array([[*size, 4.0] for _, size in walls + blocks], dtype=float)
-    turns = np.stack([np.eye(3)] * 4 + [_turn(0.3 * k) for k in range(4)])
+    turns = np.stack([np.eye(3)] * 4 + [rotation_z(0.3 * k) for k in range(4)])
     feet = np.array([[18.0, 4.0, -2.0], [-18.0, 5.0, -2.0], [4.0, 14.0, -2.0], [-6.0, -15.0, -2.0]])
     poles = Cylinders(feet, feet + np.array([0.0, 0.0, 7.0]), np.array([0.15, 0.3, 0.2, 0.4]))
     car = Boxes(np.array([[0.0, 0.0, 0.7]]), np.array([[2.0, 0.9, 0.7]]), np.eye(3)[None])

@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.geometry import exp, is_rigid, make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion import CARRIERS, Sway, motion_along
+from lidarslam.simulation.motion import CARRIERS, motion_along
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import Route, World
 
@@ -55,7 +55,7 @@ def test_limits_are_physical(motion, T):
 
 def test_laps_come_round_exactly(motion):
     if not motion.rests:  # the sway goes on as it likes
-        motion = replace(motion, sway=Sway())
+        motion = replace(motion, sway=())
     laps = motion.duration_s * np.arange(4)
     np.testing.assert_allclose(motion.pose_at(laps), motion.pose_at(np.zeros(4)), atol=1e-9)
     quarter = motion.pose_at(np.array([0.25, 1.25]) * motion.duration_s)

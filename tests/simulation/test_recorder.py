@@ -1,4 +1,4 @@
-"""Scans put back by the true poses lie on the world's surfaces; the same seed gives the same bytes."""
+"""Scans put back by the true poses lie on the world's surfaces or above them in grass; a seed gives the same bytes."""
 
 from dataclasses import replace
 
@@ -7,8 +7,10 @@ import pytest
 
 from lidarslam.core.geometry import transform_points
 from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.noise import bloom, measure, range_sigma
+from lidarslam.simulation.noise import bloom, measure, range_sigma, ranges_in_grass
+from lidarslam.simulation.reference_map import reference_map
 from lidarslam.simulation.sensors import RangeModel, find_sensor
+from lidarslam.simulation.world import Grass, HeightField
 
 from .conftest import EXACT, in_world, simulation_in
 
@@ -122,3 +124,45 @@ def test_edges_bloom():
     bloomed, edge = trials[0]
     assert set(bloomed[edge]) <= {5.0, 20.0}
     np.testing.assert_array_equal(bloomed[~edge], flat[~edge])
+
+
+GRASS_M = 0.2
+LAWN = Grass(HeightField(np.array([-500.0, -500.0]), 1000.0, np.full((2, 2), GRASS_M)), 0.3)
+
+
+@pytest.fixture(scope="module")
+def meadow(yard):
+    grown = simulation_in(replace(yard, movers=(), grass=LAWN), "car", 1.73, 50)
+    return replace(grown, sensor=replace(grown.sensor, ranging=EXACT))
+
+
+@pytest.mark.parametrize("cosine", [1.0, 0.3, 0.06])
+def test_rays_end_among_blades_as_beer_and_lambert_have_it(cosine, rng):
+    count = 40_000
+    ranges, is_blade = ranges_in_grass(LAWN, np.zeros((count, 3)), np.full(count, 50.0), np.full(count, cosine), rng)
+    # Tips are evenly distributed between half the height and all of it.
+    tips = GRASS_M * np.linspace(0.5, 1.0, 1001) / cosine
+    assert is_blade.mean() == pytest.approx((1.0 - np.exp(-tips / 0.3)).mean(), abs=0.01)
+    assert (ranges[~is_blade] == 50.0).all()
+    depth = 50.0 - ranges[is_blade]
+    assert 0.0 <= depth.min() <= depth.max() <= tips.max()
+
+
+def test_a_scan_ends_above_the_ground_within_the_grass(meadow):
+    sweep = meadow.scan(30)
+    points = in_world(meadow, sweep.scan)
+    ranges = np.linalg.norm(sweep.scan.points, axis=1)
+    is_shortened = ranges < sweep.true_ranges - 1e-3
+    above = points[is_shortened, 2] - meadow.world.ground_at(points[is_shortened, :2])
+    assert 0.1 < is_shortened.mean() < 0.9
+    assert above.min() > -0.05  # the hills are soft, so that the grass follows them
+    assert above.max() < GRASS_M + 0.05
+    assert np.median(above) > 0.05
+    is_near = ranges < 8.0
+    assert is_shortened[is_near].mean() < is_shortened[~is_near & is_shortened | (ranges < 30.0) & ~is_near].mean()
+    np.testing.assert_array_equal(meadow.scan(30).scan.points, sweep.scan.points)
+
+
+def test_the_reference_map_is_of_the_ground(meadow):
+    mown = replace(meadow, world=replace(meadow.world, grass=None))
+    np.testing.assert_array_equal(reference_map(meadow, step=25).points, reference_map(mown, step=25).points)

@@ -1,7 +1,9 @@
 """Every world: the same from the same seed, free along the way, standing on its ground; indoors closed all round."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,11 +11,11 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.simulation.mesh import Caster, box_mesh, cylinder_mesh, merge
-from lidarslam.simulation.motion import Sway
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import WORLDS, World, build_world
+from lidarslam.simulation.worlds import town
 from lidarslam.simulation.worlds.building import UP
-from lidarslam.simulation.worlds.crowd import COMPANIONS, CROSSING, STANDING
+from lidarslam.simulation.worlds.hard_places import COMPANIONS, CROSSING, STANDING
 from lidarslam.simulation.worlds.paths import Clearance, loop_length, subdivide_loop
 
 from .conftest import cached_world, cast, caster_of
@@ -240,7 +242,7 @@ def test_a_corridor_opens_into_a_yard_and_recordings_begin_deep_in_it(seed: int)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_carrier_climbs_the_stairs_smoothly_and_comes_down_again(seed: int) -> None:
     world = cached_world("stairs", seed)
-    motion = replace(motion_along_route("handheld", world, seed), sway=Sway())
+    motion = replace(motion_along_route("handheld", world, seed), sway=())
     times = np.arange(0.0, motion.duration_s, 0.01)
     z = motion.pose_at(times)[:, 2, 3]
     assert z.max() == pytest.approx(world.route.waypoints[:, 2].max(), abs=0.05)
@@ -270,3 +272,58 @@ def test_a_crowd_is_around_the_start_and_half_of_it_goes_along(seed: int) -> Non
     assert np.ptp(beside, axis=1).max() < 1.0
     assert beside.max() < 8.5
     assert apart[:, times > 1.0].min() > world.route.free_side_m
+
+
+def town_plan(seed: int) -> tuple[FloatArray, list[tuple[int, int]], list[int]]:
+    rng = np.random.default_rng(seed)
+    nodes, streets = town.draw_network(rng)
+    return nodes, streets, town.draw_tour(rng, len(nodes), streets)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_lap_takes_every_street_once_in_either_direction(seed):
+    nodes, streets, tour = town_plan(seed)
+    driven = Counter(pairwise([*tour, tour[0]]))
+    assert driven == Counter([*streets, *(street[::-1] for street in streets)])
+    assert not any(before == after for before, after in zip(tour, [*tour[2:], *tour[:2]], strict=True))  # no turn round
+    steps = nodes[tour] - np.roll(nodes[tour], 1, axis=0)
+    assert 9_000.0 < np.linalg.norm(steps, axis=1).sum() < 13_000.0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_streets_meet_at_corners_that_a_car_can_take(seed):
+    nodes, streets, _ = town_plan(seed)
+    assert len(streets) < 60
+    assert np.bincount(np.ravel(streets)).min() >= 2
+    for node in range(len(nodes)):
+        ends = [nodes[b if a == node else a] - nodes[node] for a, b in streets if node in (a, b)]
+        angles = np.sort([np.arctan2(y, x) for x, y in ends])
+        assert np.diff([*angles, angles[0] + 2.0 * np.pi]).min() > np.deg2rad(40.0)
+
+
+@pytest.fixture(scope="module")
+def small_town() -> World:
+    """A town of four blocks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(town, "_ROWS", 3)
+        patch.setattr(town, "_LEFT_OUT", 2)
+        return town.town(0)
+
+
+@pytest.mark.slow
+def test_nothing_stands_in_the_way_of_the_car(small_town):
+    lane = subdivide_loop(small_town.route.waypoints, 1.0)
+    clear = Caster(small_town).distances(lane + np.array([0.0, 0.0, town.FREE_SIDE_M]))
+    assert clear.min() > town.FREE_SIDE_M - 0.6  # over the ground's own unevenness
+    assert len(small_town.boxes) > 1000
+    assert (small_town.cylinders.radii == 0.33).sum() > 20  # wheels
+    assert small_town.movers
+
+
+@pytest.mark.slow
+def test_a_car_goes_round_and_round(small_town):
+    motion = motion_along_route("car-fast", small_town, 0)
+    way = np.linalg.norm(np.diff(motion.base[:, :2], axis=0), axis=1)
+    assert way.max() * (len(way) / motion.duration_s) < 14.5
+    start, again = motion.pose_at(np.array([0.0, motion.duration_s]))
+    assert np.allclose(start, again, atol=0.02)  # but for its suspension

@@ -16,7 +16,7 @@ from lidarslam.datasets.published.kitti_files import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer
 from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_ns
-from lidarslam.simulation.writers import FORMATS, T_CAM_LIDAR, find_format
+from lidarslam.simulation.writers import FORMATS, T_CAM_LIDAR
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 SWEEP_S = 0.1
@@ -76,8 +76,8 @@ def test_scans_and_imu_of_every_driver_in_every_format(name, driver, tmp_path, s
 
 def write(name, folder, sweeps, rig):
     """The recording that the program's reader finds in a folder with the scans."""
-    find_format(name).write(folder, iter(sweeps), rig)
-    return open_recording(find_format(name).source_in(folder))
+    FORMATS[name].write(folder, iter(sweeps), rig)
+    return open_recording(FORMATS[name].source_in(folder))
 
 
 def assert_same(scan, expected):
@@ -121,8 +121,8 @@ def test_messages_are_laid_out_as_the_driver_lays_them_out(name, driver, tmp_pat
 
 def messages(name, driver, folder, sweeps, rig):
     """Record stamp and message, decoded by rosbags with the definitions in the bag, with the sweep it was made of."""
-    find_format(name).write(folder, iter(sweeps), replace(rig, driver=driver))
-    source = find_format(name).source_in(folder)
+    FORMATS[name].write(folder, iter(sweeps), replace(rig, driver=driver))
+    source = FORMATS[name].source_in(folder)
     store = MessageSerializer(ros2=name != "rosbag1").store
     with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(source) as reader:
         deserialize = store.deserialize_ros1 if name == "rosbag1" else store.deserialize_cdr
@@ -208,14 +208,14 @@ def test_one_scan_is_held_at_a_time(name, tmp_path, sweeps, rig):
             del made, scan
             most = max(most, len(alive))
 
-    find_format(name).write(tmp_path / "room", stream(), rig)
+    FORMATS[name].write(tmp_path / "room", stream(), rig)
     assert most == 1  # the writer's own, when the next one is asked for
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
-    find_format(name).write(tmp_path / "room", iter(sweeps[:2]), replace(rig, imu=some_imu()))
-    patterns = find_format(name).files
+    FORMATS[name].write(tmp_path / "room", iter(sweeps[:2]), replace(rig, imu=some_imu()))
+    patterns = FORMATS[name].files
     for entry in (tmp_path / "room").iterdir():
         assert any(entry.match(pattern) for pattern in patterns)
     assert all(any((tmp_path / "room").glob(pattern)) for pattern in patterns)

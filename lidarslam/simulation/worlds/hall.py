@@ -88,7 +88,7 @@ def _edge(a: tuple[float, float], b: tuple[float, float], *gaps: float, half: fl
     return points.reshape(-1, 2, 2)
 
 
-def build(seed: int) -> World:
+def hall(seed: int) -> World:
     """The hall of that seed; the ground floor is at z = 0, the route climbs two decks and is 230 to 300 m long."""
     rng = np.random.default_rng(seed)
     plan = draw_hall(rng)

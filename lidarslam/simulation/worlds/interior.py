@@ -252,43 +252,39 @@ class Furnisher:
         piece(self.builder.shifted(*middle, yaw=yaw), size, self.rng)
         return True
 
-    def at_wall(self, room: Room, size: Size, piece: Piece, z: float = 0.0, tries: int = 12) -> bool:
-        """Draw a piece of that width, depth and height at some wall, its bottom at z; whether there was room."""
-        inner = 0.5 * WALL_M + HAIR_M
+    def place(
+        self, room: Room, size: Size, piece: Piece, z: float = 0.0, tries: int = 12, is_on_floor: bool = False
+    ) -> bool:
+        """Draw a piece of that width, depth and height at a wall from z up, or on the floor; whether there was room."""
+        half, y = 0.5 * size[0], (-0.5 * size[1], 0.5 * size[1]) if is_on_floor else (0.0, size[1])
         for _ in range(tries):
-            wall, length = room.at_wall(int(self.rng.integers(4)), self.builder)
-            free = length - 2.0 * inner - size[0]
-            if free < 0.0:
-                continue
-            along = inner + 0.5 * size[0] + free * float(self.rng.choice([0.0, 1.0, self.rng.random()]))
-            spot = wall.shifted(along, inner, z)
-            if self.clearance.claim(*spot.bounds((-0.5 * size[0], 0.5 * size[0]), (0.0, size[1]), (0.0, size[2]))):
+            spot = self._on_floor(room, size) if is_on_floor else self._at_wall(room, size[0], z)
+            if spot and self.clearance.claim(*spot.bounds((-half, half), y, (0.0, size[2]))):
                 piece(spot, size, self.rng)
                 return True
         return False
 
-    def on_floor(self, room: Room, size: Size, piece: Piece, tries: int = 12) -> bool:
-        """Draw a piece that fills that width, depth and height around its middle; whether there was room."""
-        a, b = 0.5 * size[0], 0.5 * size[1]
-        for _ in range(tries):
-            turned = bool(self.rng.random() < 0.5)
-            half = np.array([b, a] if turned else [a, b])
-            low, high = room.low + WALL_M + half, room.high - WALL_M - half
-            if (low > high).any():
-                continue
-            spot = self.builder.shifted(*self.rng.uniform(low, high), yaw=0.5 * np.pi * turned)
-            if self.clearance.claim(*spot.bounds((-a, a), (-b, b), (0.0, size[2]))):
-                piece(spot, size, self.rng)
-                return True
-        return False
+    def _at_wall(self, room: Room, width: float, z: float) -> Builder | None:
+        inner = 0.5 * WALL_M + HAIR_M
+        wall, length = room.at_wall(int(self.rng.integers(4)), self.builder)
+        free = length - 2.0 * inner - width
+        if free < 0.0:
+            return None
+        along = inner + 0.5 * width + free * float(self.rng.choice([0.0, 1.0, self.rng.random()]))
+        return wall.shifted(along, inner, z)
+
+    def _on_floor(self, room: Room, size: Size) -> Builder | None:
+        turned = bool(self.rng.random() < 0.5)
+        half = 0.5 * np.array(size[:2])[:: -1 if turned else 1]
+        low, high = room.low + WALL_M + half, room.high - WALL_M - half
+        if (low > high).any():
+            return None
+        return self.builder.shifted(*self.rng.uniform(low, high), yaw=0.5 * np.pi * turned)
 
     def some(self, room: Room, pieces: Pieces) -> None:
         """A number of pieces, each of its own size."""
         for _ in self.number(pieces.count):
-            if pieces.is_on_floor:
-                self.on_floor(room, self.drawn(pieces.size), pieces.piece, pieces.tries)
-            else:
-                self.at_wall(room, self.drawn(pieces.size), pieces.piece, pieces.z, pieces.tries)
+            self.place(room, self.drawn(pieces.size), pieces.piece, pieces.z, pieces.tries, pieces.is_on_floor)
 
     def number(self, count: int | tuple[int, int]) -> range:
         """A range of that length, or of one within limits."""
@@ -309,7 +305,7 @@ def furnish_room(room: Room, kind: str, put: Furnisher) -> None:
             pieces(room, put)
     for _ in put.number((1, 4)):
         width, low = put.rng.uniform(0.6, 1.8), put.rng.uniform(0.95, 1.3)
-        put.at_wall(room, (width, 0.04, 1.0), board, z=low - 0.1)
+        put.place(room, (width, 0.04, 1.0), board, z=low - 0.1)
 
 
 def furnish_corridor(corridor: Room, height: float, put: Furnisher) -> None:
@@ -318,23 +314,23 @@ def furnish_corridor(corridor: Room, height: float, put: Furnisher) -> None:
     put.some(corridor, Pieces(pilaster, int(area / 6.0), (0.35, (0.12, 0.2), height), tries=6))
     for _ in range(int(area / 6.0)):
         depth, width, tall = put.drawn(((0.25, 0.45), (0.6, 1.8), (0.8, 2.0)))
-        put.at_wall(corridor, (width, depth, tall), cabinet, tries=8)
+        put.place(corridor, (width, depth, tall), cabinet, tries=8)
     for _ in range(int(area / 9.0)):
-        put.at_wall(corridor, (0.2, 0.2, 0.7), extinguisher, z=0.3, tries=6)
-        put.at_wall(corridor, put.drawn(((0.5, 1.6), 0.05, 1.0)), partial(board, low=0.05), z=1.0, tries=6)
-        put.at_wall(corridor, (0.5, 0.5, 1.2), lambda spot, _, rng: plant(spot, (0.5, 0.45, 1.1), rng), tries=6)
+        put.place(corridor, (0.2, 0.2, 0.7), extinguisher, z=0.3, tries=6)
+        put.place(corridor, put.drawn(((0.5, 1.6), 0.05, 1.0)), partial(board, low=0.05), z=1.0, tries=6)
+        put.place(corridor, (0.5, 0.5, 1.2), lambda spot, _, rng: plant(spot, (0.5, 0.45, 1.1), rng), tries=6)
 
 
 def _conference(room: Room, put: Furnisher) -> None:
     longest = max(1.5, float((room.high - room.low).max()) - 2.4)
-    any(put.on_floor(room, put.drawn(((1.4, longest), (2.0, 2.4), 1.0)), conference) for _ in range(3))
+    any(put.place(room, put.drawn(((1.4, longest), (2.0, 2.4), 1.0)), conference, is_on_floor=True) for _ in range(3))
 
 
 def _gas_bottles(room: Room, put: Furnisher) -> None:
     for _ in put.number((1, 4)):
         height, radius = put.rng.uniform(0.7, 1.6), put.rng.uniform(0.12, 0.25)
         rows = (0.0, 0.28, 0.0, height, radius), (0.0, 0.28, height, height + 0.1, 0.3 * radius)
-        put.at_wall(room, (0.55, 0.55, 1.7), lambda spot, _, __, rows=rows: spot.poles(*rows))  # type: ignore[misc]
+        put.place(room, (0.55, 0.55, 1.7), lambda spot, _, __, rows=rows: spot.poles(*rows))  # type: ignore[misc]
 
 
 _SHELF = (0.8, 1.4), (0.28, 0.42)

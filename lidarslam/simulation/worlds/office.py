@@ -248,7 +248,7 @@ _FRAME_M = 0.06
 _SILL_M, _LINTEL_M = 0.92, 2.2
 
 
-def build(seed: int) -> World:
+def office(seed: int) -> World:
     """The office of that seed; the floor is at z = 0, the route 40 to 90 m long and into some of the rooms."""
     rng = np.random.default_rng(seed)
     plan = draw_plan(rng)

@@ -1,4 +1,4 @@
-"""City streets round one block or two: houses, kerbs, parked and oncoming cars, trees, poles, people."""
+"""City streets round one block or two, and terraced housing: houses, kerbs, parked and oncoming cars, trees, poles."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -12,7 +12,6 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import outdoor, paths
 from lidarslam.simulation.worlds.building import Builder, Vector, heading, left_of, relief
-from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
 
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
@@ -148,15 +147,11 @@ def _draw_streets(
     rng: np.random.Generator, outline: FloatArray, is_double: bool
 ) -> tuple[FloatArray, tuple[tuple[int, int], ...]]:
     """Nodes and edges round the outline (4, 2), with a middle street at x = 0 or none, and of dead ends."""
-    nodes: list[FloatArray] = []
+    nodes: dict[tuple[float, ...], int] = {}  # at whole metres
     edges: list[tuple[int, int]] = []
 
     def node(at: FloatArray) -> int:
-        for k, other in enumerate(nodes):
-            if np.abs(other - at).max() < 0.5:
-                return k
-        nodes.append(at)
-        return len(nodes) - 1
+        return nodes.setdefault(tuple(at), len(nodes))
 
     for k, corner in enumerate(outline):
         step = outline[(k + 1) % 4] - corner
@@ -173,7 +168,7 @@ def _draw_streets(
         edges += pairwise([node(corner + stop * along) for stop in sorted(stops)])
     if is_double:
         edges.append((node(np.array([0.0, 0.0])), node(np.array([0.0, outline[2, 1]]))))
-    return np.array(nodes), tuple(edges)
+    return np.array(list(nodes)), tuple(edges)
 
 
 class Lot(NamedTuple):
@@ -259,18 +254,18 @@ def _frontages(plan: Quarter) -> Iterator[tuple[FloatArray, float, FloatArray]]:
         yield side.at(-before, front), before + side.length_m + after, side.along
 
 
-def build(seed: int) -> World:
+def street(seed: int) -> World:
     """A quarter of a city; everybody drives on the right."""
     rng = np.random.default_rng(seed)
     plan = draw_quarter(rng)
-    ground = lay_ground(rng, plan, (0.6, 1.1))
+    ground, _ = lay_ground(rng, plan, (0.6, 1.1))
     lots, gaps = draw_lots(plan, rng)
     grounds = Grounds(rng, plan.tour, ground)
     lay_kerbs(grounds.solid, plan.kerb_stones(), ground)
     for lot in lots:
         sides = (_is_open(plan, lots, lot, -1.5), _is_open(plan, lots, lot, lot.width + 1.5))
         pose = house_pose(ground, lot.origin, lot.along, lot.width)
-        grounds.solid.place(house(rng, lot.width, lot.depth, sides), pose)
+        grounds.solid.place(outdoor.house(rng, lot.width, lot.depth, sides), pose)
     for lot in [*gaps, *(lot for lot in lots if lot.setback_m > 2.0)]:
         _garden(grounds, lot)
     park_cars(grounds, plan, (0.35, 0.85))
@@ -281,6 +276,36 @@ def build(seed: int) -> World:
     return World("street", seed, route, *grounds.solid.solids, (ground,), movers, map_spacing_m=0.1)
 
 
+def terrace(seed: int) -> World:
+    """Two long terraces back to back, and the same across the street: all periods of the same house look the same."""
+    rng = np.random.default_rng(seed)
+    # One long, narrow block: two streets of about 400 m, and two short ones that join them.
+    outline = rectangle((0.0, 0.0), (float(rng.integers(380, 461)), float(rng.integers(56, 71))))
+    tour = outline if rng.random() < 0.5 else outline[::-1]
+    edges = tuple((k, (k + 1) % 4) for k in range(4))
+    plan = Quarter(outline, edges, rng.uniform(3.4, 4.2), tour, tour[::-1], outline[None, [0, 2]])
+    # Hardly a slope: houses that step up with it would be distinguishable.
+    ground, kerb = lay_ground(rng, plan, (0.05, 0.15))
+    grounds = Grounds(rng, plan.tour, ground)
+    width, depth = rng.uniform(5.2, 6.8), rng.uniform(8.0, 9.5)
+    lay_kerbs(grounds.solid, plan.kerb_stones(), ground)
+    alike = outdoor.house(rng, width, depth, (False, False), (2, 3))
+    for lot in repeated_lots(plan, width, depth):
+        grounds.solid.place(alike, house_pose(ground, lot.origin, lot.along, lot.width))
+    spacing_m = 5 * width  # houses to a lamp post
+    for side in plan.sides():  # lamp posts on the verges of both sides, opposite one another
+        count = int((side.length_m - 2.0 * spacing_m) / spacing_m)
+        for at in 0.5 * side.length_m + spacing_m * (np.arange(count + 1) - 0.5 * count):
+            where = side.at(at, HALF_WIDTH_M + 0.9)
+            grounds.put(outdoor.lamp_post(5.5, 1.3), where, heading(-side.outward))
+    park_cars(grounds, plan, (0.02, 0.08))
+    route = Route(paths.on_ground(lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, 14.0)  # 50 km/h
+    movers = (*traffic(grounds, plan), *people(grounds, plan))
+    verge = np.minimum(kerb - 0.4, 1.8 - kerb)  # between kerb and pavement
+    grass = outdoor.grass(rng, ground, np.full(kerb.shape, 0.1), verge)
+    return World("terrace", seed, route, *grounds.solid.solids, (ground,), movers, map_spacing_m=0.1, grass=grass)
+
+
 def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
     """The middle (N, 2) of the right lane along a tour (M, 2)."""
     corners = paths.offset_loop(tour, 0.5 * _LANE_M)
@@ -288,14 +313,14 @@ def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
     return paths.subdivide_loop(paths.round_corners(corners, radii, step_m), 5.0)
 
 
-def lay_ground(rng: np.random.Generator, plan: Quarter, hills_m: tuple[float, float]) -> HeightField:
-    """Gentle slopes of that deviation, with the surface of the streets on them."""
+def lay_ground(rng: np.random.Generator, plan: Quarter, hills_m: tuple[float, float]) -> tuple[HeightField, FloatArray]:
+    """Gentle slopes of that deviation with the surface of the streets on them, and the nodes' kerb distance (X, Y)."""
     margin = plan.front_m + 20.0
     # Nodes are at whole metres, so that a kerb is at grid points.
     low, nodes = paths.grid_around(plan.nodes, margin, RISE_M)
     kerb = plan.kerb_distance(nodes.reshape(-1, 2)).reshape(nodes.shape[:2])
     heights = relief(rng, kerb.shape, (rng.uniform(*hills_m), 40.0 / RISE_M))
-    return HeightField(low, RISE_M, pave(rng, heights, kerb, RISE_M, HALF_WIDTH_M))
+    return HeightField(low, RISE_M, pave(rng, heights, kerb, RISE_M, HALF_WIDTH_M)), kerb
 
 
 def pave(

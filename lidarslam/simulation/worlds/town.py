@@ -16,21 +16,9 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
-from lidarslam.simulation.worlds import outdoor
+from lidarslam.simulation.worlds import outdoor, paths, street
 from lidarslam.simulation.worlds.building import heading, left_of, smooth_noise
-from lidarslam.simulation.worlds.houses import house
 from lidarslam.simulation.worlds.outdoor import Grounds, on_slope, upright
-from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along
-from lidarslam.simulation.worlds.street import (
-    KERB_WIDTH_M,
-    RISE_M,
-    STONE_M,
-    furnish_pavement,
-    house_pose,
-    lane_of,
-    lay_kerbs,
-    pave,
-)
 
 # Crossings, before some streets are left out: rows and columns, their distance, and the largest displacement of each.
 _ROWS = 6
@@ -56,34 +44,34 @@ _MARGIN_M = 45.0
 _MOST_GROUND_POINTS = 600_000
 
 
-def build(seed: int) -> World:
+def town(seed: int) -> World:
     """Some 6 km of streets; a lap of some 11 km takes each in both directions.
 
     Within `FREE_SIDE_M` of the drive, at any height, there is only the road.
     """
     rng = np.random.default_rng(seed)
     nodes, streets = draw_network(rng)
-    lane = lane_of(nodes[draw_tour(rng, len(nodes), streets)], 1.0)
+    lane = street.lane_of(nodes[draw_tour(rng, len(nodes), streets)], 1.0)
     rng = np.random.default_rng(seed)  # what stands there does not depend on how long a tour was looked for
     course = Course.along(np.concatenate([lane, lane[:1]]))
     low = np.floor(course.points.min(axis=0) - _MARGIN_M)
     high = course.points.max(axis=0) + _MARGIN_M
-    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
-    distance = np.asarray(course.tree.query(grid_nodes(low, high, cell))[0])
+    cell = max(street.RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
+    distance = np.asarray(course.tree.query(paths.grid_nodes(low, high, cell))[0])
     hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
-    ground = HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
-    route = Route(on_ground(lane, ground), 2.0, FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
+    ground = HeightField(low, cell, street.pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
+    route = Route(paths.on_ground(lane, ground), 2.0, FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
     taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
     rows = _Rows(Grounds(rng, course.points, ground), course, taken)
     for place in (rows.houses, rows.cars_and_pavement):  # houses first, which need most room
         for side in course.sides():
             place(side)
     solid = rows.grounds.solid
-    there = on_ground(course.points[:: round(2.0 / _STEP_M)], ground)
+    there = paths.on_ground(course.points[:: round(2.0 / _STEP_M)], ground)
     rows.grounds.prune(
         replace(route, waypoints=np.concatenate([there, there[-2:0:-1]]), free_height_m=1e3), margin_m=0.02
     )
-    lay_kerbs(solid, rows.kerb_stones(), ground)
+    street.lay_kerbs(solid, rows.kerb_stones(), ground)
     return World("town", seed, route, *solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
 
 
@@ -96,7 +84,7 @@ def draw_network(rng: np.random.Generator) -> tuple[FloatArray, list[tuple[int, 
     pairs = [pair for a, b in ways for pair in zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)]
     streets = pairs
     for left_out in rng.permutation(len(pairs)).tolist():
-        fewer = [street for street in streets if street != pairs[left_out]]
+        fewer = [pair for pair in streets if pair != pairs[left_out]]
         if len(pairs) - len(streets) < _LEFT_OUT and np.bincount(np.ravel(fewer), minlength=len(nodes)).min() > 1:
             streets = fewer
     return nodes, streets
@@ -145,8 +133,8 @@ class Course:
     @classmethod
     def along(cls, path: FloatArray) -> "Course":
         """The course of a polyline (M, 2), extended at either end."""
-        at = lengths_along(path)
-        points = points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / _STEP_M)) + 1)))
+        at = paths.lengths_along(path)
+        points = paths.points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / _STEP_M)) + 1)))
         first, last = -left_of(cls(points).lefts[[0, -1]])
         ahead = _STEP_M * np.arange(1, int(_BEYOND_M / _STEP_M) + 1)[:, None]
         return cls(np.concatenate([points[0] - ahead[::-1] * first, points, points[-1] + ahead * last]))
@@ -225,8 +213,8 @@ class _Rows:
                 self.grounds.put(tree, where, 0.0, is_green=True)
                 continue
             is_plain = bool(rng.random() > _FULLNESS)
-            part = house(rng, front - 0.02, depth, (not is_plain, not is_plain), is_plain=is_plain)
-            self.grounds.solid.place(part, house_pose(ground, start, along, front - 0.02))
+            part = outdoor.house(rng, front - 0.02, depth, (not is_plain, not is_plain), is_plain=is_plain)
+            self.grounds.solid.place(part, street.house_pose(ground, start, along, front - 0.02))
 
     def cars_and_pavement(self, side: Course) -> None:
         """Parked cars along the left of a course, and what stands on its pavement."""
@@ -248,15 +236,15 @@ class _Rows:
             if self._claim(where[None], HALF_WIDTH_M + 0.7):
                 pose = upright(ground, where, heading(where - side.beside(at, HALF_WIDTH_M + 1.9)))
                 lamp_height = rng.uniform(5.0, 7.5) if k % 4 == 0 else 0.0
-                furnish_pavement(green, green, rng, pose, lamp_height, bool(rng.random() < 0.45 * _FULLNESS))
+                street.furnish_pavement(green, green, rng, pose, lamp_height, bool(rng.random() < 0.45 * _FULLNESS))
 
     def kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Stones along the edges of the road, but not where another part of the path has its road."""
-        middle = HALF_WIDTH_M + RISE_M - 0.5 * KERB_WIDTH_M
+        middle = HALF_WIDTH_M + street.RISE_M - 0.5 * street.KERB_WIDTH_M
         laid: set[tuple[int, ...]] = set()
         for side in self.course.sides():
-            for at in np.arange(0.0, side.length_m, STONE_M):
-                start, end = side.beside(np.array([at, at + STONE_M]), middle)
+            for at in np.arange(0.0, side.length_m, street.STONE_M):
+                start, end = side.beside(np.array([at, at + street.STONE_M]), middle)
                 place = tuple(np.floor(0.5 * (start + end)).astype(int).tolist())
                 off = self.course.distance(np.stack([start, end, 0.5 * (start + end)]))
                 is_outside = (off > HALF_WIDTH_M + np.array([0.2, 0.2, -0.1])).all()
@@ -273,7 +261,7 @@ class _Rows:
                 at = np.arange(start, start + rng.uniform(20.0, 35.0), 1.0)
                 there = side.beside(at, HALF_WIDTH_M + rng.uniform(1.9, 2.4))
                 if self._claim(there, HALF_WIDTH_M + 1.4):
-                    waypoints = on_ground(np.concatenate([there, there[-2:0:-1]]), self.grounds.ground)
+                    waypoints = paths.on_ground(np.concatenate([there, there[-2:0:-1]]), self.grounds.ground)
                     yield Mover(outdoor.pedestrian(rng).boxes, waypoints, rng.uniform(0.9, 1.5), 0.0)
 
 

@@ -1,5 +1,6 @@
 """A mine in rough rock: a loop of changing width and height, side galleries, and things left in them."""
 
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ _STEEPEST = 0.08
 _FREE_SIDE_M, _FREE_HEIGHT_M = 0.8, 2.05
 
 
-def build(seed: int) -> World:
+def tunnel(seed: int) -> World:
     """The tunnel of that seed: ground and roof as height fields that meet in the walls, a loop of 150 to 300 m."""
     rng = np.random.default_rng(seed)
     galleries, pillars = draw_mine(rng)
@@ -213,17 +214,17 @@ def _rise(x: FloatArray) -> FloatArray:
     return np.asarray(_WALL_SLOPE * _BEND_M * np.logaddexp(0.0, x / _BEND_M))
 
 
+@dataclass(frozen=True, eq=False)
 class _Stations:
     """Places along the loop, `_STATION_M` apart, numbered round and round, where things are fitted to the rock."""
 
-    def __init__(
-        self, floor: FloatArray, left: FloatArray, half_widths: FloatArray, ground: HeightField, roof: HeightField,
-        rng: np.random.Generator,
-    ) -> None:  # fmt: skip
-        self.floor = floor  # (N, 3) on the ground in the middle
-        self.left = left  # (N, 2) unit vectors to the left
-        self.half_widths = half_widths  # (N,) as planned
-        self.ground, self.roof, self.rng, self.builder = ground, roof, rng, Builder()
+    floor: FloatArray  # (N, 3) on the ground in the middle
+    left: FloatArray  # (N, 2) unit vectors to the left
+    half_widths: FloatArray  # (N,) as planned
+    ground: HeightField
+    roof: HeightField
+    rng: np.random.Generator
+    builder: Builder = field(default_factory=Builder)
 
     def __len__(self) -> int:
         return len(self.floor)
