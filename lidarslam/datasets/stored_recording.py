@@ -39,13 +39,15 @@ _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "grou
 class StoredRecording:
     """A file or folder; implements `Recording`.
 
-    A reader adds `__len__`, `_items`, `_read`, `_fields` and `_last_stamp`, and sets or overrides what else there is.
+    A reader adds `__len__`, `_items`, `_read` and `_last_stamp`, and sets or overrides what else there is.
     """
 
     reader: str
     imu_name: str = "imu"
     topic: str | None = None
     topics: tuple[Topic, ...] = ()
+    point_time: PointTimeModel | None = None  # where the reader knows it; not used where the configuration wants none
+    _stored: tuple[PointField, ...] = ()
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
         self._source = source
@@ -85,12 +87,12 @@ class StoredRecording:
         return None
 
     @cached_property
-    def _point_time(self) -> PointTimeModel | None:
-        return None
-
-    @cached_property
     def _rate_is_assumed(self) -> bool:
         return False
+
+    @cached_property
+    def _point_time(self) -> PointTimeModel | None:
+        return None if self._config.time_reference == "none" else self.point_time
 
     def __len__(self) -> int:
         raise NotImplementedError
@@ -156,8 +158,8 @@ class StoredRecording:
     def _read(self, item: Any, faults: Faults) -> Scan:
         raise NotImplementedError
 
-    def _fields(self, item: Any) -> tuple[PointField, ...]:
-        raise NotImplementedError
+    def _fields(self, item: Any) -> tuple[PointField, ...]:  # noqa: ARG002
+        return self._stored
 
     def _last_stamp(self, first: Scan) -> float:
         raise NotImplementedError
@@ -171,8 +173,7 @@ class FileRecording(StoredRecording):
 
     stamps: FloatArray
     """(N,) seconds."""
-    _stored: tuple[tuple[str, str], ...] = tuple((name, "float32") for name in KITTI_FIELDS)
-    """Names and types of the fields of its points."""
+    _stored = tuple(PointField(name, "float32") for name in KITTI_FIELDS)
 
     def __init__(self, folder: Path, config: ReaderConfig, files: Sequence[Path]) -> None:
         super().__init__(folder, config)
@@ -183,9 +184,6 @@ class FileRecording(StoredRecording):
 
     def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[int]:  # noqa: ARG002
         return iter(wanted)
-
-    def _fields(self, item: int) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(*field) for field in self._stored)
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
         return float(self.stamps[-1])
@@ -213,7 +211,7 @@ class CloudRecording(StoredRecording):
         """Pairs of the items of consecutive scans, spread over the recording."""
         raise NotImplementedError
 
-    @property
+    @cached_property
     def _period_s(self) -> float | None:
         """Seconds between scans; None for a single one."""
         raise NotImplementedError
@@ -229,21 +227,17 @@ class CloudRecording(StoredRecording):
             return LearnedTime()
         unit, reference, defined_unit = self._defined_time
         period_s = self._period_s if self._has_stamps else None
-        return learn_point_time(self._stamped_clouds(), unit, reference, period_s, defined_unit)
+        return learn_point_time(self._readable(self._sound_items()), unit, reference, period_s, defined_unit)
 
-    def _stamped_clouds(self) -> Iterator[tuple[RawCloud, float | None]]:
-        for item in self._sound_items():
+    def _readable(self, items: Iterable[Any]) -> Iterator[tuple[RawCloud, float | None]]:
+        """The clouds that can be decoded, with their stamps where these read a clock."""
+        for item in items:
             with suppress(InputError):
                 yield self._decode(item), self._stamp(item) if self._has_stamps else None
 
-    def _readable(self, items: Iterable[Any]) -> Iterator[RawCloud]:
-        for item in items:
-            with suppress(InputError):
-                yield self._decode(item)
-
     @cached_property
     def _timing(self) -> PointTiming:
-        runs = (self._readable(run) for run in self._runs())
+        runs = ((cloud for cloud, _ in self._readable(run)) for run in self._runs())
         return point_timing(self._learned, runs, self._period_s, self._config.time_reference)
 
     @cached_property
@@ -259,19 +253,16 @@ class CloudRecording(StoredRecording):
 
 
 class PacketRecording(StoredRecording):
-    """The sweeps of one sensor. A reader adds `_extent`, `_items`, `_read` and `_fields`."""
+    """The sweeps of one sensor. A reader adds `_items`, `_read` and `_fields`."""
 
     reader = "packets"
     imu_name = "the sensor's own"
     library: tuple[str, str]  # that decodes the packets, and whose packets
-    point_time: PointTimeModel
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
         require(*self.library)
         super().__init__(source, config)
         self._truth_path = truth_beside(source, self.name)
-        self._has_times = config.time_reference != "none"
-        self._point_time = self.point_time if self._has_times else None
 
     def __len__(self) -> int:
         return self._extent[0]

@@ -161,7 +161,7 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         starts = sorted({int(index) for index in np.linspace(0, max(0, len(self) - 2), _PAIRS)})
         return (range(first, min(first + 2, len(self))) for first in starts)
 
-    @property
+    @cached_property
     def _period_s(self) -> float | None:
         rate = scan_rate(self.stamps)
         return None if rate is None else 1.0 / rate

@@ -71,7 +71,7 @@ class OusterRecording(PacketRecording):
         rings = np.broadcast_to(np.arange(len(ranges))[:, np.newaxis], ranges.shape)
         # Columns one after the other, in the order of firing.
         intensity = next((frame.field(name).T for name in _INTENSITIES if frame.has_field(name)), None)
-        times = offsets if self._has_times else None
+        times = offsets if self._point_time else None
         return Scan.from_raw(points.transpose(1, 0, 2), first_ns / 1e9, times, rings.T, intensity)
 
     def _fields(self, item: Any) -> tuple[PointField, ...]:

@@ -34,7 +34,7 @@ class VelodyneCapture(PacketRecording):
 
     def _read(self, item: _StampedCloud, faults: Faults) -> Scan:  # noqa: ARG002
         stamp, table = item
-        return raw_cloud(table).scan(stamp, table["time"].astype(np.float64) if self._has_times else None)
+        return raw_cloud(table).scan(stamp, table["time"].astype(np.float64) if self._point_time else None)
 
     def _clouds(self) -> Iterator[_StampedCloud]:
         import velodyne_decoder

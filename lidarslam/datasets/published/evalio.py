@@ -131,6 +131,7 @@ class EvalioRecording(StoredRecording):
 
     reader = "evalio"
     _point_time = PointTimeModel("t", "ns", "relative")
+    _stored = tuple(PointField(name, kind) for name, kind in _FIELDS)
 
     def __init__(self, folder: Path, config: ReaderConfig, sequence: Any) -> None:
         super().__init__(folder, config)
@@ -237,9 +238,6 @@ class EvalioRecording(StoredRecording):
 
     def _read(self, item: Scan, faults: Faults) -> Scan:  # noqa: ARG002
         return item
-
-    def _fields(self, item: Scan) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(name, kind) for name, kind in _FIELDS)
 
     def _last_stamp(self, first: Scan) -> float:
         return float(first.stamp + (len(self) - 1) / self._sequence.lidar_params().rate)

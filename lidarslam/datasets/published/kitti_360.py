@@ -35,6 +35,7 @@ class Kitti360Recording(BinRecording):
     """One drive."""
 
     reader = "kitti-360"
+    point_time = AZIMUTH_TIME
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / _POINTS / "data")
@@ -45,7 +46,6 @@ class Kitti360Recording(BinRecording):
         self.warnings = tuple(note for note in timing.notes if "sweeps" not in note)
         self._sweep_s = 1.0 / (scan_rate(self.stamps) or config.rate_hz)
         self._truth_path = first_file((drive.parent.parent / "data_poses" / drive.name,), "poses.txt")
-        self._point_time = None if config.time_reference == "none" else AZIMUTH_TIME
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -72,9 +72,7 @@ class Kitti360Recording(BinRecording):
             raise InputError(f"{folder}: expected 12 numbers in {to_lidar.name} and at `image_00:` in {to_pose.name}")
         return poses_of_rows(T_pose_cam) @ inverse(poses_of_rows(T_lidar_cam[0]))
 
-    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray | None:  # noqa: ARG002
-        if self._point_time is None:
-            return None
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:  # noqa: ARG002
         return -self._sweep_s * np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2.0 * np.pi)
 
     @cached_property

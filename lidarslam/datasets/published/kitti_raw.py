@@ -75,6 +75,7 @@ class KittiRawRecording(BinRecording):
 
     reader = "kitti-raw"
     imu_name = "oxts"
+    point_time = AZIMUTH_TIME
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
@@ -82,7 +83,6 @@ class KittiRawRecording(BinRecording):
         self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config)
         self.stamps = self._timing.stamps
         self._rate_is_assumed = not self._timing.from_clock
-        self._point_time = None if config.time_reference == "none" else AZIMUTH_TIME
         first, last = self._numbers[0], self._numbers[-1]
         gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
         self.warnings = (*self._timing.notes, *gaps)
@@ -158,9 +158,7 @@ class KittiRawRecording(BinRecording):
             return None
         return usable_samples(oxts.stamps, oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
-    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray | None:
-        if self._point_time is None:
-            return None
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:
         before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
         return offsets_from_azimuth(rows, float(before_s), float(after_s))
 
