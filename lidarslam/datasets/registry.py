@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -176,12 +176,11 @@ def takes_sequence(source: Path, name: str | None = None) -> bool:
 
 def recognise(source: Path) -> str | None:
     """The first reader in the table, or else of another package, that recognises a path by its names."""
-    return next((name for name, reader in _readers() if reader.recognises(source)), None)
-
-
-def _readers() -> Iterator[tuple[str, Reader]]:
-    yield from READERS.items()
-    yield from usable(ALL_READERS, Reader).items()
+    with suppress(OSError):
+        for name, reader in chain(READERS.items(), usable(ALL_READERS, Reader).items()):
+            if reader.recognises(source):
+                return name
+    return None
 
 
 def _reader(name: str) -> Reader:
@@ -244,7 +243,7 @@ def result_of_program(source: Path) -> str | None:
 def _unrecognised(source: Path) -> str | None:
     """Another kind of path and what to do, as far as names alone show it; None where they do not."""
     for above in islice(source.resolve().parents, 2):
-        reader = _reader_of(above)
+        reader = recognise(above)
         if reader in _LAYOUTS or (reader == "rosbag" and source.name == "metadata.yaml"):
             return f"{source}: lies in a recording ({reader}); name that: {above}"
     if source.is_dir() and (found := _recordings_in(source)):
@@ -261,7 +260,7 @@ def _recordings_in(folder: Path) -> list[Path]:
     level = [folder]
     for _ in range(_DEPTH):
         level = [entry for one in level for entry in _entries(one)][:_MOST_ENTRIES]
-        found = [entry for entry in level if result_of_program(entry) is None and _reader_of(entry) is not None]
+        found = [entry for entry in level if result_of_program(entry) is None and recognise(entry) is not None]
         if found:
             return found
         level = [entry for entry in level if entry.is_dir()]
@@ -271,12 +270,6 @@ def _recordings_in(folder: Path) -> list[Path]:
 def _entries(folder: Path) -> Iterator[Path]:
     with suppress(OSError):
         yield from sorted(e for e in islice(folder.iterdir(), _MOST_ENTRIES) if not e.name.startswith("."))
-
-
-def _reader_of(path: Path) -> str | None:
-    with suppress(OSError):
-        return recognise(path)
-    return None
 
 
 def _kind(source: Path) -> str:

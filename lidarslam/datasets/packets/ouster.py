@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -107,10 +107,10 @@ def read_sensor(text: str) -> Any:
 
 def frames_of_packets(sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
     """The library's LidarFrames of the packets of a sensor, in the order of recording; damaged packets are left out."""
-    from ouster.sdk.core import FrameBatcher, LidarFrame, LidarPacket
+    from ouster.sdk.core import FrameBatcher, LidarFrame
 
     batcher, frame, is_begun = FrameBatcher(sensor), LidarFrame(sensor), False
-    for packet in _packets(LidarPacket, "lidar_packet_size", sensor, contents):
+    for packet in packets_of("lidar", sensor, contents):
         is_begun = True
         if batcher.batch(packet, frame):
             yield frame
@@ -119,21 +119,15 @@ def frames_of_packets(sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
         yield frame
 
 
-def imu_packets(sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
-    """The library's ImuPackets of a sensor; damaged ones are left out."""
-    from ouster.sdk.core import ImuPacket
+def packets_of(kind: Literal["lidar", "imu"], sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
+    """The library's LidarPackets or ImuPackets of a sensor; damaged ones are left out."""
+    from ouster.sdk.core import ImuPacket, LidarPacket, PacketFormat
 
-    return _packets(ImuPacket, "imu_packet_size", sensor, contents)
-
-
-def _packets(kind: Any, size_name: str, sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
-    from ouster.sdk.core import PacketFormat
-
-    layout = PacketFormat(sensor)
-    size = getattr(layout, size_name)
+    layout, make = PacketFormat(sensor), {"lidar": LidarPacket, "imu": ImuPacket}[kind]
+    size = getattr(layout, f"{kind}_packet_size")
     for content in contents:
         if len(content) >= size:  # early drivers added a byte
-            packet = kind(layout)
+            packet = make(layout)
             packet.buf[:] = np.frombuffer(content, np.uint8, size)
             yield packet
 

@@ -18,7 +18,7 @@ from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
 
 
 class BinRecording(FileRecording):
-    """A folder of .bin scans: x, y, z, intensity and perhaps a ring. A reader adds the stamps, and the offsets of points."""
+    """A folder of .bin scans: x, y, z, intensity and perhaps a ring. A reader adds the stamps, and points' times."""
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         rows = read_bin(self._files[index], len(self._stored))

@@ -17,7 +17,7 @@ from lidarslam.datasets.packets.ouster import (
     OusterRecording,
     find_metadata,
     frames_of_packets,
-    imu_packets,
+    packets_of,
     read_sensor,
 )
 from lidarslam.datasets.point_table import RawCloud
@@ -241,7 +241,7 @@ class OusterBag(OusterRecording):
         return islice(frames_of_packets(self.sensor, contents), wanted.start, wanted.stop, wanted.step)
 
     def _packets_of_imu(self) -> Iterator[Any]:
-        return imu_packets(self.sensor, self._contents("imu_packets", self._topic.message_type))
+        return packets_of("imu", self.sensor, self._contents("imu_packets", self._topic.message_type))
 
     def _contents(self, name: str, message_type: str) -> Iterator[bytes]:
         """The content of the messages of a topic other than that of the packets: a single string or array of bytes."""
