@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import numbered_scans
-from lidarslam.datasets.published.kitti_files import read_calibration, read_sweep_timing
+from lidarslam.datasets.published.kitti_raw import read_calibration, read_sweep_timing
 from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import find_sequence, first_file

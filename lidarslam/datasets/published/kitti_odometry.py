@@ -17,7 +17,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import numbered_scans
-from lidarslam.datasets.published.kitti_files import read_tr
+from lidarslam.datasets.published.kitti_raw import read_tr
 from lidarslam.datasets.published.stamped_files import BinRecording
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stored_recording import find_sequence, first_file

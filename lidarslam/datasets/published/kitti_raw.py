@@ -1,7 +1,9 @@
 """A synchronised drive of KITTI's raw data: `DATE/DATE_drive_NNNN_sync/{velodyne_points, oxts}`.
 
-The scans are as measured, not motion compensated. The calibration files are in the date's folder above the drive."""
+The scans are as measured, not motion compensated. The calibration files are in the date's folder above the drive. Files
+that KITTI's other data sets have too are read here for them."""
 
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -11,17 +13,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.files import bounded_lines
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, orthonormalize
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.kitti_files import read_raw_calibration, read_sweep_timing
 from lidarslam.datasets.published.stamped_files import BinRecording, increasing
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
-from lidarslam.datasets.times.stamps import read_stamps
+from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps
 
 _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
@@ -29,6 +32,8 @@ _COLUMNS = 30
 _POSITION_ACCURACY_COLUMN = 23
 # Of the unit's own axes; the columns behind them are of the level ones.
 _ACCELERATIONS, _ANGULAR_VELOCITIES = slice(11, 14), slice(17, 20)
+# Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
+_SWEEP_TOLERANCE = 0.25
 
 
 class OxtsPoses(NamedTuple):
@@ -175,3 +180,94 @@ class KittiRawRecording(BinRecording):
         accuracy = f"The ground truth is GPS/IMU; it states its own position accuracy as {median_m:.2f} m (median)."
         gaps = (f"{left_out} oxts rows without a stamp that increases were left out.",) if left_out else ()
         return *gaps, accuracy
+
+
+def read_calibration(path: Path) -> dict[str, FloatArray]:
+    """The arrays of a calibration file by name; lines without numbers, such as the date, are left out."""
+    arrays = {}
+    for line in bounded_lines(path):
+        name, _, values = line.partition(":")
+        try:
+            arrays[name.strip()] = np.array([float(word) for word in values.split()])
+        except ValueError:
+            continue
+    return arrays
+
+
+def _entry(path: Path, arrays: dict[str, FloatArray], name: str, count: int) -> FloatArray:
+    values = arrays.get(name)
+    if values is None or len(values) != count or not np.isfinite(values).all():
+        got = "no such line" if values is None else f"{len(values)} numbers"
+        raise InputError(f"{path}: expected a line `{name}:` with {count} numbers, got {got}")
+    return values
+
+
+def _rigid(path: Path, R: FloatArray, t: FloatArray) -> FloatArray:
+    """The transform (4, 4), re-orthonormalised: the files round to seven digits or fewer."""
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0.0:
+        raise InputError(f"{path}: holds a rotation matrix that is none; expected orthonormal rows, right-handed")
+    return orthonormalize(make_transform(R, t))
+
+
+def read_tr(path: Path) -> FloatArray:
+    """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr` or `Tr_velo_to_cam`."""
+    arrays = read_calibration(path)
+    name = "Tr_velo_to_cam" if "Tr" not in arrays and "Tr_velo_to_cam" in arrays else "Tr"
+    rows = _entry(path, arrays, name, 12).reshape(3, 4)
+    return _rigid(path, rows[:, :3], rows[:, 3])
+
+
+def read_raw_calibration(path: Path) -> FloatArray:
+    """The transform (4, 4) of a raw calibration file: T_B_A of calib_A_to_B.txt, T_rect_cam of calib_cam_to_cam.txt."""
+    arrays = read_calibration(path)
+    if path.name == "calib_cam_to_cam.txt":
+        return _rigid(path, _entry(path, arrays, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
+    return _rigid(path, _entry(path, arrays, "R", 9).reshape(3, 3), _entry(path, arrays, "T", 3))
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTiming:
+    """The times of N sweeps."""
+
+    stamps: FloatArray  # (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras
+    # before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end
+    before_s: FloatArray
+    after_s: FloatArray
+    from_clock: bool  # whether the stamps are clock readings; else they are made from the rate
+    notes: tuple[str, ...]  # facts for the user
+
+
+def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], config: ReaderConfig) -> SweepTiming:
+    """By timestamps.txt, timestamps_start.txt and timestamps_end.txt in a `velodyne_points` folder, else by the rate.
+
+    The numbers (N,) of the scans are the rows of the files; a missing scan has a blank row.
+    """
+    try:
+        found = _rows(folder / "timestamps.txt", numbers)
+        stamps, replaced = mend_stamps(found, numbers.astype(np.float64))
+    except ValueError:
+        half = np.full(len(numbers), 0.5 / config.rate_hz)
+        note = assumed_rate("There is no timestamps.txt with two stamps that increase", config)
+        return SweepTiming(numbers / config.rate_hz, half, half, False, (note,))
+    notes = []
+    if replaced:
+        notes.append(f"{count(replaced, 'stamp')} of timestamps.txt interpolated: missing, repeated or backwards.")
+    period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / config.rate_hz
+    start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
+    before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
+    after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
+    if wrong_starts or wrong_ends:
+        said = "ends of sweeps missing or implausible, and replaced: sweeps are taken to be seamless."
+        notes.append(f"{count(wrong_starts, 'start')} and {wrong_ends} {said}")
+    return SweepTiming(stamps, before_s, after_s, True, tuple(notes))
+
+
+def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray:
+    """The stamps of the rows with these numbers, NaN where there is none."""
+    stamps = read_stamps(path) if path.is_file() else np.empty(0)
+    return np.append(stamps, np.nan)[np.minimum(numbers, len(stamps))]
+
+
+def _plausible(durations: FloatArray, expected: float) -> tuple[FloatArray, int]:
+    wrong = ~(np.abs(durations - expected) < _SWEEP_TOLERANCE * expected)  # NaN is wrong too
+    return np.where(wrong, expected, durations), int(np.count_nonzero(wrong))
