@@ -104,15 +104,13 @@ class StoredRecording:
         return self._scans(scan_indices(len(self), start, stop, step), faults)
 
     def _scans(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
-        counted = Faults() if faults is None else faults
+        counted = Faults(strict=True) if faults is None else faults
         try:
-            for item in self._items(wanted, counted, faults is None):
+            for item in self._items(wanted, counted):
                 try:
                     scan = self._read(item, counted)
                 except InputError as error:
-                    if faults is None:
-                        raise
-                    faults.unreadable(error)
+                    counted.unreadable(error)
                     continue
                 yield scan
         finally:
@@ -142,7 +140,7 @@ class StoredRecording:
     def _first(self, faults: Faults) -> tuple[Any, Scan]:
         """The first readable scan, and its item; the error of the first one where none can be read."""
         first_error = None
-        for item in self._items(range(len(self)), faults, False):
+        for item in self._items(range(len(self)), faults):
             try:
                 return item, self._read(item, faults)
             except InputError as error:
@@ -151,8 +149,8 @@ class StoredRecording:
         left_out = "".join(f"; {warning}" for warning in faults.warnings())
         raise first_error or InputError(f"{self._source}: holds no scan that could be used; record it again{left_out}")
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:
-        """The items that the wanted scans are read from; others are counted, or, where it is strict, an error."""
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Any]:
+        """The items that the wanted scans are read from; others are counted."""
         raise NotImplementedError
 
     def _read(self, item: Any, faults: Faults) -> Scan:
@@ -182,7 +180,7 @@ class FileRecording(StoredRecording):
     def __len__(self) -> int:
         return len(self._files)
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[int]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[int]:  # noqa: ARG002
         return iter(wanted)
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002

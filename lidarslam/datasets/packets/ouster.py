@@ -168,7 +168,7 @@ class OusterFile(OusterRecording):
         last = next(self._scans(range(max(0, count - 1), count), Faults()), None)
         return count, 0.0 if last is None else last.stamp
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Any]:  # noqa: ARG002
         of_sensor = self._frame_sets.single(0)
         stop = min(wanted.stop, len(of_sensor))
         frame_sets = of_sensor[wanted.start : stop : wanted.step] if wanted.start < stop else ()

@@ -29,7 +29,7 @@ class VelodyneCapture(PacketRecording):
     library = "velodyne_decoder", "packets of a Velodyne"
     point_time = PointTimeModel("time", "s", "relative")
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[_StampedCloud]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[_StampedCloud]:  # noqa: ARG002
         return islice(self._clouds(), wanted.start, wanted.stop, wanted.step)
 
     def _read(self, item: _StampedCloud, faults: Faults) -> Scan:  # noqa: ARG002

@@ -218,7 +218,7 @@ class EvalioRecording(StoredRecording):
                 number = sum(1 for _ in iterator.imu_iter())
         return ImuSummary(f"{parameters.brand} {parameters.model}", number, float(parameters.rate), True)
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Scan]:
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Scan]:
         given = 0
         with self._reading("the scans"):
             measurements = self._sequence.data_iter().lidar_iter()
@@ -228,7 +228,7 @@ class EvalioRecording(StoredRecording):
                     measurement = next(measurements)
                     scan = _scan(measurement) if index in wanted else None
             except InputError as error:
-                if strict or not given:
+                if faults.strict or not given:
                     raise
                 faults.leave_out(_UNREADABLE, str(error), len(wanted) - given)
                 return

@@ -110,10 +110,10 @@ class BagRecording(CloudRecording):
     def _notes(self) -> tuple[str, ...]:
         return self._timing.notes
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
-        return in_stamp_order(self._wanted(wanted, faults, strict), self._stamp, faults)
+    def _items(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
+        return in_stamp_order(self._wanted(wanted, faults), self._stamp, faults)
 
-    def _wanted(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
+    def _wanted(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
         other_sensor = (
             f"scans were left out: they come from another sensor than {self._frame_id!r}; for that one set"
             " reader.frame_id"
@@ -122,8 +122,6 @@ class BagRecording(CloudRecording):
             if index not in wanted:
                 continue
             if message.damage is not None:
-                if strict:
-                    raise InputError(message.damage)
                 faults.unreadable(InputError(message.damage))
             elif message.frame_id != self._frame_id:
                 faults.leave_out(other_sensor, repr(message.frame_id))
@@ -236,7 +234,7 @@ class OusterBag(OusterRecording):
             f" beside the bag as {self.name}.json"
         )
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Any]:  # noqa: ARG002
         contents = self._contents(self._topic.name.rpartition("/")[2], self._topic.message_type)
         return islice(frames_of_packets(self.sensor, contents), wanted.start, wanted.stop, wanted.step)
 
