@@ -68,12 +68,12 @@ def usable_samples(
 
 def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
     """(N,) whether a component of a vector (N, 3) is one of several equal ones in a row, at the largest of them all."""
+    from scipy.ndimage import binary_opening  # takes a while to load
+
     sizes = np.abs(vectors)
     largest = sizes.max(axis=0)
     at_limit = (sizes == largest) & (largest > least)
-    runs = np.lib.stride_tricks.sliding_window_view(np.pad(at_limit, ((_REPEATED - 1,) * 2, (0, 0))), _REPEATED, axis=0)
-    whole = np.asarray(runs.all(axis=-1))
-    return np.asarray(np.any([whole[n : n + len(vectors)] for n in range(_REPEATED)], axis=(0, 2)))
+    return np.asarray(binary_opening(at_limit, np.ones((_REPEATED, 1), dtype=bool)).any(axis=1))
 
 
 def summarise(name: str, samples: ImuSamples | None) -> ImuSummary | None:

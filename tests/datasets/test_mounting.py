@@ -14,7 +14,6 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import Mounting, ReaderConfig
-from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting import (
     UPRIGHT,
     MountedRecording,
@@ -84,8 +83,10 @@ class Recorded:
     name = "memory"
     warnings = ("old",)
     T_cam_lidar = make_transform(turn(10, 20, 30), np.array([0.1, 0.2, 0.3]))
-    truth = Trajectory(np.arange(3.0), np.stack([make_transform(turn(0, 0, a), np.ones(3)) for a in (0, 30, 60)]))
-    samples = ImuSamples(np.arange(3.0), np.ones((3, 3)), np.ones((3, 3)), T_cam_lidar)
+    ground_truth = Trajectory(
+        np.arange(3.0), np.stack([make_transform(turn(0, 0, a), np.ones(3)) for a in (0, 30, 60)])
+    )
+    imu = ImuSamples(np.arange(3.0), np.ones((3, 3)), np.ones((3, 3)), T_cam_lidar)
 
     def __init__(self, clouds: list[FloatArray]) -> None:
         self._scans = [Scan(points, float(number)) for number, points in enumerate(clouds)]
@@ -94,21 +95,7 @@ class Recorded:
     def __len__(self) -> int:
         return len(self._scans)
 
-    @property
-    def ground_truth(self) -> Trajectory:
-        return self.truth
-
-    @property
-    def imu(self) -> ImuSamples:
-        return self.samples
-
-    def scans(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        step: int = 1,
-        faults: Faults | None = None,  # noqa: ARG002
-    ) -> Iterator[Scan]:
+    def scans(self, start=0, stop=None, step=1, faults=None) -> Iterator[Scan]:  # noqa: ARG002
         self.passes += 1
         return iter(self._scans[start:stop:step])
 
