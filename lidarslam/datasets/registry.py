@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from difflib import get_close_matches
-from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
@@ -40,7 +40,7 @@ _LAYOUTS = ("kitti-odometry", "kitti-raw")
 class Reader(NamedTuple):
     """One row of the table."""
 
-    module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`
+    module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`, or that is `module:function`
     reads: str  # the layout, in words
     recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
     takes_sequence: bool = False  # whether --sequence chooses one of several in a source
@@ -76,20 +76,20 @@ READERS: dict[str, Reader] = {
         is_of_evalio,
     ),
     "kitti-odometry": Reader(
-        f"{_HERE}.published.kitti_odometry",
+        f"{_HERE}.published.kitti:open_odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         _has("sequences/", "velodyne/"),
         takes_sequence=True,
         elevation_deg=KITTI_DEG,
     ),
     "kitti-360": Reader(
-        f"{_HERE}.published.kitti_360",
+        f"{_HERE}.published.kitti:open_360",
         "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
         _is_kitti_360,
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        f"{_HERE}.published.kitti_raw",
+        f"{_HERE}.published.kitti:open_raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
         _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
@@ -196,7 +196,8 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     logger.info("reader: %s, %s: %s", name, why, reader.reads)
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
-    recording = cast(Recording, import_module(reader.module).open_recording(source, config))
+    opens = resolve_name(reader.module if ":" in reader.module else f"{reader.module}:open_recording")
+    recording = cast(Recording, opens(source, config))
     raised_deg = config.raised_deg(reader.elevation_deg)
     if config.mounting == "upright" and not raised_deg and config.time_scale == 1.0:
         return recording

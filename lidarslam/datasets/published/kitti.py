@@ -1,8 +1,19 @@
-"""A synchronised drive of KITTI's raw data: `DATE/DATE_drive_NNNN_sync/{velodyne_points, oxts}`.
+"""KITTI: the odometry benchmark, drives of the raw data, and KITTI-360.
 
-The scans are as measured, not motion compensated. The calibration files are in the date's folder above the drive. Files
-that KITTI's other data sets have too are read here for them."""
+Odometry: `sequences/NN/{velodyne/*.bin, times.txt, calib.txt}` and `poses/NN.txt`. The scans are motion compensated by
+the publishers. The poses are those of the left camera, `cam`; they are converted to the LiDAR's frame here, and nowhere
+else.
 
+Raw: `DATE/DATE_drive_NNNN_sync/{velodyne_points, oxts}`, synchronised. The scans are as measured, not motion
+compensated. The calibration files are in the date's folder above the drive.
+
+KITTI-360 (Liao et al., PAMI 2022): `data_3d_raw/..._sync/velodyne_points`, `data_poses`, `calibration`. The scans are
+as measured, too. As on KITTI's car, the laser turns clockwise from the rear and faces forward at the stamp, as the data
+set's own program for compensation assumes.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,14 +28,15 @@ from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, inverse, make_transform, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.text import count
-from lidarslam.core.trajectory import Trajectory, parse_numbers
+from lidarslam.core.trajectory import Trajectory, parse_numbers, read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.stamped_files import BinRecording, increasing
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stored_recording import find_sequence, first_file
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
-from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps
+from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps, scan_rate
 
 _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
@@ -34,6 +46,106 @@ _POSITION_ACCURACY_COLUMN = 23
 _ACCELERATIONS, _ANGULAR_VELOCITIES = slice(11, 14), slice(17, 20)
 # Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
 _SWEEP_TOLERANCE = 0.25
+# Of KITTI-360.
+_SCANS, _POINTS = "data_3d_raw", "velodyne_points"
+
+
+def open_odometry(source: Path, config: ReaderConfig) -> Recording:
+    """Open a sequence of the benchmark: its root, with `config.sequence`, or one `sequences/NN` folder."""
+    return KittiOdometryRecording(find_sequence(source, source / "sequences", "velodyne", config.sequence), config)
+
+
+class KittiOdometryRecording(BinRecording):
+    """One sequence."""
+
+    reader = "kitti-odometry"
+    _notes = ("The scans are motion compensated by the publishers; they have no per-point time and need none.",)
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        files, self._numbers = numbered_scans(folder / "velodyne")
+        super().__init__(folder, config, files)
+        self._times = self._read_times()
+        self._rate_is_assumed = not len(self._times)
+        last = int(self._numbers[-1])
+        if (folder / "times.txt").is_file() and last >= len(self._times) < 2:
+            raise InputError(
+                f"{folder / 'times.txt'}: expected {last + 1} stamps, one for every scan up to {files[-1].name}, got"
+                f" {len(self._times)}; complete it, or remove it to use the rate"
+            )
+        self.stamps = self._stamps_of(self._numbers)
+        whole = folder.resolve()
+        poses = first_file((whole.parent.parent / "poses",), f"{whole.name}.txt")
+        self._pose_file = poses or first_file((whole,), "poses.txt")
+        self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
+
+    def _read_times(self) -> FloatArray:
+        path = self._source / "times.txt"
+        times = read_stamps(path) if path.is_file() else np.empty(0)
+        increasing = increasing_rows(times)
+        if not increasing.all():
+            raise InputError(
+                f"{path}: expected stamps that increase from line to line, those at line"
+                f" {int(np.argmin(increasing)) + 1} and perhaps others do not; mend it, or remove it to use the rate"
+            )
+        return times
+
+    def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
+        """The stamps (N,) of scans by their numbers; those beyond the last line continue at the median rate."""
+        if self._rate_is_assumed:
+            return numbers / self._config.rate_hz
+        last_line = len(self._times) - 1
+        beyond = np.maximum(numbers - last_line, 0)
+        period_s = float(np.median(np.diff(self._times))) if beyond.any() else 0.0
+        return np.asarray(self._times[np.minimum(numbers, last_line)] + period_s * beyond, dtype=np.float64)
+
+    @property
+    def name(self) -> str:
+        """Such as kitti_04."""
+        return f"kitti_{self._source.resolve().name}"
+
+    @cached_property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """The extrinsic calibration `Tr`, (4, 4); None without calib.txt."""
+        path = self._source / "calib.txt"
+        return read_tr(path) if path.is_file() else None
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of every pose with a stamp, also where the scan is absent."""
+        T_cam_lidar = self.T_cam_lidar
+        if self._pose_file is None or T_cam_lidar is None:
+            return None
+        T_cam0_cam = read_kitti_poses(self._pose_file)
+        if not self._rate_is_assumed:
+            T_cam0_cam = T_cam0_cam[: max(len(self._times), int(self._numbers[-1]) + 1)]
+        # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
+        T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
+        return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """Missing and superfluous stamps, scans and poses."""
+        return tuple(self._warnings())
+
+    def _warnings(self) -> Iterator[str]:
+        last, lines, poses = int(self._numbers[-1]), len(self._times), 0
+        if self._rate_is_assumed:
+            yield assumed_rate("There is no times.txt", self._config)
+        if len(self) <= last - self._numbers[0]:
+            yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
+        if self._pose_file is not None and self._truth_path is None:
+            yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
+        elif self._pose_file is not None:
+            with suppress(InputError):  # damaged, an error of `ground_truth`
+                poses = len(read_kitti_poses(self._pose_file))
+        up_to = f"for the scans up to number {last}"
+        if 0 < lines <= last:
+            yield f"times.txt has only {lines} lines {up_to}; the missing stamps continue at its rate."
+        if 0 < poses <= last:
+            yield f"{self._pose_file} has only {poses} poses {up_to}."
+        counts = ((lines, f"times.txt has {lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
+        if more := [said for number, said in counts if number > last + 1]:
+            yield f"{' and '.join(more)} {up_to}; those beyond are not used."
 
 
 class OxtsPoses(NamedTuple):
@@ -62,7 +174,7 @@ def oxts_poses(rows: FloatArray) -> FloatArray:
     return make_transform(R, np.column_stack([east, north, rows[:, 2]]))
 
 
-def open_recording(source: Path, config: ReaderConfig) -> Recording:
+def open_raw(source: Path, config: ReaderConfig) -> Recording:
     """Open a `..._sync` drive folder."""
     data = source / "velodyne_points" / "data"
     if not data.is_dir():
@@ -180,6 +292,64 @@ class KittiRawRecording(BinRecording):
         accuracy = f"The ground truth is GPS/IMU; it states its own position accuracy as {median_m:.2f} m (median)."
         gaps = (f"{left_out} oxts rows without a stamp that increases were left out.",) if left_out else ()
         return *gaps, accuracy
+
+
+def open_360(source: Path, config: ReaderConfig) -> Recording:
+    """Open a drive: the data set's root, with `config.sequence` such as 0003, or a folder in its data_3d_raw."""
+    drive = find_sequence(source, source / _SCANS, _POINTS, config.sequence, "drive")
+    return Kitti360Recording(drive.resolve(), config)
+
+
+class Kitti360Recording(BinRecording):
+    """One drive."""
+
+    reader = "kitti-360"
+    point_time = AZIMUTH_TIME
+
+    def __init__(self, drive: Path, config: ReaderConfig) -> None:
+        files, self._numbers = numbered_scans(drive / _POINTS / "data")
+        super().__init__(drive, config, files)
+        timing = read_sweep_timing(drive / _POINTS, self._numbers, config)
+        self.stamps = timing.stamps
+        # There are no files of the sweeps' starts and ends, unlike in KITTI's raw data.
+        self.warnings = tuple(note for note in timing.notes if "sweeps" not in note)
+        self._sweep_s = 1.0 / (scan_rate(self.stamps) or config.rate_hz)
+        self._truth_path = first_file((drive.parent.parent / "data_poses" / drive.name,), "poses.txt")
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of the drive's poses, for the scans that have one; the world is the first one's LiDAR frame."""
+        path, T_pose_lidar = self._truth_path, self._T_pose_lidar
+        if path is None or T_pose_lidar is None:
+            return None
+        rows = read_table(path, 13)
+        rows = rows[np.isin(rows[:, 0], self._numbers)]
+        if not len(rows):
+            return None
+        T_world_lidar = poses_of_rows(rows[:, 1:]) @ T_pose_lidar
+        stamps = self.stamps[np.searchsorted(self._numbers, rows[:, 0])]
+        return increasing(stamps, inverse(T_world_lidar[0]) @ T_world_lidar)
+
+    @cached_property
+    def _T_pose_lidar(self) -> FloatArray | None:
+        folder = self._source.parent.parent / "calibration"
+        to_lidar, to_pose = folder / "calib_cam_to_velo.txt", folder / "calib_cam_to_pose.txt"
+        if not (to_lidar.is_file() and to_pose.is_file()):
+            return None
+        T_pose_cam, T_lidar_cam = read_calibration(to_pose).get("image_00"), parse_numbers(to_lidar, 12)
+        if T_pose_cam is None or len(T_pose_cam) != 12 or len(T_lidar_cam) != 1:
+            raise InputError(f"{folder}: expected 12 numbers in {to_lidar.name} and at `image_00:` in {to_pose.name}")
+        return poses_of_rows(T_pose_cam) @ inverse(poses_of_rows(T_lidar_cam[0]))
+
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:  # noqa: ARG002
+        return -self._sweep_s * np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2.0 * np.pi)
+
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        note = "Points are taken as they are: the correction of elevation that KITTI's scans get is not applied."
+        if self._truth_path is None or self._T_pose_lidar is not None:
+            return (note,)
+        return note, "There is no calibration folder beside data_3d_raw, so the poses cannot be used as ground truth."
 
 
 def read_calibration(path: Path) -> dict[str, FloatArray]:
