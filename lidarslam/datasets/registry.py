@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from difflib import get_close_matches
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import NamedTuple, cast
@@ -177,10 +177,13 @@ def takes_sequence(source: Path, name: str | None = None) -> bool:
 def recognise(source: Path) -> str | None:
     """The first reader in the table, or else of another package, that recognises a path by its names."""
     with suppress(OSError):
-        for name, reader in chain(READERS.items(), usable(ALL_READERS, Reader).items()):
-            if reader.recognises(source):
-                return name
+        return next((name for name, reader in _readers() if reader.recognises(source)), None)
     return None
+
+
+def _readers() -> Iterator[tuple[str, Reader]]:
+    yield from READERS.items()
+    yield from usable(ALL_READERS, Reader).items()
 
 
 def _reader(name: str) -> Reader:

@@ -90,11 +90,14 @@ def test_the_correction_raises_every_point(sequence):
     assert any("0.205" in note for note in recording.describe().notes)
 
 
-def test_points_of_another_layout_are_refused_by_their_values(sequence):
+def test_points_of_another_layout_are_refused_by_their_values_and_names_that_are_no_numbers(sequence):
     azimuth = np.linspace(-np.pi, np.pi, 500)
     room = np.column_stack([8.3 * np.cos(azimuth), 6.1 * np.sin(azimuth), np.full(500, -1.7), np.full(500, 0.5)])
     room.tofile(min(sequence.rglob("*.bin")))
     with pytest.raises(InputError, match="by its values they have 32 bytes"):
+        open_recording(sequence)
+    (sequence / "velodyne" / "last.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"last\.bin: expected a name that is the scan's number"):
         open_recording(sequence)
 
 
@@ -139,12 +142,6 @@ def test_without_calibration_or_poses_there_is_no_truth(sequence, absent):
     assert (recording.T_cam_lidar is None) == (absent == "calib.txt")
     assert recording.ground_truth is recording.describe().ground_truth is None
     assert any("calib.txt" in note for note in recording.describe().notes) == (absent == "calib.txt")
-
-
-def test_damaged_files_are_named(sequence):
-    (sequence / "velodyne" / "last.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"last\.bin: expected a name that is the scan's number"):
-        open_recording(sequence)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import image_axes
-from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.datasets.config import Mounting, ReaderConfig
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.mounting import (
     UPRIGHT,
     MountedRecording,
@@ -24,7 +22,6 @@ from lidarslam.datasets.mounting import (
     written,
 )
 from lidarslam.datasets.recording import RecordingInfo
-from lidarslam.datasets.registry import open_recording
 
 QUARTERS = {"left": (90, 0, 0), "right": (-90, 0, 0), "backward": (0, 90, 0), "forward": (0, -90, 0)}
 HEIGHT_M = 1.7
@@ -216,24 +213,6 @@ def test_what_only_some_scans_show_is_a_warning_and_no_more():
 )
 def test_scans_without_surfaces_show_nothing(points):
     assert guess_mounting([points] * 5) == UPRIGHT
-
-
-def test_recordings_are_opened_upright(tmp_path: Path):
-    R = turn(*QUARTERS["left"])
-    for number, points in enumerate(cast(rays(), 0.8 * number, BOXES) for number in range(17)):
-        np.save(tmp_path / f"{number:06d}.npy", points @ R.T)
-    T = make_transform(R.T, np.zeros(3))
-    write_tum(tmp_path / "ground_truth.tum", Trajectory(0.1 * np.arange(17.0), np.tile(T, (17, 1, 1))))
-
-    def opened(mounting: Mounting) -> MountedRecording:
-        return open_recording(tmp_path, ReaderConfig(mounting=mounting))
-
-    upright, guessed, given = opened("upright"), opened("auto"), opened("left")
-    assert any("--set reader.mounting=left" in warning for warning in guessed.warnings)
-    for recording in (guessed, given):
-        first, own = next(iter(recording.scans())), next(iter(upright.scans()))
-        np.testing.assert_array_equal(first.points, own.points @ transform_of("left")[:3, :3].T)
-        np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], np.eye(4), atol=1e-9)
 
 
 @pytest.mark.parametrize("angles", [(90, 0, 0), (0, 90, 0), (45, 0, 0), (30, 40, 110)])

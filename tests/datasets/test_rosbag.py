@@ -264,18 +264,14 @@ def test_index_that_promises_more_messages(make_bag_kit, velodyne_clouds, caplog
         list(recording.scans())
 
 
-@pytest.fixture
-def two_sensors(ros2_kit, velodyne_clouds):
-    """A topic that a front and a rear LiDAR send to in turn."""
+def test_two_sensors_that_send_to_one_topic_in_turn_are_told_apart(ros2_kit, velodyne_clouds):
     messages = velodyne_clouds(ros2_kit, 8)
     for i, (_, cloud) in enumerate(messages):
         cloud.header.frame_id = "rear" if i % 2 else "front"
-    return ros2_kit.write({"/points": messages})
+    path = ros2_kit.write({"/points": messages})
 
-
-def test_two_sensors_on_one_topic_are_told_apart(two_sensors):
     def stamps(faults, **options):
-        return [scan.stamp for scan in open_recording(two_sensors, ReaderConfig(**options)).scans(faults=faults)]
+        return [scan.stamp for scan in open_recording(path, ReaderConfig(**options)).scans(faults=faults)]
 
     faults = Faults()
     assert stamps(faults) == [ns / 10**9 for ns in stamps_ns(8)[::2]]
