@@ -11,7 +11,6 @@ from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.core.text import count
-from lidarslam.datasets.recording import ImuSummary
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
 _IN_G = (0.7, 1.5)  # as `GRAVITY_RANGE`, of accelerations in g
@@ -74,13 +73,6 @@ def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
     largest = sizes.max(axis=0)
     at_limit = (sizes == largest) & (largest > least)
     return np.asarray(binary_opening(at_limit, np.ones((_REPEATED, 1), dtype=bool)).any(axis=1))
-
-
-def summarise(name: str, samples: ImuSamples | None) -> ImuSummary | None:
-    """The description of the samples of a topic, file or folder; None of none."""
-    if samples is None:
-        return None
-    return ImuSummary(name, len(samples), samples.rate_hz, samples.T_lidar_imu is not None, samples.notes)
 
 
 def read_imu_csv(path: Path) -> ImuSamples | None:

@@ -21,8 +21,7 @@ from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import STORAGE_SUFFIXES, storage_files
+from lidarslam.datasets.recording import STORAGE_SUFFIXES, Recording, storage_files
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at, take_in
 from lidarslam.datasets.mounting import MountedRecording
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.recording import FileRecording
 
 
 def seen(points, **fields):

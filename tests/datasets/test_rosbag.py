@@ -12,10 +12,9 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.recording import Topic
+from lidarslam.datasets.recording import Topic, find_truth_file
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.stored_recording import find_truth_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 from .conftest import COMPRESSIONS, LATENCY_NS, PERIOD_NS, STAMP_NS, execute, point_table, stamps_ns

@@ -14,7 +14,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.stored_recording import PacketRecording
+from lidarslam.datasets.recording import PacketRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # A sensor's metadata is some tens of kilobytes of JSON with the beams' angles.

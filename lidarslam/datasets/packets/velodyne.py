@@ -13,8 +13,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
 from lidarslam.datasets.point_table import PointField, fields_of, raw_cloud
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import PacketRecording
+from lidarslam.datasets.recording import PacketRecording, Recording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # Beyond the range of any model; the library's own limit is less than that of some.

@@ -19,7 +19,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.stamped_files import increasing, poses_wxyz
-from lidarslam.datasets.stored_recording import FileRecording, first_file
+from lidarslam.datasets.recording import FileRecording, first_file
 
 _NANOSECOND = 1e-9
 _POINT = ("x", "y", "z", "intensity", "laser_number")

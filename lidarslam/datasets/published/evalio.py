@@ -21,8 +21,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.catalogue import CATALOGUE
-from lidarslam.datasets.recording import ImuSummary, Recording
-from lidarslam.datasets.stored_recording import StoredRecording
+from lidarslam.datasets.recording import ImuSummary, Recording, StoredRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows
 

@@ -33,8 +33,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import find_sequence, first_file
+from lidarslam.datasets.recording import Recording, find_sequence, first_file
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps, scan_rate
 

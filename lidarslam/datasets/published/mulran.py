@@ -24,7 +24,7 @@ from lidarslam.datasets.published.stamped_files import (
     poses_of_rows,
     read_table,
 )
-from lidarslam.datasets.stored_recording import first_file
+from lidarslam.datasets.recording import first_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 _LASERS, _COLUMNS, _SWEEP_S = 64, 1024, 0.1

@@ -22,7 +22,7 @@ from lidarslam.datasets.folders.scan_files import read_bytes
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.point_table import fields_of
 from lidarslam.datasets.published.stamped_files import StampedRecording, increasing, read_table
-from lidarslam.datasets.stored_recording import first_file
+from lidarslam.datasets.recording import first_file
 
 _POINT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
 _STEP_M, _ORIGIN_M = 0.005, -100.0

@@ -22,8 +22,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_wxyz
-from lidarslam.datasets.recording import KITTI_FIELDS, Recording
-from lidarslam.datasets.stored_recording import choose_sequence
+from lidarslam.datasets.recording import KITTI_FIELDS, Recording, choose_sequence
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 _LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")

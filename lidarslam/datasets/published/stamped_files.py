@@ -13,7 +13,7 @@ from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bin
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
 
 

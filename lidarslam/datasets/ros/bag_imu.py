@@ -13,7 +13,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.text import count
-from lidarslam.datasets.imu_samples import summarise, usable_samples
+from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.recording import ImuSummary, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import (
@@ -97,8 +97,9 @@ class BagImu:
         if self._topic is None:
             return None
         first = self._decoded(islice(self._bag.messages(self._topic), _SAMPLES_LOOKED_AT))
-        found = summarise(self._topic.name, first)
-        return None if found is None else replace(found, samples=self._topic.messages)
+        if first is None:
+            return None
+        return replace(ImuSummary.of(self._topic.name, first), samples=self._topic.messages)
 
     def _decoded(self, messages: Iterator[BagMessage]) -> ImuSamples | None:
         found = [(m, None if m.damage is not None else imu_numbers(m.raw, self._bag.ros2)) for m in messages]

@@ -21,7 +21,16 @@ from lidarslam.datasets.packets.ouster import (
     read_sensor,
 )
 from lidarslam.datasets.point_table import RawCloud
-from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
+from lidarslam.datasets.recording import (
+    CloudRecording,
+    ImuSummary,
+    Recording,
+    SeveralTopicsError,
+    Topic,
+    require,
+    storage_files,
+    truth_beside,
+)
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import BagImu
 from lidarslam.datasets.ros.bag_message import (
@@ -34,7 +43,6 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
-from lidarslam.datasets.stored_recording import CloudRecording, require, storage_files, truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _STRING_TYPE = "std_msgs/msg/String"
