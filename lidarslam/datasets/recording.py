@@ -24,8 +24,8 @@ from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, lea
 
 logger = logging.getLogger(__name__)
 
-# The commands to install them. ouster-sdk is no extra: it requires a version of rosbags that this program cannot use,
-# and does not need it for the functions used here.
+# The commands to install libraries. ouster-sdk is no extra: it requires a version of rosbags that this program cannot
+# use, and does not need it for the functions used here.
 _INSTALL = {
     "velodyne_decoder": "pip install 'lidarslam[velodyne]'",
     "ouster.sdk": "pip install --no-deps ouster-sdk",
@@ -142,7 +142,7 @@ class StoredRecording:
     topic: str | None = None
     topics: tuple[Topic, ...] = ()
     point_time: PointTimeModel | None = None  # where the reader knows it; not used where the configuration wants none
-    _stored: tuple[PointField, ...] = ()
+    _stored: tuple[PointField, ...] = ()  # the fields of its points
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
         self._source = source

@@ -39,6 +39,7 @@ from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_
 
 _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
+# Of a file of oxts.
 _COLUMNS = 30
 _POSITION_ACCURACY_COLUMN = 23
 # Of the unit's own axes; the columns behind them are of the level ones.
@@ -55,7 +56,7 @@ def open_odometry(source: Path, config: ReaderConfig) -> Recording:
 
 
 class KittiOdometryRecording(BinRecording):
-    """One sequence."""
+    """One sequence of the benchmark."""
 
     reader = "kitti-odometry"
     _notes = ("The scans are motion compensated by the publishers; they have no per-point time and need none.",)
@@ -187,7 +188,7 @@ def open_raw(source: Path, config: ReaderConfig) -> Recording:
 
 
 class KittiRawRecording(BinRecording):
-    """One drive."""
+    """One drive of the raw data."""
 
     reader = "kitti-raw"
     imu_name = "oxts"
@@ -300,7 +301,7 @@ def open_360(source: Path, config: ReaderConfig) -> Recording:
 
 
 class Kitti360Recording(BinRecording):
-    """One drive."""
+    """One drive of KITTI-360."""
 
     reader = "kitti-360"
     point_time = AZIMUTH_TIME
