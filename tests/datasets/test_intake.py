@@ -192,16 +192,6 @@ def test_kinds_are_counted_and_the_first_of_each_is_remembered():
     assert faults.warnings() == ("2 scans have a fault; the first: a", "2 scans were left out: why; the first: b")
 
 
-def test_unreadable_scans_are_left_out_where_they_are_counted_and_raised_elsewhere():
-    faults = Faults()
-    assert [scan.stamp for scan in Odd([0, 1, 2, 3, 4]).scans(faults=faults)] == [0.0, 2.0, 4.0]
-    assert faults.left_out == 2
-    scans = Odd([0, 1]).scans()
-    assert next(scans).stamp == 0.0
-    with pytest.raises(InputError, match="1 is damaged"):
-        next(scans)
-
-
 def test_a_recording_is_described_by_its_first_readable_scan():
     info = Odd([1, 3, 4, 6]).describe()
     assert (info.first.stamp, info.scans, info.last_stamp) == (4.0, 4, 6.0)

@@ -18,12 +18,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.stamped_files import (
-    StampedRecording,
-    increasing,
-    poses_of_rows,
-    read_table,
-)
+from lidarslam.datasets.published.stamped_files import StampedRecording, increasing, poses_of_rows, read_table
 from lidarslam.datasets.recording import first_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
