@@ -96,10 +96,6 @@ _DRIVERS = {
         _layout(48, **_XYZ, intensity=("f4", 16), timestamp=("f8", 24), ring=("u2", 32)),
         ("timestamp", "s", "absolute", _epoch_seconds),
     ),
-    "robosense": (
-        _layout(26, **_XYZ, intensity=("f4", 12), ring=("u2", 16), timestamp=("f8", 18)),
-        ("timestamp", "s", "absolute", _epoch_seconds),
-    ),
     "livox": (
         _layout(26, **_XYZ, intensity=("f4", 12), tag=("u1", 16), line=("u1", 17), timestamp=("f8", 18)),
         ("timestamp", "ns", "absolute", _epoch_nanoseconds),
