@@ -22,6 +22,7 @@ _SINGULAR = {
 class Faults:
     """The faults of one pass through a recording, counted by kind; of each kind the first is remembered."""
 
+    strict: bool = False  # a scan that cannot be read is an error
     left_out: int = 0  # number of scans that were left out
     _counts: dict[str, int] = field(default_factory=dict)
     _first: dict[str, str] = field(default_factory=dict)
@@ -32,7 +33,9 @@ class Faults:
         self.note(kind, example, count)
 
     def unreadable(self, error: InputError) -> None:
-        """Count one scan that is left out because it cannot be read."""
+        """Count one scan that is left out because it cannot be read; where it is strict, raise the error."""
+        if self.strict:
+            raise error
         self.leave_out(_UNREADABLE, str(error))
 
     def note(self, kind: str, example: str, count: int = 1) -> None:

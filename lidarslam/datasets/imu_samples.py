@@ -11,7 +11,6 @@ from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.core.text import count
-from lidarslam.datasets.recording import ImuSummary
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
 _IN_G = (0.7, 1.5)  # as `GRAVITY_RANGE`, of accelerations in g
@@ -68,19 +67,12 @@ def usable_samples(
 
 def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
     """(N,) whether a component of a vector (N, 3) is one of several equal ones in a row, at the largest of them all."""
+    from scipy.ndimage import binary_opening  # takes a while to load
+
     sizes = np.abs(vectors)
     largest = sizes.max(axis=0)
     at_limit = (sizes == largest) & (largest > least)
-    runs = np.lib.stride_tricks.sliding_window_view(np.pad(at_limit, ((_REPEATED - 1,) * 2, (0, 0))), _REPEATED, axis=0)
-    whole = np.asarray(runs.all(axis=-1))
-    return np.asarray(np.any([whole[n : n + len(vectors)] for n in range(_REPEATED)], axis=(0, 2)))
-
-
-def summarise(name: str, samples: ImuSamples | None) -> ImuSummary | None:
-    """The description of the samples of a topic, file or folder; None of none."""
-    if samples is None:
-        return None
-    return ImuSummary(name, len(samples), samples.rate_hz, samples.T_lidar_imu is not None, samples.notes)
+    return np.asarray(binary_opening(at_limit, np.ones((_REPEATED, 1), dtype=bool)).any(axis=1))
 
 
 def read_imu_csv(path: Path) -> ImuSamples | None:

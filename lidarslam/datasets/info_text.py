@@ -29,7 +29,7 @@ _CHOOSE = "Choose one of them with --topic, such as --topic {}"
 def describe_source(source: Path, config: ReaderConfig) -> str:
     """The contents of a recording; of a bag whose topic is still to be chosen, the topics alone."""
     try:
-        return format_info(source, open_recording(source, config).describe())
+        info = open_recording(source, config).describe()
     except SeveralTopicsError as error:
         rows = [
             ("source", str(source)),
@@ -37,6 +37,7 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
             ("note", _CHOOSE.format(error.clouds[0].name)),
         ]
         return _text(rows, error.topics, chosen=None)
+    return _text(list(_rows(source, info)), info.topics, info.topic)
 
 
 def describe_as_json(source: Path, config: ReaderConfig) -> str:
@@ -82,11 +83,6 @@ def _content(info: RecordingInfo) -> dict[str, Any]:
 
 def _topics(topics: Sequence[Topic]) -> list[dict[str, Any]]:
     return [{"name": topic.name, "type": topic.message_type, "messages": topic.messages} for topic in topics]
-
-
-def format_info(source: Path, info: RecordingInfo) -> str:
-    """A recording's description as aligned lines of text."""
-    return _text(list(_rows(source, info)), info.topics, info.topic)
 
 
 def _text(rows: Sequence[tuple[str, str]], topics: Sequence[Topic], chosen: str | None) -> str:

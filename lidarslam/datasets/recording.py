@@ -1,17 +1,40 @@
-"""A recording on disk: a sequence of scans with a description; the interface of the readers."""
+"""A recording on disk, a sequence of scans with a description: the interface of the readers, and their common part."""
 
-from collections.abc import Iterator, Sequence
+import logging
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan, ScanSequence
+from lidarslam.core.trajectory import Trajectory, read_tum
+from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.times.point_time import PointTimeModel
+from lidarslam.datasets.point_table import PointField, RawCloud
+from lidarslam.datasets.times.azimuth import PointTiming, point_timing
+from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, learn_point_time
+
+logger = logging.getLogger(__name__)
+
+# The commands to install libraries. ouster-sdk is no extra: it requires a version of rosbags that this program cannot
+# use, and does not need it for the functions used here.
+_INSTALL = {
+    "velodyne_decoder": "pip install 'lidarslam[velodyne]'",
+    "ouster.sdk": "pip install --no-deps ouster-sdk",
+}
+_LISTED = 8
+STORAGE_SUFFIXES = (".db3", ".mcap")  # of rosbag2
+_TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
+# Of the points of KITTI, and of the .bin files of others.
+KITTI_FIELDS = ("x", "y", "z", "intensity")
 
 
 @dataclass(frozen=True)
@@ -32,10 +55,6 @@ class SeveralTopicsError(InputError):
         self.topics = tuple(topics)
 
 
-# Of the points of KITTI, and of the .bin files of others.
-KITTI_FIELDS = ("x", "y", "z", "intensity")
-
-
 @dataclass(frozen=True)
 class ImuSummary:
     """The IMU of a recording."""
@@ -45,6 +64,11 @@ class ImuSummary:
     rate_hz: float | None  # median; None of fewer than two samples
     has_extrinsic: bool  # whether T_lidar_imu is known
     notes: tuple[str, ...] = ()  # of its samples
+
+    @staticmethod
+    def of(name: str, samples: ImuSamples) -> "ImuSummary":
+        """The description of the samples of a topic, file or folder."""
+        return ImuSummary(name, len(samples), samples.rate_hz, samples.T_lidar_imu is not None, samples.notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +129,332 @@ class Recording(ScanSequence, Protocol):
 
     def describe(self) -> RecordingInfo:
         """The contents of the recording, by its first scan too."""
+
+
+class StoredRecording:
+    """A file or folder; implements `Recording`.
+
+    A reader adds `__len__`, `_items`, `_read` and `_last_stamp`, and sets or overrides what else there is.
+    """
+
+    reader: str
+    imu_name: str = "imu"
+    topic: str | None = None
+    topics: tuple[Topic, ...] = ()
+    point_time: PointTimeModel | None = None  # where the reader knows it; not used where the configuration wants none
+    _stored: tuple[PointField, ...] = ()  # the fields of its points
+
+    def __init__(self, source: Path, config: ReaderConfig) -> None:
+        self._source = source
+        self._config = config
+
+    @property
+    def name(self) -> str:
+        """The folder's name, or the file's without its suffix."""
+        return self._source.resolve().name if self._source.is_dir() else self._source.stem
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at the truth's own stamps."""
+        return None if self._truth_path is None else read_tum(self._truth_path)
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """No IMU."""
+        return None
+
+    @cached_property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """No camera."""
+        return None
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """Faults of the recording as a whole."""
+        return ()
+
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        return ()
+
+    @cached_property
+    def _truth_path(self) -> Path | None:
+        return None
+
+    @cached_property
+    def _rate_is_assumed(self) -> bool:
+        return False
+
+    @cached_property
+    def _point_time(self) -> PointTimeModel | None:
+        return None if self._config.time_reference == "none" else self.point_time
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`; faults are logged where nobody counts them."""
+        return self._scans(scan_indices(len(self), start, stop, step), faults)
+
+    def _scans(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
+        counted = Faults(strict=True) if faults is None else faults
+        try:
+            for item in self._items(wanted, counted):
+                try:
+                    scan = self._read(item, counted)
+                except InputError as error:
+                    counted.unreadable(error)
+                    continue
+                yield scan
+        finally:
+            if faults is None:
+                for warning in counted.warnings():
+                    logger.warning("%s: %s", self._source, warning)
+
+    def describe(self) -> RecordingInfo:
+        """By the first readable scan; see `Recording`."""
+        faults = Faults()
+        item, first = self._first(faults)
+        return RecordingInfo(
+            reader=self.reader,
+            scans=len(self),
+            first=first,
+            last_stamp=self._last_stamp(first),
+            ground_truth=self._truth_path,
+            point_time=self._point_time,
+            topic=self.topic,
+            topics=self.topics,
+            fields=self._fields(item),
+            notes=(*self._notes, *self.warnings, *faults.warnings()),
+            rate_is_assumed=self._rate_is_assumed,
+            imu=self._imu_summary(),
+        )
+
+    def _first(self, faults: Faults) -> tuple[Any, Scan]:
+        """The first readable scan, and its item; the error of the first one where none can be read."""
+        first_error = None
+        for item in self._items(range(len(self)), faults):
+            try:
+                return item, self._read(item, faults)
+            except InputError as error:
+                first_error = first_error or error
+                faults.unreadable(error)
+        left_out = "".join(f"; {warning}" for warning in faults.warnings())
+        raise first_error or InputError(f"{self._source}: holds no scan that could be used; record it again{left_out}")
+
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Any]:
+        """The items that the wanted scans are read from; others are counted."""
+        raise NotImplementedError
+
+    def _read(self, item: Any, faults: Faults) -> Scan:
+        raise NotImplementedError
+
+    def _fields(self, item: Any) -> tuple[PointField, ...]:  # noqa: ARG002
+        return self._stored
+
+    def _last_stamp(self, first: Scan) -> float:
+        raise NotImplementedError
+
+    def _imu_summary(self) -> ImuSummary | None:
+        return None if self.imu is None else ImuSummary.of(self.imu_name, self.imu)
+
+
+class FileRecording(StoredRecording):
+    """A folder with a file for each scan. A reader adds `_read`, by the index of a scan, and the stamps."""
+
+    stamps: FloatArray
+    """(N,) seconds."""
+    _stored = tuple(PointField(name, "float32") for name in KITTI_FIELDS)
+
+    def __init__(self, folder: Path, config: ReaderConfig, files: Sequence[Path]) -> None:
+        super().__init__(folder, config)
+        self._files = files
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def _items(self, wanted: range, faults: Faults) -> Iterator[int]:  # noqa: ARG002
+        return iter(wanted)
+
+    def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
+        return float(self.stamps[-1])
+
+
+class CloudRecording(StoredRecording):
+    """Scans whose points may have times, of which field, unit and clock are inferred from the first of them.
+
+    A reader adds `__len__`, `_items`, `_last_stamp`, and the methods below that raise an error.
+    """
+
+    _has_stamps: bool = True  # whether stamps are readings of a clock, rather than made from the rate
+
+    def _decode(self, item: Any) -> RawCloud:
+        raise NotImplementedError
+
+    def _stamp(self, item: Any) -> float:
+        raise NotImplementedError
+
+    def _sound_items(self) -> Iterable[Any]:
+        """All items in their order, to infer from; those that cannot be decoded are counted when it is their turn."""
+        raise NotImplementedError
+
+    def _runs(self) -> Iterable[Iterable[Any]]:
+        """Pairs of the items of consecutive scans, spread over the recording."""
+        raise NotImplementedError
+
+    @cached_property
+    def _period_s(self) -> float | None:
+        """Seconds between scans; None for a single one."""
+        raise NotImplementedError
+
+    @property
+    def _defined_time(self) -> tuple[TimeUnit, TimeReference, TimeUnit | None]:
+        """Unit and reference of the time field, and the unit by the definition of a message."""
+        return self._config.time_unit, self._config.time_reference, None
+
+    @cached_property
+    def _learned(self) -> LearnedTime:
+        if self._config.time_reference == "none":
+            return LearnedTime()
+        unit, reference, defined_unit = self._defined_time
+        period_s = self._period_s if self._has_stamps else None
+        return learn_point_time(self._readable(self._sound_items()), unit, reference, period_s, defined_unit)
+
+    def _readable(self, items: Iterable[Any]) -> Iterator[tuple[RawCloud, float | None]]:
+        """The clouds that can be decoded, with their stamps where these read a clock."""
+        for item in items:
+            with suppress(InputError):
+                yield self._decode(item), self._stamp(item) if self._has_stamps else None
+
+    @cached_property
+    def _timing(self) -> PointTiming:
+        runs = ((cloud for cloud, _ in self._readable(run)) for run in self._runs())
+        return point_timing(self._learned, runs, self._period_s, self._config.time_reference)
+
+    @cached_property
+    def _point_time(self) -> PointTimeModel | None:
+        return self._timing.model
+
+    def _read(self, item: Any, faults: Faults) -> Scan:
+        stamp = self._stamp(item)
+        return self._timing.scan(self._decode(item), stamp, faults, f"{stamp:.9f}")
+
+    def _fields(self, item: Any) -> tuple[PointField, ...]:
+        return self._decode(item).fields
+
+
+class PacketRecording(StoredRecording):
+    """The sweeps of one sensor. A reader adds `_items`, `_read` and `_fields`."""
+
+    reader = "packets"
+    imu_name = "the sensor's own"
+    library: tuple[str, str]  # that decodes the packets, and whose packets
+
+    def __init__(self, source: Path, config: ReaderConfig) -> None:
+        require(*self.library)
+        super().__init__(source, config)
+        self._truth_path = truth_beside(source, self.name)
+
+    def __len__(self) -> int:
+        return self._extent[0]
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """See `Recording`; sweeps are not counted beforehand, which would take a pass over all packets."""
+        return self._scans(scan_indices(sys.maxsize, start, stop, step), faults)
+
+    @cached_property
+    def _extent(self) -> tuple[int, float]:
+        """Number of sweeps, and the stamp of the last one."""
+        count, last = 0, 0.0
+        for scan in self.scans(faults=Faults()):
+            count, last = count + 1, scan.stamp
+        return count, last
+
+    def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
+        return self._extent[1]
+
+
+def require(library: str, purpose: str) -> None:
+    """Check that a library is installed; the message names the purpose."""
+    try:
+        import_module(library)
+    except ModuleNotFoundError as error:
+        name = library.partition(".")[0] if error.name and library.startswith(error.name) else error.name
+        raise ConfigError(f"{name} is not installed, which {purpose} need; {_INSTALL[library]}") from error
+
+
+def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
+    """The indices `range(start, stop, step)` of a recording of `count` scans, a stop past the end being the end."""
+    if start < 0 or step < 1 or (stop is not None and stop < 0):
+        raise InputError(
+            f"expected start >= 0, stop >= 0 and step >= 1, got start {start}, stop {stop} and step {step}"
+        )
+    return range(start, count if stop is None else min(stop, count), step)
+
+
+def find_sequence(source: Path, folder: Path, marker: str, wanted: str | None, noun: str = "sequence") -> Path:
+    """The sequence of a data set: the source, or one of those in a folder, which are known by a path in them.
+
+    Wanted is one by its name, or the last number in it; None: the only one.
+    """
+    if (source / marker).exists():
+        name = source.resolve().name
+        if wanted is not None and wanted.zfill(len(name)) != name:
+            raise InputError(
+                f"{source}: is the {noun} {name}, not {wanted}; leave --sequence out or give the folder above"
+            )
+        return source
+    names = sorted(path.name for path in folder.glob("*") if (path / marker).exists())
+    if not names:
+        raise InputError(f"{source}: expected {marker} in it, or in folders in {folder}; found neither")
+    return folder / choose_sequence(source, names, wanted, noun)
+
+
+def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun: str = "sequence") -> str:
+    """Of the names of a data set's sequences the only one, or the wanted one: by name, or by the last number in it."""
+    number = int(wanted) if wanted is not None and wanted.isdecimal() else None
+    fitting = [name for name in names if wanted in (None, name)] or [
+        name for name in names if number is not None and _last_number(name) == number
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
+    listed = f"{', '.join(names[:_LISTED])}{more}"
+    if wanted is None:
+        raise InputError(f"{source}: holds {len(names):,} {noun}s; choose one with --sequence: {listed}")
+    raise InputError(f"{source}: has no {noun} {wanted!r}; there are: {listed}")
+
+
+def _last_number(name: str) -> int | None:
+    numbers = re.findall(r"[0-9]+", name)
+    return int(numbers[-1]) if numbers else None
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The databases and MCAP files of a folder, without hidden ones such as macOS's `._` files.
+
+    A recorder that was killed leaves them without their metadata.yaml.
+    """
+    named = (entry for entry in folder.iterdir() if entry.suffix in STORAGE_SUFFIXES and entry.name[0] != ".")
+    return sorted(entry for entry in named if entry.is_file())
+
+
+def first_file(folders: Sequence[Path], *names: str) -> Path | None:
+    """The first of these files in the first folder that has one of them."""
+    paths = (folder / name for folder in folders for name in names)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | None:
+    """The true trajectory in the first folder that has one; `<stem>.tum` in any of them precedes general names."""
+    own = None if stem is None else first_file(folders, f"{stem}.tum")
+    return own or first_file(folders, *_TRUTH_NAMES)
+
+
+def truth_beside(source: Path, name: str) -> Path | None:
+    """The true trajectory in a recording's folder or its parent, or in the folder of its file."""
+    return find_truth_file([source, source.resolve().parent] if source.is_dir() else [source.parent], name)

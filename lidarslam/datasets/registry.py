@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from difflib import get_close_matches
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
@@ -21,8 +21,7 @@ from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import STORAGE_SUFFIXES, storage_files
+from lidarslam.datasets.recording import STORAGE_SUFFIXES, Recording, storage_files
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +39,7 @@ _LAYOUTS = ("kitti-odometry", "kitti-raw")
 class Reader(NamedTuple):
     """One row of the table."""
 
-    module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`
+    module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`, or that is `module:function`
     reads: str  # the layout, in words
     recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
     takes_sequence: bool = False  # whether --sequence chooses one of several in a source
@@ -76,20 +75,20 @@ READERS: dict[str, Reader] = {
         is_of_evalio,
     ),
     "kitti-odometry": Reader(
-        f"{_HERE}.published.kitti_odometry",
+        f"{_HERE}.published.kitti:open_odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         _has("sequences/", "velodyne/"),
         takes_sequence=True,
         elevation_deg=KITTI_DEG,
     ),
     "kitti-360": Reader(
-        f"{_HERE}.published.kitti_360",
+        f"{_HERE}.published.kitti:open_360",
         "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
         _is_kitti_360,
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        f"{_HERE}.published.kitti_raw",
+        f"{_HERE}.published.kitti:open_raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
         _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
@@ -176,7 +175,9 @@ def takes_sequence(source: Path, name: str | None = None) -> bool:
 
 def recognise(source: Path) -> str | None:
     """The first reader in the table, or else of another package, that recognises a path by its names."""
-    return next((name for name, reader in _readers() if reader.recognises(source)), None)
+    with suppress(OSError):
+        return next((name for name, reader in _readers() if reader.recognises(source)), None)
+    return None
 
 
 def _readers() -> Iterator[tuple[str, Reader]]:
@@ -197,7 +198,8 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     logger.info("reader: %s, %s: %s", name, why, reader.reads)
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
-    recording = cast(Recording, import_module(reader.module).open_recording(source, config))
+    opens = resolve_name(reader.module if ":" in reader.module else f"{reader.module}:open_recording")
+    recording = cast(Recording, opens(source, config))
     raised_deg = config.raised_deg(reader.elevation_deg)
     if config.mounting == "upright" and not raised_deg and config.time_scale == 1.0:
         return recording
@@ -244,7 +246,7 @@ def result_of_program(source: Path) -> str | None:
 def _unrecognised(source: Path) -> str | None:
     """Another kind of path and what to do, as far as names alone show it; None where they do not."""
     for above in islice(source.resolve().parents, 2):
-        reader = _reader_of(above)
+        reader = recognise(above)
         if reader in _LAYOUTS or (reader == "rosbag" and source.name == "metadata.yaml"):
             return f"{source}: lies in a recording ({reader}); name that: {above}"
     if source.is_dir() and (found := _recordings_in(source)):
@@ -261,7 +263,7 @@ def _recordings_in(folder: Path) -> list[Path]:
     level = [folder]
     for _ in range(_DEPTH):
         level = [entry for one in level for entry in _entries(one)][:_MOST_ENTRIES]
-        found = [entry for entry in level if result_of_program(entry) is None and _reader_of(entry) is not None]
+        found = [entry for entry in level if result_of_program(entry) is None and recognise(entry) is not None]
         if found:
             return found
         level = [entry for entry in level if entry.is_dir()]
@@ -271,12 +273,6 @@ def _recordings_in(folder: Path) -> list[Path]:
 def _entries(folder: Path) -> Iterator[Path]:
     with suppress(OSError):
         yield from sorted(e for e in islice(folder.iterdir(), _MOST_ENTRIES) if not e.name.startswith("."))
-
-
-def _reader_of(path: Path) -> str | None:
-    with suppress(OSError):
-        return recognise(path)
-    return None
 
 
 def _kind(source: Path) -> str:

@@ -17,7 +17,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory, format_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import recorded_axes
-from lidarslam.datasets.published.kitti_raw import KittiRawRecording
+from lidarslam.datasets.published.kitti import KittiRawRecording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import static_transform

@@ -4,6 +4,7 @@ import sqlite3
 import struct
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,13 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.datasets.registry import READERS
+from lidarslam.datasets.ros import made_messages
+from lidarslam.datasets.ros.bag_message import (
+    CUSTOM_MESSAGE_DEFINITION,
+    CUSTOM_POINT_DEFINITION,
+    TRANSFORMS_DEFINITION,
+    TRANSFORMS_TYPE,
+)
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -29,8 +37,6 @@ COMPRESSIONS = [
     ("db3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
     ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
 ]
-
-_DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 def stamps_ns(count: int) -> list[int]:
@@ -90,20 +96,11 @@ _DRIVERS = {
         _layout(48, **_XYZ, intensity=("f4", 16), timestamp=("f8", 24), ring=("u2", 32)),
         ("timestamp", "s", "absolute", _epoch_seconds),
     ),
-    "robosense": (
-        _layout(26, **_XYZ, intensity=("f4", 12), ring=("u2", 16), timestamp=("f8", 18)),
-        ("timestamp", "s", "absolute", _epoch_seconds),
-    ),
     "livox": (
         _layout(26, **_XYZ, intensity=("f4", 12), tag=("u1", 16), line=("u1", 17), timestamp=("f8", 18)),
         ("timestamp", "ns", "absolute", _epoch_nanoseconds),
     ),
 }
-
-_LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-_LIVOX_MESSAGE = (
-    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
-)
 
 
 @pytest.fixture(params=list(_DRIVERS))
@@ -164,13 +161,10 @@ class BagKit:
         self.folder = folder
         self.store = get_typestore(Stores.ROS2_HUMBLE if self.ros2 else Stores.ROS1_NOETIC)
         for package in ("livox_ros_driver", "livox_ros_driver2"):
-            self.store.register(get_types_from_msg(_LIVOX_POINT, f"{package}/msg/CustomPoint"))
-            self.store.register(get_types_from_msg(_LIVOX_MESSAGE, f"{package}/msg/CustomMsg"))
-
+            self.store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, f"{package}/msg/CustomPoint"))
+            self.store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, f"{package}/msg/CustomMsg"))
         if not self.ros2:  # which rosbags has for ROS 2 alone
-            self.store.register(
-                get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
-            )
+            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
 
     def new(self, type_name: str, /, **values: Any) -> Any:
         """A message of a type given as package/Name."""
@@ -178,8 +172,7 @@ class BagKit:
 
     def header(self, stamp_ns: int) -> Any:
         """A std_msgs/Header."""
-        stamp = self.new("builtin_interfaces/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        return self.new("std_msgs/Header", stamp=stamp, frame_id="lidar", **({} if self.ros2 else {"seq": 7}))
+        return made_messages.header(self.store, stamp_ns, "lidar", sequence=7)
 
     def cloud(self, records: np.ndarray, stamp_ns: int, row_padding: int = 0, **changes: Any) -> Any:
         """A sensor_msgs/PointCloud2 of records (height, width)."""
@@ -188,14 +181,9 @@ class BagKit:
         rows = np.zeros((height, width * point_step + row_padding), np.uint8)
         if records.size:
             rows[:, : width * point_step] = np.ascontiguousarray(records).view(np.uint8).reshape(height, -1)
-        fields = [
-            self.new("sensor_msgs/PointField", name=name, offset=offset, datatype=_DATATYPES[kind.str[1:]], count=1)
-            for name, (kind, offset) in records.dtype.fields.items()
-        ]
-        shape = {"height": height, "width": width, "point_step": point_step, "row_step": rows.shape[1]}
-        content = {"fields": fields, "is_bigendian": False, "is_dense": False, "data": rows.reshape(-1)}
-        values = {"header": self.header(stamp_ns), **shape, **content, **changes}
-        return self.new("sensor_msgs/PointCloud2", **values)
+        empty = made_messages.point_cloud(self.store, self.header(stamp_ns), records.reshape(-1)[:0])
+        shape = {"height": height, "width": width, "row_step": rows.shape[1]}
+        return replace(empty, **{**shape, "data": rows.reshape(-1), **changes})
 
     def livox(
         self, points: np.ndarray, offset_ns: np.ndarray, lines: np.ndarray, stamp_ns: int, timebase: int, package: str
@@ -217,20 +205,14 @@ class BagKit:
 
     def imu(self, stamp_ns: int, frame_id: str, angular_velocity: np.ndarray, acceleration: np.ndarray) -> Any:
         """A sensor_msgs/Imu."""
-        header = self.header(stamp_ns)
-        header.frame_id = frame_id
-        w, a = (
-            self.new("geometry_msgs/Vector3", **dict(zip("xyz", values.tolist(), strict=True)))
-            for values in (angular_velocity, acceleration)
-        )
         return self.new(
             "sensor_msgs/Imu",
-            header=header,
+            header=made_messages.header(self.store, stamp_ns, frame_id),
             orientation=self.new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=np.full(9, 1.0),
-            angular_velocity=w,
+            angular_velocity=made_messages.vector(self.store, angular_velocity),
             angular_velocity_covariance=np.full(9, 2.0),
-            linear_acceleration=a,
+            linear_acceleration=made_messages.vector(self.store, acceleration),
             linear_acceleration_covariance=np.full(9, 3.0),
         )
 
@@ -324,14 +306,10 @@ def pcd_bytes(table: np.ndarray, data: str = "binary") -> bytes:
     types = [table.dtype[name] for name in table.dtype.names]
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
         "FIELDS " + " ".join(table.dtype.names),
         "SIZE " + " ".join(str(t.base.itemsize) for t in types),
         "TYPE " + " ".join(kinds[t.base.kind] for t in types),
         "COUNT " + " ".join(str(int(np.prod(t.shape)) if t.shape else 1) for t in types),
-        f"WIDTH {len(table)}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
         f"POINTS {len(table)}",
         f"DATA {data}",
     ]

@@ -133,22 +133,14 @@ def test_a_part_of_a_bag_says_that_there_are_others(write_drive):
 
 def test_a_bag_without_index_is_read_up_to_a_damaged_chunk(write_drive):
     file, _, _ = write_drive("mcap", count=2)
-    data = file.read_bytes()
-    header, chunk = _mcap_chunk(data)
+    data, ((begin, size),) = file.read_bytes(), chunks_of(file)
+    header, chunk = data[: begin - 49], data[begin - 49 : begin + size]
     broken = chunk[:49] + b"\xff" * 9 + chunk[58:]  # the length of its first record
     file.write_bytes(header + chunk + broken + chunk[:-100])
     bag = BagFile(file)
     (topic,) = (topic for topic in bag.topics if topic.messages)
     assert topic.messages == len(list(bag.messages(topic))) == 2
     assert "breaks off at byte" in bag.damage
-
-
-def _mcap_chunk(data):
-    """An MCAP file up to its first chunk, and that chunk."""
-    at = 8
-    while data[at] != 0x06:
-        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-    return data[:at], data[at : at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")]
 
 
 @pytest.mark.parametrize("data", ["text", 100, 4 * 10**12, 0.5])

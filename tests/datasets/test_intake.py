@@ -13,7 +13,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at, take_in
 from lidarslam.datasets.mounting import MountedRecording
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.recording import FileRecording
 
 
 def seen(points, **fields):
@@ -190,16 +190,6 @@ def test_kinds_are_counted_and_the_first_of_each_is_remembered():
     faults.note("scans have a fault", "c")
     assert faults.left_out == 2
     assert faults.warnings() == ("2 scans have a fault; the first: a", "2 scans were left out: why; the first: b")
-
-
-def test_unreadable_scans_are_left_out_where_they_are_counted_and_raised_elsewhere():
-    faults = Faults()
-    assert [scan.stamp for scan in Odd([0, 1, 2, 3, 4]).scans(faults=faults)] == [0.0, 2.0, 4.0]
-    assert faults.left_out == 2
-    scans = Odd([0, 1]).scans()
-    assert next(scans).stamp == 0.0
-    with pytest.raises(InputError, match="1 is damaged"):
-        next(scans)
 
 
 def test_a_recording_is_described_by_its_first_readable_scan():

@@ -20,7 +20,7 @@ def _truth(count: int) -> np.ndarray:
     return np.stack([exp([0.01 * i, -0.004 * i, 0.03 * i, 1.1 * i, 0.1 * i, 0.02 * i]) for i in range(count)])
 
 
-def _write_sequence(
+def write_sequence(
     root: Path, rng: np.random.Generator, name: str = "04", numbers=range(6), rows: int = 6, poses: int = 6
 ) -> list[np.ndarray]:
     folder = root / "sequences" / name
@@ -42,12 +42,12 @@ def _write_sequence(
 @pytest.fixture
 def sequence(tmp_path, rng) -> Path:
     """The folder of a sequence of six scans."""
-    _write_sequence(tmp_path, rng)
+    write_sequence(tmp_path, rng)
     return tmp_path / "sequences" / "04"
 
 
 def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng, uncorrected):
-    clouds = _write_sequence(tmp_path, rng)
+    clouds = write_sequence(tmp_path, rng)
     assert choose_reader(tmp_path) == "kitti-odometry"
     recording = open_recording(tmp_path)
     scans = list(recording.scans())
@@ -72,7 +72,7 @@ def test_a_single_sequence_folder_reads_the_same(tmp_path, sequence, monkeypatch
 
 
 def test_gaps_in_the_numbers_keep_stamps_and_truth_in_step(tmp_path, rng, uncorrected):
-    clouds = _write_sequence(tmp_path, rng, numbers=(1, 2, 4), rows=9, poses=7)
+    clouds = write_sequence(tmp_path, rng, numbers=(1, 2, 4), rows=9, poses=7)
     recording = open_recording(tmp_path)
     scans = list(recording.scans())
     np.testing.assert_allclose([scan.stamp for scan in scans], [0.1037, 0.2074, 0.4148], atol=1e-6)
@@ -90,11 +90,14 @@ def test_the_correction_raises_every_point(sequence):
     assert any("0.205" in note for note in recording.describe().notes)
 
 
-def test_points_of_another_layout_are_refused_by_their_values(sequence):
+def test_points_of_another_layout_are_refused_by_their_values_and_names_that_are_no_numbers(sequence):
     azimuth = np.linspace(-np.pi, np.pi, 500)
     room = np.column_stack([8.3 * np.cos(azimuth), 6.1 * np.sin(azimuth), np.full(500, -1.7), np.full(500, 0.5)])
     room.tofile(min(sequence.rglob("*.bin")))
     with pytest.raises(InputError, match="by its values they have 32 bytes"):
+        open_recording(sequence)
+    (sequence / "velodyne" / "last.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"last\.bin: expected a name that is the scan's number"):
         open_recording(sequence)
 
 
@@ -111,7 +114,7 @@ def test_scans_are_not_counted_from_the_end(sequence, wrong):
 
 def test_the_sequence_must_be_chosen_among_several(tmp_path, rng):
     for name in ("03", "07"):
-        _write_sequence(tmp_path, rng, name)
+        write_sequence(tmp_path, rng, name)
     (tmp_path / "sequences" / "11").mkdir()  # no scans: not available
     with pytest.raises(InputError, match="holds 2 sequences; choose one with --sequence: 03, 07"):
         open_recording(tmp_path)
@@ -124,7 +127,7 @@ def test_the_sequence_must_be_chosen_among_several(tmp_path, rng):
 
 
 def test_without_times_the_rate_gives_the_stamps_of_scans_and_truth(tmp_path, rng):
-    _write_sequence(tmp_path, rng, numbers=(0, 1, 3))
+    write_sequence(tmp_path, rng, numbers=(0, 1, 3))
     (tmp_path / "sequences" / "04" / "times.txt").unlink()
     recording = open_recording(tmp_path, ReaderConfig(rate_hz=20.0))
     np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [0.0, 0.05, 0.15])
@@ -139,12 +142,6 @@ def test_without_calibration_or_poses_there_is_no_truth(sequence, absent):
     assert (recording.T_cam_lidar is None) == (absent == "calib.txt")
     assert recording.ground_truth is recording.describe().ground_truth is None
     assert any("calib.txt" in note for note in recording.describe().notes) == (absent == "calib.txt")
-
-
-def test_damaged_files_are_named(sequence):
-    (sequence / "velodyne" / "last.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"last\.bin: expected a name that is the scan's number"):
-        open_recording(sequence)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import image_axes
-from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.datasets.config import Mounting, ReaderConfig
-from lidarslam.datasets.faults import Faults
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.mounting import (
     UPRIGHT,
     MountedRecording,
@@ -25,7 +22,6 @@ from lidarslam.datasets.mounting import (
     written,
 )
 from lidarslam.datasets.recording import RecordingInfo
-from lidarslam.datasets.registry import open_recording
 
 QUARTERS = {"left": (90, 0, 0), "right": (-90, 0, 0), "backward": (0, 90, 0), "forward": (0, -90, 0)}
 HEIGHT_M = 1.7
@@ -84,8 +80,10 @@ class Recorded:
     name = "memory"
     warnings = ("old",)
     T_cam_lidar = make_transform(turn(10, 20, 30), np.array([0.1, 0.2, 0.3]))
-    truth = Trajectory(np.arange(3.0), np.stack([make_transform(turn(0, 0, a), np.ones(3)) for a in (0, 30, 60)]))
-    samples = ImuSamples(np.arange(3.0), np.ones((3, 3)), np.ones((3, 3)), T_cam_lidar)
+    ground_truth = Trajectory(
+        np.arange(3.0), np.stack([make_transform(turn(0, 0, a), np.ones(3)) for a in (0, 30, 60)])
+    )
+    imu = ImuSamples(np.arange(3.0), np.ones((3, 3)), np.ones((3, 3)), T_cam_lidar)
 
     def __init__(self, clouds: list[FloatArray]) -> None:
         self._scans = [Scan(points, float(number)) for number, points in enumerate(clouds)]
@@ -94,21 +92,7 @@ class Recorded:
     def __len__(self) -> int:
         return len(self._scans)
 
-    @property
-    def ground_truth(self) -> Trajectory:
-        return self.truth
-
-    @property
-    def imu(self) -> ImuSamples:
-        return self.samples
-
-    def scans(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        step: int = 1,
-        faults: Faults | None = None,  # noqa: ARG002
-    ) -> Iterator[Scan]:
+    def scans(self, start=0, stop=None, step=1, faults=None) -> Iterator[Scan]:  # noqa: ARG002
         self.passes += 1
         return iter(self._scans[start:stop:step])
 
@@ -229,24 +213,6 @@ def test_what_only_some_scans_show_is_a_warning_and_no_more():
 )
 def test_scans_without_surfaces_show_nothing(points):
     assert guess_mounting([points] * 5) == UPRIGHT
-
-
-def test_recordings_are_opened_upright(tmp_path: Path):
-    R = turn(*QUARTERS["left"])
-    for number, points in enumerate(cast(rays(), 0.8 * number, BOXES) for number in range(17)):
-        np.save(tmp_path / f"{number:06d}.npy", points @ R.T)
-    T = make_transform(R.T, np.zeros(3))
-    write_tum(tmp_path / "ground_truth.tum", Trajectory(0.1 * np.arange(17.0), np.tile(T, (17, 1, 1))))
-
-    def opened(mounting: Mounting) -> MountedRecording:
-        return open_recording(tmp_path, ReaderConfig(mounting=mounting))
-
-    upright, guessed, given = opened("upright"), opened("auto"), opened("left")
-    assert any("--set reader.mounting=left" in warning for warning in guessed.warnings)
-    for recording in (guessed, given):
-        first, own = next(iter(recording.scans())), next(iter(upright.scans()))
-        np.testing.assert_array_equal(first.points, own.points @ transform_of("left")[:3, :3].T)
-        np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], np.eye(4), atol=1e-9)
 
 
 @pytest.mark.parametrize("angles", [(90, 0, 0), (0, 90, 0), (45, 0, 0), (30, 40, 110)])

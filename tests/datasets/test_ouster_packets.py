@@ -57,7 +57,7 @@ def packets(sensor, frames):
     for number, frame in enumerate(frames):
         imu = core.ImuPacket(layout)
         ns = FIRST_NS + number * PERIOD_NS
-        values = struct.pack("<QQQ6f", ns, ns + 10, ns + 20, 0.0, 0.5, 1.0, 90.0, 0.0, -180.0)
+        values = struct.pack("<QQQ6f", ns, ns + 10, ns + 20, 0.0, 0.5, 1.0, 90.0 - number, 0.0, number - 180.0)
         imu.buf[:] = np.frombuffer(values, np.uint8)
         for packet in (imu, *core.frame_to_packets(frame, layout, sensor.init_id, sensor.sn)):
             packet.host_timestamp = FIRST_NS + len(made) * 1_500_000
@@ -121,7 +121,8 @@ def test_info(recorded):
 def assert_imu(imu):
     np.testing.assert_allclose(imu.stamps, (FIRST_NS + 20 + PERIOD_NS * np.arange(COUNT)) / 1e9, atol=1e-6)
     np.testing.assert_allclose(imu.accelerations, np.tile([0.0, 4.903325, 9.80665], (COUNT, 1)), rtol=1e-6)
-    np.testing.assert_allclose(imu.angular_velocities, np.tile([np.pi / 2, 0.0, -np.pi], (COUNT, 1)), rtol=1e-6)
+    rates_deg = [[90.0 - number, 0.0, number - 180.0] for number in range(COUNT)]
+    np.testing.assert_allclose(np.rad2deg(imu.angular_velocities), rates_deg, rtol=1e-6)
     assert np.abs(imu.T_lidar_imu[:3, 3]).max() == pytest.approx(0.011775)  # metres
 
 

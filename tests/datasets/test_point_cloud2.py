@@ -24,17 +24,10 @@ def test_padded_rows_and_big_endian(driver, make_sweep, ros2_kit):
     swapped = sweep.records.astype(sweep.records.dtype.newbyteorder(">"))
     message = ros2_kit.cloud(swapped, STAMP_NS, row_padding=13, is_bigendian=True)
     cloud = decode_point_cloud2(message)
+    message.data[:] = 0  # the cloud has its own copy
     assert_same(cloud, sweep)
     assert cloud.times.dtype.isnative
     assert cloud.rings.dtype.isnative
-
-
-def test_the_result_does_not_hold_on_to_the_message(make_sweep, ros2_kit):
-    sweep = make_sweep("ouster", STAMP_NS)
-    message = ros2_kit.cloud(sweep.records, STAMP_NS)
-    cloud = decode_point_cloud2(message)
-    message.data[:] = 0
-    assert_same(cloud, sweep)
 
 
 def test_fields_with_a_count(ros2_kit, make_sweep):
@@ -46,16 +39,6 @@ def test_fields_with_a_count(ros2_kit, make_sweep):
     np.testing.assert_array_equal(cloud.points, sweep.points)
     assert cloud.fields[0] == PointField("x", "float32")
     assert cloud.fields[3] == PointField("intensity", "float32[3]")
-
-
-def test_an_unknown_datatype_matters_only_where_it_is_read(ros2_kit, make_sweep):
-    sweep = make_sweep("velodyne", STAMP_NS)
-    message = ros2_kit.cloud(sweep.records, STAMP_NS)
-    message.fields[3].datatype = 11
-    np.testing.assert_array_equal(decode_point_cloud2(message).points, sweep.points)
-    message.fields[0].datatype = 11
-    with pytest.raises(InputError, match="'x' has the unknown datatype 11"):
-        decode_point_cloud2(message)
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (1, 0), (0, 5)])
@@ -168,9 +151,12 @@ def test_point_cloud2(ros2_kit, columns):
     assert cloud.intensities.tolist() == [0.0, 20_000.0, 40_000.0, 60_000.0]
 
 
-def test_fields_that_cannot_be_read_are_no_attributes(ros2_kit):
+def test_fields_that_cannot_be_read_matter_only_where_they_are_needed(ros2_kit):
     message = ros2_kit.cloud(table(intensity=np.ones(4, dtype="f4"), rgb=PACKED).reshape(1, 4), STAMP_NS)
     message.fields[3].datatype, message.fields[4].offset = 99, 1000
     cloud = decode_point_cloud2(message)
-    assert len(cloud.points) == 4
+    np.testing.assert_array_equal(cloud.points, np.ones((4, 3)))
     assert cloud.intensities is cloud.colours is None
+    message.fields[0].datatype = 11
+    with pytest.raises(InputError, match="'x' has the unknown datatype 11"):
+        decode_point_cloud2(message)

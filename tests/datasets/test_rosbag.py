@@ -12,10 +12,9 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.recording import Topic
+from lidarslam.datasets.recording import Topic, find_truth_file
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.stored_recording import find_truth_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 from .conftest import COMPRESSIONS, LATENCY_NS, PERIOD_NS, STAMP_NS, execute, point_table, stamps_ns
@@ -264,18 +263,14 @@ def test_index_that_promises_more_messages(make_bag_kit, velodyne_clouds, caplog
         list(recording.scans())
 
 
-@pytest.fixture
-def two_sensors(ros2_kit, velodyne_clouds):
-    """A topic that a front and a rear LiDAR send to in turn."""
+def test_two_sensors_that_send_to_one_topic_in_turn_are_told_apart(ros2_kit, velodyne_clouds):
     messages = velodyne_clouds(ros2_kit, 8)
     for i, (_, cloud) in enumerate(messages):
         cloud.header.frame_id = "rear" if i % 2 else "front"
-    return ros2_kit.write({"/points": messages})
+    path = ros2_kit.write({"/points": messages})
 
-
-def test_two_sensors_on_one_topic_are_told_apart(two_sensors):
     def stamps(faults, **options):
-        return [scan.stamp for scan in open_recording(two_sensors, ReaderConfig(**options)).scans(faults=faults)]
+        return [scan.stamp for scan in open_recording(path, ReaderConfig(**options)).scans(faults=faults)]
 
     faults = Faults()
     assert stamps(faults) == [ns / 10**9 for ns in stamps_ns(8)[::2]]

@@ -254,10 +254,11 @@ def test_a_stamp_file_comes_first(tmp_path, rng, name, above):
         (["a1", "a2", "a3"], "0.5\n1.5\n2.5\n3.5\n", [0.5, 1.5, 2.5], "4 stamps for 3 scans; the first are taken."),
         (["000001", "000003"], "0.0\n0.1\n0.25\n0.35\n0.45\n", [0.1, 0.35], "5 stamps for 2 scans; each takes"),
         (["a1", "a2", "a3"], "0\n100\n200\n", [0.0, 100.0, 200.0], "100 s apart"),
+        (["a1", "a2", "a3", "a4"], "1.0\n1.5\n1.5\n2.5\n", [1.0, 1.5, 2.0, 2.5], "1 stamp of times.txt interpolated"),
     ],
-    ids=["too few", "too many", "numbered scans", "milliseconds"],
+    ids=["too few", "too many", "numbered scans", "milliseconds", "repeated"],
 )
-def test_stamps_of_another_number_than_the_scans_or_unit_are_a_warning(tmp_path, rng, names, lines, stamps, warning):
+def test_stamps_that_do_not_go_with_the_scans_are_a_warning(tmp_path, rng, names, lines, stamps, warning):
     _write_numbered(tmp_path, rng, [f"{name}.bin" for name in names])
     (tmp_path / "times.txt").write_text(lines)
     recording = open_recording(tmp_path)
@@ -275,14 +276,6 @@ def test_stamp_file_formats(tmp_path):
         (tmp_path / "times.txt").write_text(f"0.0\n{wrong}\n")
         with pytest.raises(InputError, match="at line 2"):
             read_stamps(tmp_path / "times.txt")
-
-
-def test_stamps_that_do_not_increase_are_interpolated(tmp_path, rng):
-    _write_numbered(tmp_path, rng, [f"{i}.bin" for i in range(4)])
-    (tmp_path / "times.txt").write_text("1.0\n1.5\n1.5\n2.5\n")
-    recording = open_recording(tmp_path)
-    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [1.0, 1.5, 2.0, 2.5])
-    assert any("1 stamp of times.txt" in note for note in recording.describe().notes)
 
 
 @pytest.mark.parametrize("scans", [["0.bin", "1.bin"], ["scan_1.ply", "scan_2.ply"]])

@@ -90,13 +90,6 @@ def test_a_name_that_is_misspelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert refused(Path("record")).startswith("record: no such file or folder; did you mean recordings?")
 
 
-@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
-def test_an_empty_bag(tmp_path: Path, suffix: str) -> None:
-    write(tmp_path / f"drive{suffix}", content=b"")
-    with pytest.raises(InputError, match="is empty, 0 bytes; copy the bag again"):
-        open_recording(tmp_path / f"drive{suffix}")
-
-
 @pytest.mark.parametrize(
     ("name", "module", "remedy"),
     [

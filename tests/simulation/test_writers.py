@@ -12,7 +12,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, transform_points
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.published.kitti_files import read_calibration, read_tr
+from lidarslam.datasets.published.kitti import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.bag_writer import DRIVERS, MessageSerializer
 from lidarslam.simulation.recorder import CLOCK_START_NS, Rig, SimulatedScan, clock_ns

@@ -17,8 +17,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key, table_reader
 from lidarslam.datasets.imu_samples import IMU_FILE, read_imu_csv
 from lidarslam.datasets.point_table import RawCloud, raw_cloud
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import CloudRecording, FileRecording, find_truth_file, first_file
+from lidarslam.datasets.recording import CloudRecording, FileRecording, Recording, find_truth_file, first_file
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S
 from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate, stamps_from_names
 
@@ -161,7 +160,7 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         starts = sorted({int(index) for index in np.linspace(0, max(0, len(self) - 2), _PAIRS)})
         return (range(first, min(first + 2, len(self))) for first in starts)
 
-    @property
+    @cached_property
     def _period_s(self) -> float | None:
         rate = scan_rate(self.stamps)
         return None if rate is None else 1.0 / rate

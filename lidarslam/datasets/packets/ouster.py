@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.stored_recording import PacketRecording
+from lidarslam.datasets.recording import PacketRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # A sensor's metadata is some tens of kilobytes of JSON with the beams' angles.
@@ -71,7 +71,7 @@ class OusterRecording(PacketRecording):
         rings = np.broadcast_to(np.arange(len(ranges))[:, np.newaxis], ranges.shape)
         # Columns one after the other, in the order of firing.
         intensity = next((frame.field(name).T for name in _INTENSITIES if frame.has_field(name)), None)
-        times = offsets if self._has_times else None
+        times = offsets if self._point_time else None
         return Scan.from_raw(points.transpose(1, 0, 2), first_ns / 1e9, times, rings.T, intensity)
 
     def _fields(self, item: Any) -> tuple[PointField, ...]:
@@ -107,10 +107,10 @@ def read_sensor(text: str) -> Any:
 
 def frames_of_packets(sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
     """The library's LidarFrames of the packets of a sensor, in the order of recording; damaged packets are left out."""
-    from ouster.sdk.core import FrameBatcher, LidarFrame, LidarPacket
+    from ouster.sdk.core import FrameBatcher, LidarFrame
 
     batcher, frame, is_begun = FrameBatcher(sensor), LidarFrame(sensor), False
-    for packet in _packets(LidarPacket, "lidar_packet_size", sensor, contents):
+    for packet in packets_of("lidar", sensor, contents):
         is_begun = True
         if batcher.batch(packet, frame):
             yield frame
@@ -119,21 +119,15 @@ def frames_of_packets(sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
         yield frame
 
 
-def imu_packets(sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
-    """The library's ImuPackets of a sensor; damaged ones are left out."""
-    from ouster.sdk.core import ImuPacket
+def packets_of(kind: Literal["lidar", "imu"], sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
+    """The library's LidarPackets or ImuPackets of a sensor; damaged ones are left out."""
+    from ouster.sdk.core import ImuPacket, LidarPacket, PacketFormat
 
-    return _packets(ImuPacket, "imu_packet_size", sensor, contents)
-
-
-def _packets(kind: Any, size_name: str, sensor: Any, contents: Iterable[bytes]) -> Iterator[Any]:
-    from ouster.sdk.core import PacketFormat
-
-    layout = PacketFormat(sensor)
-    size = getattr(layout, size_name)
+    layout, make = PacketFormat(sensor), {"lidar": LidarPacket, "imu": ImuPacket}[kind]
+    size = getattr(layout, f"{kind}_packet_size")
     for content in contents:
         if len(content) >= size:  # early drivers added a byte
-            packet = kind(layout)
+            packet = make(layout)
             packet.buf[:] = np.frombuffer(content, np.uint8, size)
             yield packet
 
@@ -174,7 +168,7 @@ class OusterFile(OusterRecording):
         last = next(self._scans(range(max(0, count - 1), count), Faults()), None)
         return count, 0.0 if last is None else last.stamp
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Any]:  # noqa: ARG002
         of_sensor = self._frame_sets.single(0)
         stop = min(wanted.stop, len(of_sensor))
         frame_sets = of_sensor[wanted.start : stop : wanted.step] if wanted.start < stop else ()

@@ -13,8 +13,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
 from lidarslam.datasets.point_table import PointField, fields_of, raw_cloud
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import PacketRecording
+from lidarslam.datasets.recording import PacketRecording, Recording
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 # Beyond the range of any model; the library's own limit is less than that of some.
@@ -29,12 +28,12 @@ class VelodyneCapture(PacketRecording):
     library = "velodyne_decoder", "packets of a Velodyne"
     point_time = PointTimeModel("time", "s", "relative")
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[_StampedCloud]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[_StampedCloud]:  # noqa: ARG002
         return islice(self._clouds(), wanted.start, wanted.stop, wanted.step)
 
     def _read(self, item: _StampedCloud, faults: Faults) -> Scan:  # noqa: ARG002
         stamp, table = item
-        return raw_cloud(table).scan(stamp, table["time"].astype(np.float64) if self._has_times else None)
+        return raw_cloud(table).scan(stamp, table["time"].astype(np.float64) if self._point_time else None)
 
     def _clouds(self) -> Iterator[_StampedCloud]:
         import velodyne_decoder

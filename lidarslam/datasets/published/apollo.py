@@ -11,8 +11,7 @@ from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
 from lidarslam.datasets.published.stamped_files import poses_wxyz
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import find_sequence
+from lidarslam.datasets.recording import Recording, find_sequence
 from lidarslam.datasets.times.stamps import increasing_rows
 
 _COLUMNS = 9

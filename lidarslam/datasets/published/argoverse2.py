@@ -19,7 +19,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.stamped_files import increasing, poses_wxyz
-from lidarslam.datasets.stored_recording import FileRecording, first_file
+from lidarslam.datasets.recording import FileRecording, first_file
 
 _NANOSECOND = 1e-9
 _POINT = ("x", "y", "z", "intensity", "laser_number")
@@ -42,6 +42,12 @@ class Argoverse2Recording(FileRecording):
         super().__init__(folder, config, files)
         self.stamps = np.array([int(path.stem) for path in files]) * _NANOSECOND
         self._truth_path = first_file((folder,), "city_SE3_egovehicle.feather")
+        self._calibration = folder / "calibration" / "egovehicle_SE3_sensor.feather"
+        if not self._calibration.is_file():
+            self.warnings = (
+                "There is no calibration/egovehicle_SE3_sensor.feather; points and poses are in the vehicle's frame,"
+                " not that of the upper LiDAR.",
+            )
 
     @property
     def name(self) -> str:
@@ -49,10 +55,10 @@ class Argoverse2Recording(FileRecording):
         return f"argoverse2_{self._source.resolve().name.partition('-')[0]}"
 
     @cached_property
-    def _T_ego_lidar(self) -> FloatArray | None:
-        path = self._source / "calibration" / "egovehicle_SE3_sensor.feather"
+    def _T_ego_lidar(self) -> FloatArray:
+        path = self._calibration
         if not path.is_file():
-            return None
+            return np.eye(4)
         sensors = _read_columns(path, ("sensor_name", *_POSITION, *_QUATERNION))
         rows = np.flatnonzero(sensors["sensor_name"] == _SENSOR)
         if len(rows) != 1:
@@ -69,32 +75,20 @@ class Argoverse2Recording(FileRecording):
         table = _read_columns(path, ("timestamp_ns", *_POSITION, *_QUATERNION))
         stamps, T_world_ego = table["timestamp_ns"].astype(np.float64) * _NANOSECOND, _poses(path, table)
         order = np.argsort(stamps, kind="stable")
-        T_world_lidar = T_world_ego if self._T_ego_lidar is None else T_world_ego @ self._T_ego_lidar
-        return increasing(stamps[order], T_world_lidar[order])
+        return increasing(stamps[order], T_world_ego[order] @ self._T_ego_lidar)
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         table = _read_columns(self._files[index], _POINT)
         points = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
-        if self._T_ego_lidar is not None:
-            missing = ~points.any(axis=1)
-            points = transform_points(inverse(self._T_ego_lidar), points)
-            points[missing] = 0.0
+        missing = ~points.any(axis=1)
+        points = transform_points(inverse(self._T_ego_lidar), points)
+        points[missing] = 0.0
         stamp = float(self.stamps[index])
         return Scan.from_raw(points, stamp, rings=table["laser_number"], intensities=table["intensity"])
 
     def _fields(self, index: int) -> tuple[PointField, ...]:
         table = _read_columns(self._files[index], _POINT)
         return tuple(PointField(name, str(values.dtype)) for name, values in table.items())
-
-    @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """A missing calibration."""
-        if self._T_ego_lidar is not None:
-            return ()
-        return (
-            "There is no calibration/egovehicle_SE3_sensor.feather; points and poses are in the vehicle's frame,"
-            " not that of the upper LiDAR.",
-        )
 
 
 open_recording = Argoverse2Recording

@@ -21,8 +21,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.catalogue import CATALOGUE
-from lidarslam.datasets.recording import ImuSummary, Recording
-from lidarslam.datasets.stored_recording import StoredRecording
+from lidarslam.datasets.recording import ImuSummary, Recording, StoredRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows
 
@@ -131,6 +130,7 @@ class EvalioRecording(StoredRecording):
 
     reader = "evalio"
     _point_time = PointTimeModel("t", "ns", "relative")
+    _stored = tuple(PointField(name, kind) for name, kind in _FIELDS)
 
     def __init__(self, folder: Path, config: ReaderConfig, sequence: Any) -> None:
         super().__init__(folder, config)
@@ -217,7 +217,7 @@ class EvalioRecording(StoredRecording):
                 number = sum(1 for _ in iterator.imu_iter())
         return ImuSummary(f"{parameters.brand} {parameters.model}", number, float(parameters.rate), True)
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Scan]:
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Scan]:
         given = 0
         with self._reading("the scans"):
             measurements = self._sequence.data_iter().lidar_iter()
@@ -227,7 +227,7 @@ class EvalioRecording(StoredRecording):
                     measurement = next(measurements)
                     scan = _scan(measurement) if index in wanted else None
             except InputError as error:
-                if strict or not given:
+                if faults.strict or not given:
                     raise
                 faults.leave_out(_UNREADABLE, str(error), len(wanted) - given)
                 return
@@ -237,9 +237,6 @@ class EvalioRecording(StoredRecording):
 
     def _read(self, item: Scan, faults: Faults) -> Scan:  # noqa: ARG002
         return item
-
-    def _fields(self, item: Scan) -> tuple[PointField, ...]:  # noqa: ARG002
-        return tuple(PointField(name, kind) for name, kind in _FIELDS)
 
     def _last_stamp(self, first: Scan) -> float:
         return float(first.stamp + (len(self) - 1) / self._sequence.lidar_params().rate)

@@ -18,13 +18,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.scan_files import read_bin
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.stamped_files import (
-    StampedRecording,
-    increasing,
-    poses_of_rows,
-    read_table,
-)
-from lidarslam.datasets.stored_recording import first_file
+from lidarslam.datasets.published.stamped_files import StampedRecording, increasing, poses_of_rows, read_table
+from lidarslam.datasets.recording import first_file
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 _LASERS, _COLUMNS, _SWEEP_S = 64, 1024, 0.1
@@ -44,14 +39,13 @@ class MulRanRecording(StampedRecording):
     reader = "mulran"
     scan_folder = "Ouster"
     imu_name = "xsens_imu.csv"
+    point_time = PointTimeModel("column", "s", "relative")
     _notes = ("A scan's name is taken for the start of its sweep; the data set does not say which instant it is.",)
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         super().__init__(folder, config)
         self._folders = folder, folder / "sensor_data"
         self._truth_path = first_file(self._folders, "global_pose.csv")
-        self._has_times = config.time_reference != "none"
-        self._point_time = PointTimeModel("column", "s", "relative") if self._has_times else None
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -77,10 +71,10 @@ class MulRanRecording(StampedRecording):
     def _read(self, index: int, faults: Faults) -> Scan:
         rows = read_bin(self._files[index])
         offsets = rings = None
-        if self._has_times and len(rows) == _LASERS * _COLUMNS:
+        if self._point_time and len(rows) == _LASERS * _COLUMNS:
             number = np.arange(len(rows))
             offsets, rings = _SWEEP_S / _COLUMNS * (number // _LASERS), number % _LASERS
-        elif self._has_times:
+        elif self._point_time:
             faults.note(NO_POINT_TIME, str(self._files[index]))
         return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, rings, rows[:, 3])
 

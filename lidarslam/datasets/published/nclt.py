@@ -20,8 +20,9 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bytes
 from lidarslam.datasets.imu_samples import usable_samples
+from lidarslam.datasets.point_table import fields_of
 from lidarslam.datasets.published.stamped_files import StampedRecording, increasing, read_table
-from lidarslam.datasets.stored_recording import first_file
+from lidarslam.datasets.recording import first_file
 
 _POINT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
 _STEP_M, _ORIGIN_M = 0.005, -100.0
@@ -39,7 +40,7 @@ class NcltRecording(StampedRecording):
     reader = "nclt"
     scan_folder = "velodyne_sync"
     imu_name = "ms25.csv"
-    _stored = tuple((name, str(_POINT[name])) for name in _POINT.names or ())
+    _stored = fields_of(np.empty(0, _POINT))
     _notes = ("Points have no times in this layout. The body's axes are turned so that z points up.",)
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:

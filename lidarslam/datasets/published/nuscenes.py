@@ -20,9 +20,9 @@ from lidarslam.core.json_text import parse_json, read_json
 from lidarslam.core.text import stays_below
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_wxyz
-from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stored_recording import choose_sequence
+from lidarslam.datasets.recording import KITTI_FIELDS, Recording, choose_sequence
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 _LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
@@ -65,7 +65,7 @@ class NuScenesRecording(BinRecording):
     """One scene, given by its name and token: its sweeps in the order of time, samples (key frames) among them."""
 
     reader = "nuscenes"
-    _stored = tuple((name, "float32") for name in ("x", "y", "z", "intensity", "ring"))
+    _stored = tuple(PointField(name, "float32") for name in (*KITTI_FIELDS, "ring"))
 
     def __init__(self, root: Path, config: ReaderConfig, scene: str, version: Path, token: str) -> None:
         tables = version / "sample_data.json"

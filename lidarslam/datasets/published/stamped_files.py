@@ -13,20 +13,21 @@ from lidarslam.core.trajectory import Trajectory, parse_numbers
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import read_bin
-from lidarslam.datasets.stored_recording import FileRecording
+from lidarslam.datasets.recording import FileRecording
 from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
 
 
 class BinRecording(FileRecording):
-    """A folder of .bin scans: x, y, z, intensity and perhaps a ring. A reader adds the stamps, and times of points."""
+    """A folder of .bin scans: x, y, z, intensity and perhaps a ring. A reader adds the stamps, and points' times."""
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         rows = read_bin(self._files[index], len(self._stored))
         rings = rows[:, 4] if len(self._stored) > 4 else None
-        return Scan.from_raw(rows[:, :3], self.stamps[index], self._offsets(rows, index), rings, rows[:, 3])
+        offsets = self._offsets(rows, index) if self._point_time else None
+        return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, rings, rows[:, 3])
 
-    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray | None:  # noqa: ARG002
-        return None
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:
+        raise NotImplementedError
 
 
 class StampedRecording(FileRecording):

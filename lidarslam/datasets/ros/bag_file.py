@@ -28,9 +28,8 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.point_table import RawCloud
-from lidarslam.datasets.recording import Topic
+from lidarslam.datasets.recording import Topic, storage_files
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
-from lidarslam.datasets.stored_recording import storage_files
 
 Recovered = tuple[str, str, int, bytes]
 """Topic, type as in ROS 2, time of recording in nanoseconds, and bytes of a message."""

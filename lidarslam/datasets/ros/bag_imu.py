@@ -13,7 +13,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.text import count
-from lidarslam.datasets.imu_samples import summarise, usable_samples
+from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.recording import ImuSummary, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import (
@@ -97,29 +97,22 @@ class BagImu:
         if self._topic is None:
             return None
         first = self._decoded(islice(self._bag.messages(self._topic), _SAMPLES_LOOKED_AT))
-        found = summarise(self._topic.name, first)
-        return None if found is None else replace(found, samples=self._topic.messages)
+        if first is None:
+            return None
+        return replace(ImuSummary.of(self._topic.name, first), samples=self._topic.messages)
 
     def _decoded(self, messages: Iterator[BagMessage]) -> ImuSamples | None:
-        sound: list[BagMessage] = []
-        rows: list[FloatArray] = []
-        damaged = 0
-        for message in messages:
-            numbers = None if message.damage is not None else imu_numbers(message.raw, self._bag.ros2)
-            if numbers is None:
-                damaged += 1
-            else:
-                sound.append(message)
-                rows.append(numbers)
+        found = [(m, None if m.damage is not None else imu_numbers(m.raw, self._bag.ros2)) for m in messages]
+        sound = [message for message, numbers in found if numbers is not None]
         if not sound:
             return None
         source = find_stamp_source(sound) if self._stamps.from_header else self._stamps
         stamps = np.array([source.stamp(message) for message in sound])
         stamps[stamps <= source.before_first] = np.nan
         T_lidar_imu, notes = self._extrinsic(sound[0].frame_id)
-        if damaged:
+        if damaged := len(found) - len(sound):
             notes = (*notes, f"{count(damaged, 'damaged IMU message')} left out.")
-        table = np.stack(rows)
+        table = np.stack([numbers for _, numbers in found if numbers is not None])
         return usable_samples(stamps, table[:, ANGULAR_VELOCITY], table[:, ACCELERATION], T_lidar_imu, notes)
 
     def _extrinsic(self, frame_id: str) -> tuple[FloatArray | None, tuple[str, ...]]:

@@ -129,27 +129,16 @@ def behind_header(raw: bytes, ros2: bool, alignment: int) -> tuple[ByteOrder, in
 
 def decode_custom_message(raw: bytes, ros2: bool) -> RawCloud:
     """Decode a serialised CustomMsg; the times are nanoseconds of a clock, `timebase + offset_time`, as uint64."""
-    try:
-        # timebase, point_num, lidar_id, rsvd[3], number of points, points
-        order, start = behind_header(raw, ros2, 8)
-        timebase, count = struct.unpack_from(f"{order}Q8xI", raw, start)
-    except struct.error as error:
-        raise InputError(f"a Livox CustomMsg of {len(raw)} bytes ends too early ({error})") from error
-    cloud = raw_cloud(_records("a Livox CustomMsg", "points", raw, start + 20, count, _POINT.newbyteorder(order), ros2))
-    offsets = np.asarray(cloud.times)
-    return replace(cloud, times=offsets.astype(np.uint64) + np.uint64(timebase))
+    # timebase, point_num, lidar_id, rsvd[3], number of points
+    (timebase, _), points = _records("a Livox CustomMsg", "points", raw, ros2, "Q8xI", _POINT)
+    cloud = raw_cloud(points)
+    return replace(cloud, times=np.asarray(cloud.times).astype(np.uint64) + np.uint64(timebase))
 
 
 def decode_scan_message(raw: bytes, ros2: bool) -> RawCloud:
     """Decode a serialised velodyne_msgs/VelodyneScan; the times are nanoseconds of the host's clock, as int64."""
-    # The number of packets, and the packets; in CDR all are aligned to four bytes.
-    try:
-        order, start = behind_header(raw, ros2, 4)
-        (count,) = struct.unpack_from(order + "I", raw, start)
-    except struct.error as error:
-        raise InputError(f"a VelodyneScan of {len(raw)} bytes ends too early ({error})") from error
-    packets = _records("a VelodyneScan", "packets", raw, start + 4, count, _PACKET.newbyteorder(order), ros2)
-    if not count:
+    _, packets = _records("a VelodyneScan", "packets", raw, ros2, "I", _PACKET)
+    if not len(packets):
         return RawCloud(np.empty((0, 3)), "time", np.empty(0, np.int64))
     stamp, table = decode_sweep([(int(p["sec"]) + int(p["nsec"]) / 1e9, p["data"].tobytes()) for p in packets])
     times = round(stamp * 1e9) + np.round(table["time"].astype(np.float64) * 1e9).astype(np.int64)
@@ -157,14 +146,23 @@ def decode_scan_message(raw: bytes, ros2: bool) -> RawCloud:
 
 
 def _records(
-    message: str, noun: str, raw: bytes, start: int, count: int, record: np.dtype[Any], ros2: bool
-) -> NDArray[np.void]:
-    """(count,) records of a message, in CDR aligned to four bytes each; the last may lack its padding."""
+    message: str, noun: str, raw: bytes, ros2: bool, head: str, record: np.dtype[Any]
+) -> tuple[tuple[int, ...], NDArray[np.void]]:
+    """The values between a message's header and its records, in struct's letters, and the records (N,).
+
+    The last of the values is N. In CDR records are aligned to four bytes each; the last may lack its padding.
+    """
+    try:
+        order, start = behind_header(raw, ros2, struct.calcsize(head[0]))
+        values = struct.unpack_from(order + head, raw, start)
+    except struct.error as error:
+        raise InputError(f"{message} of {len(raw)} bytes ends too early ({error})") from error
+    start, count = start + struct.calcsize(order + head), values[-1]
     step = record.itemsize + (-record.itemsize % 4 if ros2 else 0)
     needed = start + (count - 1) * step + record.itemsize if count else 0
     if len(raw) < needed:
         raise InputError(f"{message} of {count} {noun} needs {needed} bytes, it has {len(raw)}")
-    return np.ndarray((count,), record, raw, offset=start, strides=(step,))
+    return values, np.ndarray((count,), record.newbyteorder(order), raw, offset=start, strides=(step,))
 
 
 def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> RawCloud:

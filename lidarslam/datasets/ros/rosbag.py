@@ -17,11 +17,20 @@ from lidarslam.datasets.packets.ouster import (
     OusterRecording,
     find_metadata,
     frames_of_packets,
-    imu_packets,
+    packets_of,
     read_sensor,
 )
 from lidarslam.datasets.point_table import RawCloud
-from lidarslam.datasets.recording import ImuSummary, Recording, SeveralTopicsError, Topic
+from lidarslam.datasets.recording import (
+    CloudRecording,
+    ImuSummary,
+    Recording,
+    SeveralTopicsError,
+    Topic,
+    require,
+    storage_files,
+    truth_beside,
+)
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import BagImu
 from lidarslam.datasets.ros.bag_message import (
@@ -34,7 +43,6 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
-from lidarslam.datasets.stored_recording import CloudRecording, require, storage_files, truth_beside
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _STRING_TYPE = "std_msgs/msg/String"
@@ -110,10 +118,10 @@ class BagRecording(CloudRecording):
     def _notes(self) -> tuple[str, ...]:
         return self._timing.notes
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
-        return in_stamp_order(self._wanted(wanted, faults, strict), self._stamp, faults)
+    def _items(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
+        return in_stamp_order(self._wanted(wanted, faults), self._stamp, faults)
 
-    def _wanted(self, wanted: range, faults: Faults, strict: bool) -> Iterator[BagMessage]:
+    def _wanted(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
         other_sensor = (
             f"scans were left out: they come from another sensor than {self._frame_id!r}; for that one set"
             " reader.frame_id"
@@ -122,8 +130,6 @@ class BagRecording(CloudRecording):
             if index not in wanted:
                 continue
             if message.damage is not None:
-                if strict:
-                    raise InputError(message.damage)
                 faults.unreadable(InputError(message.damage))
             elif message.frame_id != self._frame_id:
                 faults.leave_out(other_sensor, repr(message.frame_id))
@@ -236,12 +242,12 @@ class OusterBag(OusterRecording):
             f" beside the bag as {self.name}.json"
         )
 
-    def _items(self, wanted: range, faults: Faults, strict: bool) -> Iterator[Any]:  # noqa: ARG002
+    def _items(self, wanted: range, faults: Faults) -> Iterator[Any]:  # noqa: ARG002
         contents = self._contents(self._topic.name.rpartition("/")[2], self._topic.message_type)
         return islice(frames_of_packets(self.sensor, contents), wanted.start, wanted.stop, wanted.step)
 
     def _packets_of_imu(self) -> Iterator[Any]:
-        return imu_packets(self.sensor, self._contents("imu_packets", self._topic.message_type))
+        return packets_of("imu", self.sensor, self._contents("imu_packets", self._topic.message_type))
 
     def _contents(self, name: str, message_type: str) -> Iterator[bytes]:
         """The content of the messages of a topic other than that of the packets: a single string or array of bytes."""

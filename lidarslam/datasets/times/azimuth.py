@@ -96,7 +96,8 @@ def _ring_by_ring(points: FloatArray, rings: NDArray[np.generic]) -> FloatArray 
     full = [path for path in paths.values() if _is_turn(path)]
     if not full or sum(len(path) for path in full) < _SHARE_IN_RINGS * len(points):
         return None
-    start = float(np.median([_nearest_turn(path[0], full[0][0]) for path in full]))
+    firsts = np.array([path[0] for path in full])
+    start = float(np.median(firsts + 360.0 * np.round((firsts[0] - firsts) / 360.0)))  # all of one turn
     turned = np.empty(len(points))
     for ring, path in paths.items():
         # The middle decides which turn it is: returns at the start may be missing.
@@ -110,10 +111,6 @@ def _is_turn(path: FloatArray) -> bool:
     """Whether a ring's azimuth, unwrapped in the direction of turning, runs round the circle once."""
     is_even = len(path) > 1 and float(np.mean(np.diff(path) > 0.0)) >= _SHARE
     return is_even and _TURN_DEG[0] - _MISSING_DEG < path[-1] - path[0] < _TURN_DEG[1]
-
-
-def _nearest_turn(angle: float, reference: float) -> float:
-    return float(angle + 360.0 * np.round((reference - angle) / 360.0))
 
 
 def offsets_from_order(cloud: RawCloud, sweep_s: float) -> FloatArray | None:

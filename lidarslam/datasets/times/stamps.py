@@ -189,7 +189,11 @@ def in_stamp_order(
             faults.leave_out(_NOT_AFTER, f"{where}, after {latest:.9f}")
             behind = [*(behind if behind and stamp > behind[-1] else []), stamp]
             if len(behind) >= _SET_BACK and latest - stamp > _DOUBTFUL_STEP_S and not may_be_set_back:
-                raise _set_back(number - len(behind), latest - behind[0])
+                raise InputError(
+                    f"the stamps run backwards from scan number {number - len(behind)} on, by {latest - behind[0]:.1f}"
+                    " s, as if a clock had been set back; run what comes before and after apart, with --stop and"
+                    " --start"
+                )
             continue
         behind = []
         if doubtful and not _leads_on(ahead, latest):
@@ -218,10 +222,3 @@ def _leads_on(ahead: FloatArray, latest: float) -> bool:
         ahead[np.abs(ahead - ordered[(len(ordered) - 1) // 2]) > far_s] = np.nan
     ahead[ahead <= latest] = np.nan
     return bool(increasing_rows(ahead)[0])
-
-
-def _set_back(first: int, by_s: float) -> InputError:
-    return InputError(
-        f"the stamps run backwards from scan number {first} on, by {by_s:.1f} s, as if a clock had been set back; run"
-        " what comes before and after apart, with --stop and --start"
-    )

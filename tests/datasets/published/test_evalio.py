@@ -1,4 +1,4 @@
-"""evalio's own readers over bags and truth written in the layouts of some of its data sets."""
+"""evalio's own readers over bags, binary scans and truth written in the layouts of some of its data sets."""
 
 import os
 import subprocess
@@ -25,6 +25,7 @@ PERIOD_NS, IMU_PERIOD_NS = 10**8, 2_500_000
 HILTI_T_IMU_LIDAR = make_transform(
     Rotation.from_quat([0.7071068, -0.7071068, 0.0, 0.0]).as_matrix(), [-0.001, -0.00855, 0.055]
 )
+TRUTH = exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0])
 SPIRES_BAG = "1710406700_2024-03-14-08-58-21_0_blurred_filtered_compressed"
 
 
@@ -57,11 +58,11 @@ def evalio_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def make_sequence(evalio_data: Path, make_bag_kit: Callable[[str], Any]) -> Callable[[str], tuple[Path, Any]]:
-    """The folder DATASET/SEQUENCE, and a kit that writes bags of ROS 1 to it."""
+def make_sequence(evalio_data: Path, make_bag_kit: Callable[[str], Any]) -> Callable[..., tuple[Path, Any]]:
+    """The folder DATASET/SEQUENCE, and a kit that writes bags to it."""
 
-    def make(name: str) -> tuple[Path, Any]:
-        kit = make_bag_kit("bag")
+    def make(name: str, kind: str = "bag") -> tuple[Path, Any]:
+        kit = make_bag_kit(kind)
         kit.folder = evalio_data / name
         kit.folder.mkdir(parents=True)
         return kit.folder, kit
@@ -70,7 +71,7 @@ def make_sequence(evalio_data: Path, make_bag_kit: Callable[[str], Any]) -> Call
 
 
 @pytest.fixture
-def hilti(make_sequence: Callable[[str], tuple[Path, Any]], make_sweep: Callable[..., Any]) -> SimpleNamespace:
+def hilti(make_sequence: Callable[..., tuple[Path, Any]], make_sweep: Callable[..., Any]) -> SimpleNamespace:
     """Three scans of basement_2; its columns hold the returns alone, in the order of firing."""
     folder, kit = make_sequence("hilti_2022/basement_2")
     sweeps, clouds = [], []
@@ -124,8 +125,7 @@ def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) 
         sweep.records[axis][sweep.records["x"] == 0.0] = 0.0
     messages = _one_scan(kit, sweep, "/os_cloud_node/points", "/os_cloud_node/imu")
     kit.write(messages, name="2021-07-01-10-40-50_0-stairs")
-    T = exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0])
-    values = ",".join([*map(repr, T[:3, 3].tolist()), *_quaternion(T).split()])
+    values = ",".join([*map(repr, TRUTH[:3, 3].tolist()), *_quaternion(TRUTH).split()])
     (folder / "gt-nc-stairs.csv").write_text(f"#sec,nsec,x,y,z,qx,qy,qz,qw\n1640000000,500000000,{values}\n")
 
     recording = open_recording(folder)
@@ -138,7 +138,7 @@ def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) 
     R = Rotation.from_quat([0.0032925, -0.004627, -0.0024302, 0.99998]).as_matrix()
     T_truth_lidar = make_transform(np.eye(3), R.T @ shift)
     assert recording.ground_truth.stamps == pytest.approx([1640000000.5])
-    np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], T @ T_truth_lidar, atol=1e-5)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], TRUTH @ T_truth_lidar, atol=1e-5)
 
 
 def test_enwide_has_true_positions_alone(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
@@ -171,11 +171,9 @@ def test_mcd_stamps_the_end_of_a_sweep(make_sequence: Any, make_sweep: Callable[
     assert recording.ground_truth.length_m == pytest.approx(2.0)
 
 
-def test_oxford_spires(evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]) -> None:
+def test_oxford_spires(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
     """A rosbag2, which the reader of bags would take too."""
-    folder = evalio_data / "oxford_spires" / "blenheim_palace_01"
-    folder.mkdir(parents=True)
-    kit = make_bag_kit("db3")
+    folder, kit = make_sequence("oxford_spires/blenheim_palace_01", "db3")
     sweep = make_sweep("hesai", START_NS, height=64, width=10)
     imu, _ = _imu_messages(kit, 5)
     clouds = [(START_NS, kit.cloud(sweep.records.T.copy().reshape(1, -1), START_NS))]
@@ -190,6 +188,70 @@ def test_oxford_spires(evalio_data: Path, make_bag_kit: Callable[[str], Any], ma
     assert [len(scan) for scan in recording.scans()] == [len(sweep.points)]
     assert recording.ground_truth.length_m == pytest.approx(1.0, abs=1e-3)  # evalio drops the first pose
     assert len(recording.imu) == 5
+
+
+OUSTER = [*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("t", "<u4")]
+OUSTER += [(name, "<u2") for name in ("reflectivity", "ring", "ambient")]
+
+
+@pytest.mark.slow
+def test_helipr(make_sequence: Any, rng: np.random.Generator) -> None:
+    """The truth is of the LiDAR already, with stamps in nanoseconds."""
+    folder, _ = make_sequence("helipr/kaist_05")
+    (folder / "Ouster").mkdir()
+    cloud = np.zeros(128 * 1024, OUSTER)
+    for name in ("x", "y", "z", "intensity"):
+        cloud[name] = rng.uniform(1.0, 90.0, len(cloud))
+    cloud["t"] = np.tile(np.arange(1024) * 97_000, 128)
+    cloud["ring"] = np.repeat(np.arange(128), 1024)
+    cloud.tofile(folder / "Ouster" / f"{START_NS}.bin")
+    position = " ".join(map(repr, TRUTH[:3, 3].tolist()))
+    (folder / "Ouster_gt.txt").write_text(f"{START_NS} {position} {_quaternion(TRUTH)}\n")
+    sample = ",".join(["0"] * 10 + ["0.1", "0.2", "9.8", "0.01", "0.02", "0.03"])
+    (folder / "xsens_imu.csv").write_text("".join(f"{START_NS + k * 10**7},{sample}\n" for k in range(4)))
+
+    recording = open_recording(folder)
+    (scan,) = recording.scans()
+    assert scan.stamp == pytest.approx(START_NS * 1e-9, abs=1e-6)
+    assert len(scan) == len(cloud)
+    order, expected = np.lexsort(scan.points.T), np.lexsort([cloud["x"], cloud["y"], cloud["z"]])
+    np.testing.assert_array_equal(scan.points[order, 0], cloud["x"][expected])
+    np.testing.assert_array_equal(scan.rings[order], cloud["ring"][expected])
+    np.testing.assert_allclose(scan.time_offsets[order], cloud["t"][expected] * 1e-9)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, [TRUTH], atol=1e-6)
+    assert len(recording.imu) == 4
+    assert recording.imu.accelerations[0] == pytest.approx([0.1, 0.2, 9.8])
+
+
+def test_boreas(make_sequence: Any, rng: np.random.Generator) -> None:
+    """The IMU is there, without gravity, and is no IMU to us; the truth is of the car."""
+    folder, _ = make_sequence("boreas/glen_2021_03_23_12_43")
+    (folder / "lidar").mkdir()
+    (folder / "applanix").mkdir()
+    cloud = rng.uniform(1.0, 90.0, (256, 6)).astype("<f4")
+    cloud[:, 4] = np.tile(np.arange(128), 2)
+    cloud[:, 5] = np.repeat([0.0, 0.05], 128)
+    cloud.tofile(folder / "lidar" / f"{START_NS // 1000}.bin")
+    samples = "".join(f"{k}.5,0,0,0,0,0,0\n" for k in range(3))
+    (folder / "applanix" / "imu_raw.csv").write_text(f"GPSTime,...\n{samples}")
+    # The development kit turns by the negative angles.
+    angles = -Rotation.from_matrix(TRUTH[:3, :3]).as_euler("XYZ")
+    numbers = ",".join(map(repr, [*TRUTH[:3, 3].tolist(), 0.0, 0.0, 0.0, *angles.tolist()]))
+    poses = "".join(f"1640000000.{place},{numbers},0,0,0\n" for place in (25, 35))
+    (folder / "applanix" / "gps_post_process.csv").write_text(f"GPSTime,...\n{poses}")
+
+    recording = open_recording(folder)
+    (scan,) = recording.scans()
+    order, expected = np.lexsort(scan.points.T), np.lexsort(cloud[:, :3].T)
+    np.testing.assert_array_equal(scan.points[order], cloud[expected, :3])
+    np.testing.assert_array_equal(scan.rings[order], cloud[expected, 4])
+    np.testing.assert_allclose(scan.time_offsets[order], cloud[expected, 5], atol=1e-7)
+    assert recording.imu is None
+    # The published mounting of the LiDAR.
+    c, s = 0.7360555651493133, 0.6769211217083996
+    T_imu_lidar = make_transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [0.0, 0.0, 0.13])
+    expected_T = TRUTH @ T_imu_lidar
+    assert log(inverse(expected_T) @ recording.ground_truth.T_world_lidar[0]) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_what_is_not_downloaded_names_the_command(evalio_data: Path, tmp_path: Path) -> None:

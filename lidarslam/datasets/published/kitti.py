@@ -1,0 +1,443 @@
+"""KITTI: the odometry benchmark, drives of the raw data, and KITTI-360.
+
+Odometry: `sequences/NN/{velodyne/*.bin, times.txt, calib.txt}` and `poses/NN.txt`. The scans are motion compensated by
+the publishers. The poses are those of the left camera, `cam`; they are converted to the LiDAR's frame here, and nowhere
+else.
+
+Raw: `DATE/DATE_drive_NNNN_sync/{velodyne_points, oxts}`, synchronised. The scans are as measured, not motion
+compensated. The calibration files are in the date's folder above the drive.
+
+KITTI-360 (Liao et al., PAMI 2022): `data_3d_raw/..._sync/velodyne_points`, `data_poses`, `calibration`. The scans are
+as measured, too. As on KITTI's car, the laser turns clockwise from the rear and faces forward at the stamp, as the data
+set's own program for compensation assumes.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.files import bounded_lines
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, orthonormalize
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.text import count
+from lidarslam.core.trajectory import Trajectory, parse_numbers, read_kitti_poses
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.folders.scan_files import numbered_scans
+from lidarslam.datasets.imu_samples import usable_samples
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
+from lidarslam.datasets.recording import Recording, find_sequence, first_file
+from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
+from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps, scan_rate
+
+_POLE_DEG = 90.0
+_EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
+# Of a file of oxts.
+_COLUMNS = 30
+_POSITION_ACCURACY_COLUMN = 23
+# Of the unit's own axes; the columns behind them are of the level ones.
+_ACCELERATIONS, _ANGULAR_VELOCITIES = slice(11, 14), slice(17, 20)
+# Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
+_SWEEP_TOLERANCE = 0.25
+# Of KITTI-360.
+_SCANS, _POINTS = "data_3d_raw", "velodyne_points"
+
+
+def open_odometry(source: Path, config: ReaderConfig) -> Recording:
+    """Open a sequence of the benchmark: its root, with `config.sequence`, or one `sequences/NN` folder."""
+    return KittiOdometryRecording(find_sequence(source, source / "sequences", "velodyne", config.sequence), config)
+
+
+class KittiOdometryRecording(BinRecording):
+    """One sequence of the benchmark."""
+
+    reader = "kitti-odometry"
+    _notes = ("The scans are motion compensated by the publishers; they have no per-point time and need none.",)
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        files, self._numbers = numbered_scans(folder / "velodyne")
+        super().__init__(folder, config, files)
+        self._times = self._read_times()
+        self._rate_is_assumed = not len(self._times)
+        last = int(self._numbers[-1])
+        if (folder / "times.txt").is_file() and last >= len(self._times) < 2:
+            raise InputError(
+                f"{folder / 'times.txt'}: expected {last + 1} stamps, one for every scan up to {files[-1].name}, got"
+                f" {len(self._times)}; complete it, or remove it to use the rate"
+            )
+        self.stamps = self._stamps_of(self._numbers)
+        whole = folder.resolve()
+        poses = first_file((whole.parent.parent / "poses",), f"{whole.name}.txt")
+        self._pose_file = poses or first_file((whole,), "poses.txt")
+        self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
+
+    def _read_times(self) -> FloatArray:
+        path = self._source / "times.txt"
+        times = read_stamps(path) if path.is_file() else np.empty(0)
+        increasing = increasing_rows(times)
+        if not increasing.all():
+            raise InputError(
+                f"{path}: expected stamps that increase from line to line, those at line"
+                f" {int(np.argmin(increasing)) + 1} and perhaps others do not; mend it, or remove it to use the rate"
+            )
+        return times
+
+    def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
+        """The stamps (N,) of scans by their numbers; those beyond the last line continue at the median rate."""
+        if self._rate_is_assumed:
+            return numbers / self._config.rate_hz
+        last_line = len(self._times) - 1
+        beyond = np.maximum(numbers - last_line, 0)
+        period_s = float(np.median(np.diff(self._times))) if beyond.any() else 0.0
+        return np.asarray(self._times[np.minimum(numbers, last_line)] + period_s * beyond, dtype=np.float64)
+
+    @property
+    def name(self) -> str:
+        """Such as kitti_04."""
+        return f"kitti_{self._source.resolve().name}"
+
+    @cached_property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """The extrinsic calibration `Tr`, (4, 4); None without calib.txt."""
+        path = self._source / "calib.txt"
+        return read_tr(path) if path.is_file() else None
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of every pose with a stamp, also where the scan is absent."""
+        T_cam_lidar = self.T_cam_lidar
+        if self._pose_file is None or T_cam_lidar is None:
+            return None
+        T_cam0_cam = read_kitti_poses(self._pose_file)
+        if not self._rate_is_assumed:
+            T_cam0_cam = T_cam0_cam[: max(len(self._times), int(self._numbers[-1]) + 1)]
+        # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
+        T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
+        return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """Missing and superfluous stamps, scans and poses."""
+        return tuple(self._warnings())
+
+    def _warnings(self) -> Iterator[str]:
+        last, lines, poses = int(self._numbers[-1]), len(self._times), 0
+        if self._rate_is_assumed:
+            yield assumed_rate("There is no times.txt", self._config)
+        if len(self) <= last - self._numbers[0]:
+            yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
+        if self._pose_file is not None and self._truth_path is None:
+            yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
+        elif self._pose_file is not None:
+            with suppress(InputError):  # damaged, an error of `ground_truth`
+                poses = len(read_kitti_poses(self._pose_file))
+        up_to = f"for the scans up to number {last}"
+        if 0 < lines <= last:
+            yield f"times.txt has only {lines} lines {up_to}; the missing stamps continue at its rate."
+        if 0 < poses <= last:
+            yield f"{self._pose_file} has only {poses} poses {up_to}."
+        counts = ((lines, f"times.txt has {lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
+        if more := [said for number, said in counts if number > last + 1]:
+            yield f"{' and '.join(more)} {up_to}; those beyond are not used."
+
+
+class OxtsPoses(NamedTuple):
+    """The poses of the GPS/IMU unit."""
+
+    stamps: FloatArray  # (N,) seconds on the clock of the scans, NaN where there is none
+    T_enu_imu: FloatArray  # (N, 4, 4) in an east-north-up frame; imu is x forward, y left, z up
+    accuracy_m: FloatArray  # (N,) standard deviation of the position as the unit itself states it
+    angular_velocities: FloatArray  # (N, 3) rad/s
+    accelerations: FloatArray  # (N, 3) specific force, m/s^2
+    geodetic: FloatArray  # (N, 3) latitude and longitude in degrees, altitude in metres
+
+
+def oxts_poses(rows: FloatArray) -> FloatArray:
+    """T_enu_imu (N, 4, 4) of rows (N, >=6): latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians).
+
+    The position is the Mercator projection scaled by the cosine of the first latitude, so that metres are metres
+    there; the rotation is Rz(yaw) Ry(pitch) Rx(roll), yaw counted from east (Geiger et al., IJRR 2013, and the
+    raw development kit).
+    """
+    latitude, longitude = np.deg2rad(rows[:, 0]), np.deg2rad(rows[:, 1])
+    scaled_radius = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    east = scaled_radius * longitude
+    north = scaled_radius * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+    R = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]]).as_matrix()
+    return make_transform(R, np.column_stack([east, north, rows[:, 2]]))
+
+
+def open_raw(source: Path, config: ReaderConfig) -> Recording:
+    """Open a `..._sync` drive folder."""
+    data = source / "velodyne_points" / "data"
+    if not data.is_dir():
+        raise InputError(f"{source}: expected a drive folder with velodyne_points/data in it, found none")
+    if any(data.glob("*.txt")) and not any(data.glob("*.bin")):
+        raise InputError(
+            f"{source}: holds scans as text, as the unsynchronised ..._extract drives do; expected .bin scans:"
+            " use the ..._sync drive of the same number"
+        )
+    return KittiRawRecording(source.resolve(), config)
+
+
+class KittiRawRecording(BinRecording):
+    """One drive of the raw data."""
+
+    reader = "kitti-raw"
+    imu_name = "oxts"
+    point_time = AZIMUTH_TIME
+
+    def __init__(self, drive: Path, config: ReaderConfig) -> None:
+        files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
+        super().__init__(drive, config, files)
+        self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config)
+        self.stamps = self._timing.stamps
+        self._rate_is_assumed = not self._timing.from_clock
+        first, last = self._numbers[0], self._numbers[-1]
+        gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
+        self.warnings = (*self._timing.notes, *gaps)
+
+    @cached_property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """LiDAR to the rectified left grey camera, (4, 4); None without both camera calibration files."""
+        T_cam_lidar, T_rect_cam = (self._calibration(f"calib_{name}_to_cam.txt") for name in ("velo", "cam"))
+        return None if T_cam_lidar is None or T_rect_cam is None else T_rect_cam @ T_cam_lidar
+
+    def _calibration(self, name: str) -> FloatArray | None:
+        path = self._source.parent / name
+        return read_raw_calibration(path) if path.is_file() else None
+
+    @cached_property
+    def oxts(self) -> OxtsPoses | None:
+        """The poses of `oxts/data`; None without the unit."""
+        folder = self._source / "oxts" / "data"
+        if not folder.is_dir():
+            return None
+        files, numbers = numbered_scans(folder, ".txt")
+        tables = [parse_numbers(path, _COLUMNS) for path in files]
+        for path, table in zip(files, tables, strict=True):
+            if len(table) != 1 or not np.isfinite(table[0, :6]).all() or not abs(table[0, 0]) < _POLE_DEG:
+                expected = f"one line of {_COLUMNS} numbers that begins with a latitude"
+                raise InputError(f"{path}: expected {expected}, got {len(table)} lines; copy the file again")
+        rows = np.concatenate(tables)
+        return OxtsPoses(
+            self._oxts_stamps(numbers),
+            oxts_poses(rows),
+            rows[:, _POSITION_ACCURACY_COLUMN],
+            rows[:, _ANGULAR_VELOCITIES],
+            rows[:, _ACCELERATIONS],
+            rows[:, :3],
+        )
+
+    def _oxts_stamps(self, numbers: NDArray[np.intp]) -> FloatArray:
+        """Stamps (N,) of the unit's poses, by their numbers, on the clock of the scans, NaN where there is none.
+
+        A row lies 11 to 23 ms after its scan's stamp, with jitter. Measured on the drives 0005 and 0009 against LiDAR
+        odometry: with rows at the scans' stamps, the forward motion deviates by 25 and 54 mm and the yaw by 0.049 and
+        0.010 degrees (standard deviations); with the rows' own stamps, by 15 and 12 mm, 0.018 and 0.008 degrees.
+        """
+        if not self._timing.from_clock:
+            return numbers / self._config.rate_hz
+        path = self._source / "oxts" / "timestamps.txt"
+        if path.is_file():
+            rows, table = numbers, read_stamps(path)
+        else:  # the stamps of the scans with the rows' numbers are used instead
+            rows = np.searchsorted(self._numbers, numbers)
+            rows = np.where(np.append(self._numbers, -1)[rows] == numbers, rows, len(self))
+            table = self.stamps
+        return np.append(table, np.nan)[np.minimum(rows, len(table))]
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of the GPS/IMU unit; the world is the LiDAR's frame at the first of these poses."""
+        oxts, T_lidar_imu = self.oxts, self._calibration("calib_imu_to_velo.txt")
+        if oxts is None or T_lidar_imu is None:
+            return None
+        truth = increasing(oxts.stamps, oxts.T_enu_imu @ inverse(T_lidar_imu))
+        return None if truth is None else truth.transformed(inverse(truth.T_world_lidar[0]))
+
+    @cached_property
+    def _truth_path(self) -> Path | None:
+        return None if self.ground_truth is None else self._source / "oxts"
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """Angular velocities and accelerations of the GPS/IMU unit, one for each camera image."""
+        oxts, T_lidar_imu = self.oxts, self._calibration("calib_imu_to_velo.txt")
+        if oxts is None:
+            return None
+        return usable_samples(oxts.stamps, oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
+
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:
+        before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
+        return offsets_from_azimuth(rows, float(before_s), float(after_s))
+
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        oxts, truth = self.oxts, self.ground_truth
+        if oxts is None:
+            return ("There is no oxts folder, so there is no ground truth.",)
+        if truth is None:
+            return (
+                "There is no calib_imu_to_velo.txt above the drive, so its oxts poses cannot be used as ground truth.",
+            )
+        median_m, left_out = float(np.median(oxts.accuracy_m)), len(oxts.stamps) - len(truth)
+        accuracy = f"The ground truth is GPS/IMU; it states its own position accuracy as {median_m:.2f} m (median)."
+        gaps = (f"{left_out} oxts rows without a stamp that increases were left out.",) if left_out else ()
+        return *gaps, accuracy
+
+
+def open_360(source: Path, config: ReaderConfig) -> Recording:
+    """Open a drive: the data set's root, with `config.sequence` such as 0003, or a folder in its data_3d_raw."""
+    drive = find_sequence(source, source / _SCANS, _POINTS, config.sequence, "drive")
+    return Kitti360Recording(drive.resolve(), config)
+
+
+class Kitti360Recording(BinRecording):
+    """One drive of KITTI-360."""
+
+    reader = "kitti-360"
+    point_time = AZIMUTH_TIME
+
+    def __init__(self, drive: Path, config: ReaderConfig) -> None:
+        files, self._numbers = numbered_scans(drive / _POINTS / "data")
+        super().__init__(drive, config, files)
+        timing = read_sweep_timing(drive / _POINTS, self._numbers, config)
+        self.stamps = timing.stamps
+        # There are no files of the sweeps' starts and ends, unlike in KITTI's raw data.
+        self.warnings = tuple(note for note in timing.notes if "sweeps" not in note)
+        self._sweep_s = 1.0 / (scan_rate(self.stamps) or config.rate_hz)
+        self._truth_path = first_file((drive.parent.parent / "data_poses" / drive.name,), "poses.txt")
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of the drive's poses, for the scans that have one; the world is the first one's LiDAR frame."""
+        path, T_pose_lidar = self._truth_path, self._T_pose_lidar
+        if path is None or T_pose_lidar is None:
+            return None
+        rows = read_table(path, 13)
+        rows = rows[np.isin(rows[:, 0], self._numbers)]
+        if not len(rows):
+            return None
+        T_world_lidar = poses_of_rows(rows[:, 1:]) @ T_pose_lidar
+        stamps = self.stamps[np.searchsorted(self._numbers, rows[:, 0])]
+        return increasing(stamps, inverse(T_world_lidar[0]) @ T_world_lidar)
+
+    @cached_property
+    def _T_pose_lidar(self) -> FloatArray | None:
+        folder = self._source.parent.parent / "calibration"
+        to_lidar, to_pose = folder / "calib_cam_to_velo.txt", folder / "calib_cam_to_pose.txt"
+        if not (to_lidar.is_file() and to_pose.is_file()):
+            return None
+        T_pose_cam, T_lidar_cam = read_calibration(to_pose).get("image_00"), parse_numbers(to_lidar, 12)
+        if T_pose_cam is None or len(T_pose_cam) != 12 or len(T_lidar_cam) != 1:
+            raise InputError(f"{folder}: expected 12 numbers in {to_lidar.name} and at `image_00:` in {to_pose.name}")
+        return poses_of_rows(T_pose_cam) @ inverse(poses_of_rows(T_lidar_cam[0]))
+
+    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:  # noqa: ARG002
+        return -self._sweep_s * np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2.0 * np.pi)
+
+    @cached_property
+    def _notes(self) -> tuple[str, ...]:
+        note = "Points are taken as they are: the correction of elevation that KITTI's scans get is not applied."
+        if self._truth_path is None or self._T_pose_lidar is not None:
+            return (note,)
+        return note, "There is no calibration folder beside data_3d_raw, so the poses cannot be used as ground truth."
+
+
+def read_calibration(path: Path) -> dict[str, FloatArray]:
+    """The arrays of a calibration file by name; lines without numbers, such as the date, are left out."""
+    arrays = {}
+    for line in bounded_lines(path):
+        name, _, values = line.partition(":")
+        try:
+            arrays[name.strip()] = np.array([float(word) for word in values.split()])
+        except ValueError:
+            continue
+    return arrays
+
+
+def _entry(path: Path, arrays: dict[str, FloatArray], name: str, count: int) -> FloatArray:
+    values = arrays.get(name)
+    if values is None or len(values) != count or not np.isfinite(values).all():
+        got = "no such line" if values is None else f"{len(values)} numbers"
+        raise InputError(f"{path}: expected a line `{name}:` with {count} numbers, got {got}")
+    return values
+
+
+def _rigid(path: Path, R: FloatArray, t: FloatArray) -> FloatArray:
+    """The transform (4, 4), re-orthonormalised: the files round to seven digits or fewer."""
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0.0:
+        raise InputError(f"{path}: holds a rotation matrix that is none; expected orthonormal rows, right-handed")
+    return orthonormalize(make_transform(R, t))
+
+
+def read_tr(path: Path) -> FloatArray:
+    """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr` or `Tr_velo_to_cam`."""
+    arrays = read_calibration(path)
+    name = "Tr_velo_to_cam" if "Tr" not in arrays and "Tr_velo_to_cam" in arrays else "Tr"
+    rows = _entry(path, arrays, name, 12).reshape(3, 4)
+    return _rigid(path, rows[:, :3], rows[:, 3])
+
+
+def read_raw_calibration(path: Path) -> FloatArray:
+    """The transform (4, 4) of a raw calibration file: T_B_A of calib_A_to_B.txt, T_rect_cam of calib_cam_to_cam.txt."""
+    arrays = read_calibration(path)
+    if path.name == "calib_cam_to_cam.txt":
+        return _rigid(path, _entry(path, arrays, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
+    return _rigid(path, _entry(path, arrays, "R", 9).reshape(3, 3), _entry(path, arrays, "T", 3))
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTiming:
+    """The times of N sweeps."""
+
+    stamps: FloatArray  # (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras
+    # before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end
+    before_s: FloatArray
+    after_s: FloatArray
+    from_clock: bool  # whether the stamps are clock readings; else they are made from the rate
+    notes: tuple[str, ...]  # facts for the user
+
+
+def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], config: ReaderConfig) -> SweepTiming:
+    """By timestamps.txt, timestamps_start.txt and timestamps_end.txt in a `velodyne_points` folder, else by the rate.
+
+    The numbers (N,) of the scans are the rows of the files; a missing scan has a blank row.
+    """
+    try:
+        found = _rows(folder / "timestamps.txt", numbers)
+        stamps, replaced = mend_stamps(found, numbers.astype(np.float64))
+    except ValueError:
+        half = np.full(len(numbers), 0.5 / config.rate_hz)
+        note = assumed_rate("There is no timestamps.txt with two stamps that increase", config)
+        return SweepTiming(numbers / config.rate_hz, half, half, False, (note,))
+    notes = []
+    if replaced:
+        notes.append(f"{count(replaced, 'stamp')} of timestamps.txt interpolated: missing, repeated or backwards.")
+    period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / config.rate_hz
+    start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
+    before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
+    after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
+    if wrong_starts or wrong_ends:
+        said = "ends of sweeps missing or implausible, and replaced: sweeps are taken to be seamless."
+        notes.append(f"{count(wrong_starts, 'start')} and {wrong_ends} {said}")
+    return SweepTiming(stamps, before_s, after_s, True, tuple(notes))
+
+
+def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray:
+    """The stamps of the rows with these numbers, NaN where there is none."""
+    stamps = read_stamps(path) if path.is_file() else np.empty(0)
+    return np.append(stamps, np.nan)[np.minimum(numbers, len(stamps))]
+
+
+def _plausible(durations: FloatArray, expected: float) -> tuple[FloatArray, int]:
+    wrong = ~(np.abs(durations - expected) < _SWEEP_TOLERANCE * expected)  # NaN is wrong too
+    return np.where(wrong, expected, durations), int(np.count_nonzero(wrong))
