@@ -57,8 +57,7 @@ from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import Spinning
-from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.directory import RunDirectory, Unfinished
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,7 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.sensors import SENSORS, Spinning
 from lidarslam.simulation.world import WORLDS
-from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.directory import RunDirectory, Unfinished
 
 _NOISE_M, _STILL_POINTS = 0.005, 300
 _WITHOUT_ODOMETRY = ["odometry.method=constant-velocity"]

@@ -13,9 +13,8 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.compare import compare, demo
+from lidarslam.commands.compare import compare, demo, evaluate
 from lidarslam.commands.config import config
-from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports import edit, export_bag, export_geo, export_grid, export_mesh
 from lidarslam.commands.network import export, train
 from lidarslam.commands.recordings import datasets, info, simulate

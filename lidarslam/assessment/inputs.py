@@ -20,8 +20,8 @@ from lidarslam.datasets.point_table import coordinates
 from lidarslam.datasets.registry import absent, is_recording, open_recording
 from lidarslam.simulation.record import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.storage import directory as files
+from lidarslam.storage.directory import require_whole
 from lidarslam.storage.finished_run import read_trajectory
-from lidarslam.storage.unfinished import require_whole
 
 # Surveys end well within this; squares of much more overflow.
 _FARTHEST_M = 1e9

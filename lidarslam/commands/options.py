@@ -176,7 +176,7 @@ def out_option(what: str, default: str) -> _Decorator:
 
 def default_out(folder: str, name: str) -> Path:
     """A new directory FOLDER/NAME_TIME, which is noted."""
-    from lidarslam.storage.default_places import new_place
+    from lidarslam.storage.finished_run import new_place
 
     out = new_place(Path(folder), name)
     note(f"results go to {out}")
@@ -185,11 +185,11 @@ def default_out(folder: str, name: str) -> Path:
 
 def latest_run() -> Path:
     """The latest run in `runs`, which is noted; UsageError where there is none."""
-    from lidarslam.storage import default_places
+    from lidarslam.storage import finished_run
 
-    run = default_places.latest_run()
+    run = finished_run.latest_run()
     if run is None:
-        raise click.UsageError(f"name a RUN; {default_places.RUNS} holds no finished one")
+        raise click.UsageError(f"name a RUN; {finished_run.RUNS} holds no finished one")
     note(f"taking the latest run, {run}")
     return run
 

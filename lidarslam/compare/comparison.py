@@ -1,12 +1,16 @@
 """A comparison: every method on every recording, each in its own process; one result for all, and its text."""
 
 import contextlib
+import os
+import platform
+import subprocess
 import tarfile
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 
@@ -22,7 +26,6 @@ from lidarslam.compare.method_run import (
     obstacle,
     run_method,
 )
-from lidarslam.compare.methods import scene_note
 from lidarslam.compare.plan import (
     CompareRequest,
     PlannedRecording,
@@ -31,10 +34,11 @@ from lidarslam.compare.plan import (
     make_plan,
     make_recordings,
     require_data,
+    scene_note,
 )
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer
-from lidarslam.core.tasks import open_tasks
+from lidarslam.core.tasks import open_tasks, usable_cores
 from lidarslam.core.text import as_typed, command_line, count, joined
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.fetched import fetch, url_of
@@ -57,7 +61,6 @@ from lidarslam.evaluation.comparison.gates import format_gates, judge_comparison
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.run.interruption import ended_like_interrupted
-from lidarslam.run.machine import machine, versions
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.finished_run import COMPARISON, REPORT_HTML, REPORT_MD, read_summary
@@ -423,3 +426,46 @@ def _table_lines(table: Table) -> Iterator[str]:
     if table.note:
         yield table.note
     yield from (f"[{number}] {source}" for number, source in enumerate(sources, start=1))
+
+
+_PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "onnxruntime", "open3d", "open3d-cpu", "torch")
+
+
+def versions() -> dict[str, str]:
+    """Versions of the programs that results depend on, and the commit of a checkout."""
+    found = {}
+    for name in _PROGRAMS:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    found["python"] = platform.python_version()
+    commit = _commit(Path(__file__).resolve().parents[2])
+    return found if commit is None else found | {"commit": commit}
+
+
+def machine() -> dict[str, str]:
+    """Processor, cores of this process, memory and system; unknown entries are left out."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    system = f"{platform.system()} {platform.release()} ({platform.machine()})"
+    described = {"processor": _processor(), "cores": str(usable_cores()), "memory": f"{memory:.1f} GiB"}
+    return {name: text for name, text in (described | {"system": system}).items() if text}
+
+
+def _commit(folder: Path) -> str | None:
+    """The commit of a checkout, marked where files differ from it; None without git or checkout."""
+    if not (folder / ".git").exists():
+        return None
+    command = ["git", "--no-optional-locks", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        done = subprocess.run([*command, "--exclude=*"], capture_output=True, text=True, timeout=10.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return " ".join(value.split())
+    return platform.processor()

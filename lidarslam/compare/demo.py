@@ -11,8 +11,7 @@ from pathlib import Path
 
 from lidarslam.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare, format_comparison
-from lidarslam.compare.methods import parse_methods
-from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text import as_typed, command_line
 from lidarslam.run.progress import show_count

@@ -28,10 +28,11 @@ from lidarslam.live.receiving import (
     Arrived,
     ImuReceiver,
     IncomingQueue,
+    LiveCounts,
+    LiveStatistics,
     PublishedTopic,
     find_topic,
 )
-from lidarslam.live.statistics import LiveCounts, LiveStatistics
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.pipeline.compile_ahead import made_up_scans
 from lidarslam.pipeline.estimates import ScanEstimate

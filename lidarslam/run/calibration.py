@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,8 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.run.request import RunRequest
 
@@ -74,8 +77,7 @@ def open_inertial(
     T_lidar_imu = samples.T_lidar_imu
     if (T_recorded_imu := config.odometry.T_recorded_imu) is not None:
         T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
-    poses = _Poses(config, recording, chosen)
-    lever_sigma_m = KNOWN_LEVER_M
+    poses, lever_sigma_m = _Poses(config, recording, chosen), KNOWN_LEVER_M
     if T_lidar_imu is None:
         logger.info("finding how the IMU is mounted")
         T_lidar_imu, lever_sigma_m = _found(poses, recording.name, samples), UNKNOWN_LEVER_M
@@ -104,12 +106,20 @@ def make_imu_stream(config: Config, warn: Callable[[str], None]) -> "ImuStream |
     return ImuStream(None if T_recorded_imu is None else transform_of(config.reader.mounting) @ T_recorded_imu, warn)
 
 
+def _registered(config: Config, recording: Recording, chosen: range) -> Iterator[tuple[SampledScan, MappedScan]]:
+    """The first scans, registered to each other without an odometry; up to one that cannot be read."""
+    mapper = Mapper(config.mapping.model_copy(update={"budget_ms": None}))
+    with suppress(InputError):  # raised again when the scans are read
+        for scan in take_in(recording, chosen, Faults()):
+            sampled = mapper.sample(scan)
+            yield sampled, mapper.process(sampled, Prior())
+
+
 class _Poses:
-    """Registered poses of the first scans without the IMU, in their order; registered as they are asked for."""
+    """Poses of the first scans without the IMU, in their order; registered as they are asked for."""
 
     def __init__(self, config: Config, recording: Recording, chosen: range) -> None:
-        self._scans = take_in(recording, chosen, Faults())
-        self._mapper = Mapper(config.mapping.model_copy(update={"budget_ms": None}))
+        self._scans = _registered(config, recording, chosen)
         self._poses: list[tuple[float, FloatArray, bool]] = []
 
     def compared(self, samples: ImuSamples, T_lidar_imu: FloatArray, most: int) -> "Iterator[Comparison]":
@@ -118,23 +128,16 @@ class _Poses:
 
         comparison = Comparison(samples, T_lidar_imu)
         for number in range(most):
-            if number == len(self._poses) and not self._register():
+            if number == len(self._poses):
+                for scan, mapped in islice(self._scans, 1):
+                    follows = mapped.registered and mapped.is_connected
+                    self._poses.append((scan.stamp, mapped.state.T_world_lidar, follows))
+            if number == len(self._poses):
                 break
             comparison.add(*self._poses[number])
             if (number + 1) % _EVERY == 0:
                 yield comparison
         yield comparison
-
-    def _register(self) -> bool:
-        """Register the next scan; whether there is one."""
-        scan = None
-        with suppress(InputError):  # raised again when the scans are read
-            scan = next(self._scans, None)
-        if scan is not None:
-            mapped = self._mapper.process(self._mapper.sample(scan), Prior())
-            follows = mapped.registered and mapped.is_connected
-            self._poses.append((scan.stamp, mapped.state.T_world_lidar, follows))
-        return scan is not None
 
 
 def _found(poses: _Poses, name: str, samples: ImuSamples) -> FloatArray:
@@ -214,15 +217,10 @@ class Elevation:
         return cls(raised_deg + angle_deg, float(np.rad2deg(bias.sigma)), raised_deg)
 
     @property
-    def is_certain(self) -> bool:
-        """Whether the correction is wrong."""
-        wrong_deg = self.elevation_bias_deg - self.elevation_correction_deg
-        return abs(wrong_deg) > _CERTAIN_SIGMAS * self.elevation_sigma_deg
-
-    @property
     def warning(self) -> str | None:
-        """The remedy, where the correction is wrong."""
-        if not self.is_certain:
+        """The remedy, where the correction is certainly wrong."""
+        wrong_deg = self.elevation_bias_deg - self.elevation_correction_deg
+        if abs(wrong_deg) <= _CERTAIN_SIGMAS * self.elevation_sigma_deg:
             return None
         return (
             f"elevation bias of {self.elevation_bias_deg:+.2f} +- {self.elevation_sigma_deg:.2f} degrees, where"
@@ -243,16 +241,14 @@ def with_elevations(
         return request, recording
     phase("estimating the error of the elevations")
     estimator = ElevationEstimator()
-    mapper = Mapper(request.config.mapping.model_copy(update={"budget_ms": None}))
-    with suppress(InputError):  # raised again when the scans are read
-        for scan in take_in(recording, range(chosen.start, chosen.stop)[:_MOST_ELEVATION_SCANS], Faults()):
-            sampled = mapper.sample(scan)
-            estimator.add(sampled, mapper.process(sampled, Prior()))
-            if estimator.stretches == _ENOUGH_STRETCHES:
-                break
+    scans = range(chosen.start, chosen.stop)[:_MOST_ELEVATION_SCANS]
+    for sampled, mapped in _registered(request.config, recording, scans):
+        estimator.add(sampled, mapped)
+        if estimator.stretches == _ENOUGH_STRETCHES:
+            break
     found = Elevation.found(recording, estimator)
     angle_deg, _ = elevation_of(recording)
-    if found is not None and found.is_certain:
+    if found is not None and found.warning is not None:
         angle_deg = round(found.elevation_bias_deg, 3)
     reader = request.config.reader.model_copy(update={"elevation_correction_deg": angle_deg})
     request = replace(request, config=request.config.model_copy(update={"reader": reader}))

@@ -23,9 +23,8 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import RERUN
+from lidarslam.storage.directory import RERUN, About, Unfinished
 from lidarslam.storage.finished_run import read_summary, where_astray
-from lidarslam.storage.unfinished import About, Unfinished
 
 logger = logging.getLogger(__name__)
 

@@ -14,8 +14,7 @@ import pytest
 
 from lidarslam.compare.comparison import CompareOutcome, compare, format_comparison
 from lidarslam.compare.method_run import Limits
-from lidarslam.compare.methods import parse_methods
-from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
