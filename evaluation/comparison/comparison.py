@@ -71,10 +71,7 @@ class Table:
     folded: bool = False  # whether the page shows it on request only
 
     def best(self) -> set[tuple[int, int]]:
-        """(row, column) of the best value of each ranked column, and of all that look equal to it.
-
-        None in a column without two comparable numbers that differ.
-        """
+        """(row, column) of the best values of each ranked column with two comparable numbers that differ."""
         found = set()
         for number, column in enumerate(self.columns):
             cells = [row.cells[number] for row in self.rows]

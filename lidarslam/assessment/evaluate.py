@@ -229,10 +229,7 @@ def _evaluate_map(
 def evaluate_map(
     estimate: Estimate, metrics: TrajectoryMetrics | None, reference: ReferenceMap, options: MapOptions | None = None
 ) -> MapEvaluation:
-    """Compare the map of an estimate, in the world of its poses, with a reference map.
-
-    The metrics are those of its trajectory, None when that has no reference.
-    """
+    """Compare the map of an estimate with a reference; the metrics are its trajectory's, None without a reference."""
     options = options or MapOptions()
     points = estimate.map_points()
     T_reference_world, positions = _along_trajectory(estimate, metrics, reference)

@@ -33,10 +33,7 @@ class Demo:
 
 
 def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], None] = lambda _: None) -> Demo:
-    """Record this many sweeps, run the methods, compare them, draw the maps; an earlier demonstration is replaced.
-
-    `tell` is called with a line for each finished method.
-    """
+    """Record, run the methods, compare, draw the maps; `tell` is called with a line for each finished method."""
     source = out / RECORDING
     with show_count("recording") as counted:
         request = RecordRequest(

@@ -38,10 +38,7 @@ class YamlError(ConfigError):
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one.
-
-    Any value that is no decimal number is a text.
-    """
+    """Refuses a key that occurs twice in a section; any value that is no decimal number is a text."""
 
     def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
         tag = super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
@@ -62,10 +59,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """The values of a text: dictionaries, lists, texts, numbers, dates, null.
-
-    YamlError where it is not YAML, asks for other objects, or a key occurs twice.
-    """
+    """The values of a text; YamlError where it is not YAML, asks for other objects, or a key occurs twice."""
     try:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 # a SafeLoader that refuses more
     except yaml.YAMLError as error:
@@ -75,10 +69,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The keys and values of a file in UTF-8.
-
-    ConfigError where it cannot be read, is too long, is not YAML, or has no keys and values.
-    """
+    """The keys and values of a file; ConfigError where it cannot be read, is too long, or has none."""
     try:
         with path.open("rb") as file:
             content = file.read(_LONGEST_BYTES + 1)
@@ -136,10 +127,7 @@ def bounds_of(field: FieldInfo) -> tuple[float, float] | None:
 
 
 def bounds_text(field: FieldInfo) -> str | None:
-    """The bounds in words, such as `0.01 to 10` or `[3 numbers, 0 to 1]`, with the words that may stand instead.
-
-    None of no number.
-    """
+    """Bounds in words: `0.01 to 10` or `[3 numbers, 0 to 1]`, or words that may stand instead; None of no number."""
     bounds = bounds_of(field)
     if bounds is None:
         return None

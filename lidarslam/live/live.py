@@ -268,10 +268,7 @@ def bounded(config: Config) -> Config:
 
 
 def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> ImuReceiver | None:
-    """The receiver of the IMU's samples; None where the odometry uses none.
-
-    InputError where no IMU is published, or several.
-    """
+    """The receiver of the IMU's samples, None without; InputError where no IMU is published, or several."""
     stream = make_imu_stream(config, log.warn)
     if stream is None:
         return None

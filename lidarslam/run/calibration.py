@@ -43,10 +43,7 @@ _COMPARED_SCANS = 60
 
 
 def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
-    """The samples that the odometry needs; None where it uses no IMU.
-
-    ConfigError where the recording has no IMU; InputError where the samples are damaged.
-    """
+    """The samples that the odometry needs, None where it needs none; ConfigError without an IMU."""
     if not config.odometry.uses_imu:
         return None
     samples = recording.imu
@@ -141,10 +138,7 @@ class _Poses:
 
 
 def _found(poses: _Poses, name: str, samples: ImuSamples) -> FloatArray:
-    """(4, 4) T_lidar_imu from the turns of the first scans; its position stays unknown.
-
-    InputError where they do not show it.
-    """
+    """(4, 4) T_lidar_imu by the turns of the scans, its position unknown; InputError where they do not show it."""
     from lidarslam.mapping.inertial.comparison import MountingError
 
     reason = "too few scans"

@@ -33,10 +33,7 @@ WITHOUT_EFFECT = {"viewer": True, "checkpoints": True}
 
 
 def describe_computed(request: RunRequest, recording: Recording) -> dict[str, Any]:
-    """Everything that determines the results of a run; weights and prior by a digest of their content.
-
-    InputError where a file cannot be read.
-    """
+    """Everything that determines the results of a run; weights and prior by a digest of their content."""
     config = request.config
     tree = config.model_dump(mode="json", exclude=WITHOUT_EFFECT)
     if config.odometry.is_learned:
@@ -48,10 +45,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
 
 
 def lost_when_finished(request: RunRequest) -> bool | None:
-    """Whether tracking was lost, if `out` holds this very run and it is finished; None if it is not.
-
-    InputError where it holds another finished run.
-    """
+    """Whether tracking was lost in this very run, if finished, else None; InputError where `out` has another one."""
     out = request.out
     if About.read(out) is not None or not (out / files.CONFIG).is_file() or not (out / files.SUMMARY).is_file():
         return None

@@ -44,10 +44,7 @@ def begin_graph(
     takes_gnss: bool = False,
     given: GivenLoops | None = None,
 ) -> "SlamGraph | None":
-    """A pose graph, when the configuration asks for one; its submaps are stored in the directory, or in the file.
-
-    ConfigError where it requires GNSS positions and none are used.
-    """
+    """A configured pose graph, its submaps in the directory or file; ConfigError where it lacks GNSS positions."""
     if config.pose_graph.gnss and not takes_gnss:
         raise ConfigError("pose_graph.gnss is available in lidarslam run only; leave it out here")
     if not config.pose_graph.enabled:

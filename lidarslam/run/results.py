@@ -134,10 +134,7 @@ def write_results(
     map_formats: Sequence[MapFormat] = (),
     show: Callable[[DrawnMap], None] = lambda _: None,
 ) -> RunOutcome:
-    """Draw the map, show it, and write everything; the poses are final.
-
-    OutputError where a file cannot be written; a map that cannot be costs no other file.
-    """
+    """Draw the map and write everything; OutputError where a file fails; a map that fails costs no other file."""
     scans, log = tracked.scans, tracked.scans.log
     drawn = corrected_map(tracked, closed, config.global_map, directory)
     show(drawn)
@@ -213,10 +210,7 @@ class TileWriter:
         self.failure: OutputError | None = None  # of the first tile that could not be written, after which none is
 
     def write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
-        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
-
-        OutputError where there is a file in place of the folder.
-        """
+        """Write a tile, see `WriteTile`; OutputError where there is a file in place of the folder."""
         if self.failure is None and not self._entries:
             self._begin()
         if self.failure is not None:

@@ -184,10 +184,7 @@ def log_map(
     colour: tuple[int, int, int] | None = None,
     static: bool = False,
 ) -> None:
-    """A cloud (N, 3) coloured by height, thinned to this many points.
-
-    With a colour, the height is its brightness.
-    """
+    """A cloud (N, 3), thinned to so many points, coloured by height, or with a colour of that brightness."""
     points = every_nth(points, count)
     height = levels(points[:, 2])
     if colour is None:
