@@ -15,8 +15,7 @@ from lidarslam.core.settings import Settings
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.map.metrics import CloudErrors
-from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
+from lidarslam.evaluation.trajectory.metrics import SHORT_LENGTHS_M, TrajectoryMetrics, metrics_json
 
 Value = float | str | None
 

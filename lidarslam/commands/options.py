@@ -1,6 +1,6 @@
-"""Options that several commands share, and the configuration they result in."""
+"""Options that several commands share; `lidarslam config`: the configuration they result in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import click
 from click.shell_completion import CompletionItem
 
-from lidarslam.commands.terminal import note, verbose_option
+from lidarslam.commands.terminal import note, say, verbose_option
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.plugins import PlugPoint
+from lidarslam.core.text import printable
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
@@ -277,3 +278,33 @@ def take_where(options: dict[str, Any]) -> "Where":
     if cluster is not None and jobs > 1:
         raise click.UsageError("--jobs is of this machine; a cluster computes as many tasks at once as it has CPUs")
     return Where(jobs, cluster)
+
+
+@command(
+    """lidarslam config --list
+    lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5"""
+)
+@click.option("--list", "listing", is_flag=True, help="List the configurations and benchmarks that come along.")
+@config_options
+def config(listing: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
+    """Print the resolved configuration as YAML."""
+    from lidarslam.config.settings import dump_yaml, load_config
+
+    if listing:
+        say("\n".join(_shipped()))
+        return
+    click.echo(printable(dump_yaml(load_config(config_file, settings))), nl=False)
+
+
+def _shipped() -> Iterator[str]:
+    from lidarslam.config.settings import BENCHMARKS, CONFIGS, headline, read_yaml, shipped_files
+
+    kinds = {"--config NAME": shipped_files(CONFIGS), "compare --benchmark NAME": shipped_files(BENCHMARKS)}
+    width = max(len(name) for files in kinds.values() for name in files) + 2
+    for kind, files in kinds.items():
+        yield kind
+        for name, path in files.items():
+            yield f"  {name:<{width}}{headline(path)}"
+            if data := read_yaml(path).get("data"):
+                yield f"  {'':<{width}}--data: {data}"
+    yield f"The files are in {CONFIGS}"

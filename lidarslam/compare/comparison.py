@@ -58,8 +58,7 @@ from lidarslam.evaluation.comparison.comparison import (
     times_note,
 )
 from lidarslam.evaluation.comparison.gates import format_gates, judge_comparison, require_methods
-from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.evaluation.trajectory.metrics import SHORT_LENGTHS_M, evaluate_trajectory
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory

@@ -14,10 +14,9 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from lidarslam.compare.method_run import PROCESS, Limits, MethodRun
+from lidarslam.compare.peers.estimation import ALL_PEERS, PEERS, peer_named
 from lidarslam.compare.peers.interface import MAX_RANGE_M
-from lidarslam.compare.peers.registry import ALL_PEERS, PEERS, peer_named
-from lidarslam.config.settings import load_config
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import load_config, read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import require_no_link
 from lidarslam.core.settings import Settings

@@ -195,15 +195,16 @@ class LiveOutcome:
 
 
 def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | None = None) -> LiveOutcome:
-    """Follow a robot, publish its poses, and write the run directory.
+    """Follow a robot, publish its poses, and write the run directory; Ctrl-C ends it at any time, with all results.
 
-    Args:
-        request: the topic to follow, and the end of the run; Ctrl-C ends it at any time, with all results.
-        show: called with a short text on the progress, every second while scans arrive.
-        page: shows the run in browsers, with `rerun="web"`.
+    `show` is called with a short text on the progress, every second while scans arrive; the page is of `rerun="web"`.
     """
     require_possible(request)
-    node = _open_node(request.domain)
+    try:
+        from lidarslam.live.dds import open_node
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
+    node = open_node(request.domain)
     request = replace(request, config=bounded(request.config))
     config, faults = request.config, Faults()
     with open_session(request, show) as session:
@@ -275,11 +276,3 @@ def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> ImuReceiver |
     option = "--set reader.imu_topic=NAME"
     topic = find_topic(node.published, config.reader.imu_topic, (IMU_TYPE,), option, IMU_WITHIN_S)
     return ImuReceiver(node.subscribe(topic, depth=IMU_DEPTH).take, stream)
-
-
-def _open_node(domain: int) -> "DdsNode":
-    try:
-        from lidarslam.live.dds import open_node
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
-    return open_node(domain)

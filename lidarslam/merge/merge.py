@@ -371,13 +371,11 @@ def format_merge(out: Path, outcome: MergeOutcome) -> str:
 def _recording(recording: MergedRecording, run: RunOutcome | None) -> str:
     if run is None:
         return f"{recording.name}: no scan used"
-    parts = [f"{recording.directory}: {count(recording.scans, 'scan')}, {recording.length_m:.1f} m"]
-    if run.metrics is not None:
-        parts.append(f"ATE {run.metrics.errors.ate_rmse_m:.3f} m by itself")
-    if recording.lost_scans:
-        parts.append(f"{recording.lost_scans:,} lost")
-    parts.append("in the common frame" if recording.joined else "NOT JOINED")
-    return ", ".join(parts)
+    ate = "" if run.metrics is None else f", ATE {run.metrics.errors.ate_rmse_m:.3f} m by itself"
+    lost = f", {recording.lost_scans:,} lost" if recording.lost_scans else ""
+    size = f"{count(recording.scans, 'scan')}, {recording.length_m:.1f} m"
+    frame = "in the common frame" if recording.joined else "NOT JOINED"
+    return f"{recording.directory}: {size}{ate}{lost}, {frame}"
 
 
 def merge(request: MergeRequest, show: Show) -> MergeOutcome:
@@ -493,9 +491,8 @@ def _track_all(request: MergeRequest, parts: Sequence[Part], graph: "SlamGraph",
 
 def _add(graph: "SlamGraph", part: Part) -> None:
     """Give the graph the keyframes of a recording; those without any count as well."""
-    own = CheckpointFiles(part.request.out)
-    file = own.submaps if part.scans else None
-    with closing(KeyframeGraph(part.request.config.pose_graph.keyframes, file=file)) as tracked:
+    own, config = CheckpointFiles(part.request.out), part.request.config.pose_graph.keyframes
+    with closing(KeyframeGraph(config, file=own.submaps if part.scans else None)) as tracked:
         if part.scans:
             tracked.restore(read_state(own.tracked).part("graph"))
         graph.add_recording(tracked)

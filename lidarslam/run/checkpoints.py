@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.config.settings import CheckpointConfig, Config
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import CheckpointConfig, Config, read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, write_state

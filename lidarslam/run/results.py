@@ -313,14 +313,11 @@ def format_map(written: WrittenMap) -> str:
     fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    if written.tiled is not None:
-        return f"{_tiles(written.tiled)}{fields}{moved}; {MAP_PLY}: {count(written.points, 'point')}, one per {voxel}"
+    if (tiled := written.tiled) is not None:
+        tiles = f"map of {count(tiled.total, 'point')} in {count(len(tiled.points), 'tile')}, {MAP_TILES}/"
+        overview = f"{MAP_PLY}: {count(written.points, 'point')}, one per {voxel}"
+        return f"{tiles}, voxels of {small_length(tiled.tiling.voxel_size_m)}{fields}{moved}; {overview}"
     return f"map of {count(written.points, 'point')}, voxels of {voxel}{fields}{moved}{entropy}"
-
-
-def _tiles(tiled: TiledMap) -> str:
-    voxel, tiles = small_length(tiled.tiling.voxel_size_m), count(len(tiled.points), "tile")
-    return f"map of {count(tiled.total, 'point')} in {tiles}, {MAP_TILES}/, voxels of {voxel}"
 
 
 def _loops(graph: GraphSummary) -> str:

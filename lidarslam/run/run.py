@@ -77,13 +77,8 @@ def execute(
     """Run, and write the run directory.
 
     A damaged recording or an interruption ends the run early, with the results so far. A run that is killed can be
-    resumed, to the same results.
-
-    Args:
-        request: the run to execute.
-        progress: called after every scan.
-        phase: called with a short text on the progress before the first scan and after the last.
-        page: shows the run in browsers, with `rerun="web"`.
+    resumed, to the same results. `phase` is called with a short text on the progress before the first scan and after
+    the last; the page shows the run in browsers, with `rerun="web"`.
     """
     require_possible(request, request.source)
     phase("opening the recording")

@@ -268,7 +268,7 @@ def _warn_of_earlier(run: Path) -> None:
 
 
 def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
-    old, new = _flat(was), _flat(asked)
+    old, new = flat(was), flat(asked)
     names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
     if names:
         listed = ", ".join(f"{name} {old.get(name)} (now {new.get(name)})" for name in names[:_LISTED])
@@ -278,11 +278,12 @@ def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None
         )
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested dictionaries by their keys with dots between."""
+    values: dict[str, Any] = {}
     for name, value in tree.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
+        values |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return values
 
 
 class CheckpointFiles:

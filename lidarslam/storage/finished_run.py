@@ -4,7 +4,7 @@ import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -59,7 +59,6 @@ class FinishedRun:
     lost: NDArray[np.bool_]  # (N,) which scans were lost
     map_points: FloatArray  # (M, 3) in the world, none when the map is missing
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
-    map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
     frame_of: Path | None = None  # the run, or file, in whose map this one was localised
     path: Path | None = None  # its path, resolved
 
@@ -88,7 +87,7 @@ def load_run(path: Path) -> FinishedRun:
     lost, loops = read_scans(path, len(trajectory)).lost, _loops(path, len(trajectory))
     cloud, other = shown_map(path), localised_in(path)
     name, frame_of = path.resolve().name, None if other is None else other.resolve()
-    return FinishedRun(name, trajectory, lost, cloud.points, loops, cloud.attributes, frame_of, path.resolve())
+    return FinishedRun(name, trajectory, lost, cloud.points, loops, frame_of, path.resolve())
 
 
 def read_trajectory(path: Path) -> Trajectory:

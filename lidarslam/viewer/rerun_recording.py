@@ -29,8 +29,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.report.drawing import viridis
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.viewer import rerun_environment
-from lidarslam.viewer.annotations import levels
 from lidarslam.viewer.rerun_program import GRPC_PORT, WebPage, open_window, require_window
+from lidarslam.viewer.view import levels
 from lidarslam.viewer.viewer import Viewer
 
 _log = logging.getLogger(__name__)

@@ -20,11 +20,9 @@ from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.map.metrics import MapComparison
 from lidarslam.evaluation.report.drawing import error_colours, viridis
-from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.association import common_instants
+from lidarslam.evaluation.trajectory.alignment import align, common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
-from lidarslam.viewer.annotations import levels
 from lidarslam.viewer.rerun_recording import (
     BACKGROUND,
     MAP_RADIUS,
@@ -42,6 +40,7 @@ from lidarslam.viewer.rerun_recording import (
     true_path,
     whole_past,
 )
+from lidarslam.viewer.view import levels
 
 # The rest of Okabe and Ito's palette, without those of the reference and of lost scans.
 _COLOURS = ((86, 180, 233), (230, 159, 0), (204, 121, 167), (240, 228, 66), (0, 114, 178))
