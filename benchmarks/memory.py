@@ -44,7 +44,7 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.sensors import SENSORS, Spinning
 from lidarslam.simulation.world import WORLDS

@@ -34,7 +34,7 @@ from lidarslam.run.calibration import make_imu_stream
 from lidarslam.run.loop_closing import GraphOutcome, begin_graph, correct
 from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
 from lidarslam.run.run import draw_report, open_odometry
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage.directory import RunDirectory
 
 logger = logging.getLogger(__name__)

@@ -201,12 +201,18 @@ def take_config(options: dict[str, Any], *sources: Path) -> "Config":
     Options that a source does not use are noted.
     """
     from lidarslam.config.settings import load_config, reader_settings
+    from lidarslam.datasets.registry import choose_reader, takes_sequence
 
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     settings = [*options.pop("settings"), *_method_settings(options), *reader_settings(**reader)]
     config = load_config(options.pop("config_file"), settings)
+    topic, sequence = reader["topic"], reader["sequence"]
     for source in sources:
-        _note_unused(source, config.reader.name, reader["topic"], reader["sequence"])
+        chosen = choose_reader(source, config.reader.name)
+        if topic is not None and chosen != "rosbag":
+            note(f"--topic {topic} is ignored: {source} is not a bag ({chosen})")
+        if sequence is not None and not takes_sequence(source, chosen):
+            note(f"--sequence {sequence} is ignored: {source} is one recording ({chosen})")
     return config
 
 
@@ -238,16 +244,6 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
         for key, value in given.items()
         if value is not None
     ]
-
-
-def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
-    from lidarslam.datasets.registry import choose_reader, takes_sequence
-
-    chosen = choose_reader(source, reader)
-    if topic is not None and chosen != "rosbag":
-        note(f"--topic {topic} is ignored: {source} is not a bag ({chosen})")
-    if sequence is not None and not takes_sequence(source, chosen):
-        note(f"--sequence {sequence} is ignored: {source} is one recording ({chosen})")
 
 
 def gate_options(with_method: bool) -> _Decorator:

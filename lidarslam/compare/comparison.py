@@ -16,16 +16,8 @@ from pathlib import Path
 
 from lidarslam.assessment.evaluate import evaluate_map
 from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
-from lidarslam.compare.method_run import (
-    COMMAND,
-    PROCESS,
-    Limits,
-    MethodRun,
-    clear,
-    finished_before,
-    obstacle,
-    run_method,
-)
+from lidarslam.compare import method_run
+from lidarslam.compare.method_run import Limits, MethodRun
 from lidarslam.compare.plan import (
     CompareRequest,
     PlannedRecording,
@@ -115,7 +107,7 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
     return replace(outcome, gates_passed=all(gate.passed for gate in judged))
 
 
-def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = COMMAND) -> CompareOutcome:
+def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = method_run.COMMAND) -> CompareOutcome:
     """Run, evaluate, and write comparison.json and the report.
 
     A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. The command is the
@@ -176,7 +168,7 @@ class _Turns:
             nonlocal counted
             (planned, run), (result, packed) = wanted[index], done
             if packed is not None:
-                clear(run.request.out)
+                method_run.clear(run.request.out)
                 with tarfile.open(fileobj=BytesIO(packed)) as archive:
                     archive.extractall(run.request.out, filter="data")
             counted += scans[index]
@@ -184,7 +176,7 @@ class _Turns:
             self._done[run.request.out] = result
             self.narrator.tell(format_result(planned.name, result))
 
-        command, is_remote = None if self.command == COMMAND else self.command, where.cluster is not None
+        command, is_remote = None if self.command == method_run.COMMAND else self.command, where.cluster is not None
         limits, here = self.request.limits, str(Path.cwd())
         tasks = [MethodTask(r, limits, command, here, url_of(r.request.source), is_remote) for _, r in wanted]
         with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
@@ -198,9 +190,9 @@ class _Turns:
         """An earlier result, or why there is none; None where the method has to be run."""
         if self.interrupted:
             return MethodResult(run.name, "not run", _INTERRUPTED)
-        if self.request.reuse and (earlier := finished_before(run)) is not None:
+        if self.request.reuse and (earlier := method_run.finished_before(run)) is not None:
             return earlier
-        why = obstacle(run, planned.recording)
+        why = method_run.obstacle(run, planned.recording)
         return None if why is None else MethodResult(run.name, "not run", why)
 
     def measured(self, planned: PlannedRecording) -> SequenceComparison:
@@ -224,7 +216,7 @@ class _Turns:
         result = MethodResult(run.name, "not run", _INTERRUPTED)
         try:
             with self.narrator.counting(f"{planned.name} {run.name}") as counter:
-                result, self.interrupted = run_method(run, self.request.limits, counter, self.command)
+                result, self.interrupted = method_run.run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
         return result
@@ -255,7 +247,7 @@ def run_task(task: MethodTask) -> tuple[MethodResult, bytes | None]:
             # The last two parts are in the result.
             request = replace(request, out=place / request.out.parent.name / request.out.name)
         run = replace(task.run, request=request)
-        result, _ = run_method(run, task.limits, lambda *_: None, task.command or COMMAND)
+        result, _ = method_run.run_method(run, task.limits, lambda *_: None, task.command or method_run.COMMAND)
         return result, _packed(request.out) if task.is_remote else None
 
 
@@ -263,7 +255,7 @@ def _packed(folder: Path) -> bytes:
     """The files of a run directory; last the one that says how the process ended, which marks a whole one."""
     packed = BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:
-        for path in sorted(folder.iterdir(), key=lambda path: (path.name == PROCESS, path)):
+        for path in sorted(folder.iterdir(), key=lambda path: (path.name == method_run.PROCESS, path)):
             archive.add(path, path.name)
     return packed.getvalue()
 

@@ -230,7 +230,8 @@ def load_model(model: type[M], path: Path | None, settings: Sequence[str], examp
         tree.pop(section, None)
     for setting in settings:
         _apply(tree, setting, example)
-    return _validated(model, tree, _origin(path, settings))
+    origin = " or ".join(([str(path)] if path else []) + (["--set"] if settings else []))
+    return _validated(model, tree, origin)
 
 
 def _validated(model: type[M], tree: dict[str, Any], origin: str) -> M:
@@ -303,11 +304,6 @@ def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> None:
             _put(section, str(key), part, what)
     else:
         tree[last] = value
-
-
-def _origin(path: Path | None, settings: Sequence[str]) -> str:
-    """Where a fault can have come from: the file, the settings, or either."""
-    return " or ".join(([str(path)] if path else []) + (["--set"] if settings else []))
 
 
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:

@@ -166,6 +166,14 @@ def _format_of(path: str | PathLike[str], format: TextFormat | None) -> TextForm
     return format or ("kitti" if Path(path).suffix.lower() == ".kitti" else "tum")
 
 
+def chain(T_world_first: FloatArray, relative_motions: FloatArray) -> FloatArray:
+    """Poses (N+1, 4, 4) from a first pose and N relative motions `T_prev_curr`."""
+    poses = [T_world_first]
+    for T_prev_curr in relative_motions:
+        poses.append(poses[-1] @ T_prev_curr)
+    return np.stack(poses)
+
+
 def parse_numbers(path: Path, columns: int) -> FloatArray:
     """The (N, columns) numbers of a text file, commas as blanks; InputError where a line has others."""
     numbers = array("d")

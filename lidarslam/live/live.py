@@ -42,7 +42,7 @@ from lidarslam.run.calibration import make_imu_stream
 from lidarslam.run.request import LiveRequest, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans
 from lidarslam.run.run import open_odometry, open_session
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.viewer.rerun_program import WebPage
 
 if TYPE_CHECKING:  # needs the extra

@@ -304,13 +304,13 @@ class LiveStatistics:
         """The counts up to now; the queue dropped `dropped` messages."""
         with self._lock:
             stamps, arrivals = np.array(self._arrived).reshape(-1, 2).T
-            registered = len(self._from_arrival)
+            registered, recent = len(self._from_arrival), arrivals[arrivals > time.time() - _RATE_OVER_S]
             return LiveCounts(
                 received=len(arrivals),
                 missing=count_missing(stamps),
                 dropped=dropped,
                 registered=registered,
-                rate_hz=_rate(arrivals),
+                rate_hz=float((len(recent) - 1) / np.ptp(recent)) if len(recent) > 1 and np.ptp(recent) > 0.0 else 0.0,
                 from_arrival=_latency(self._from_arrival),
                 from_stamp=_latency(self._from_stamp) if 2 * len(self._from_stamp) > registered else None,
             )
@@ -331,8 +331,3 @@ def count_missing(stamps: FloatArray) -> int:
     intervals = steps / np.median(steps)
     in_gaps = np.round(intervals[intervals > _GAP_INTERVALS] - 1.0).sum()
     return int(min(in_gaps, max(0.0, np.round(intervals.sum()) - len(intervals))))
-
-
-def _rate(arrivals: FloatArray) -> float:
-    recent = arrivals[arrivals > time.time() - _RATE_OVER_S]
-    return float((len(recent) - 1) / np.ptp(recent)) if len(recent) > 1 and np.ptp(recent) > 0.0 else 0.0

@@ -20,7 +20,7 @@ from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.request import RunRequest, describe_run
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RERUN, About, Unfinished
 from lidarslam.storage.finished_run import read_summary, where_astray

@@ -13,8 +13,7 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.loops.closure import GivenLoops, RelativePose
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, LoopReport, Milliseconds
+from lidarslam.run.summary import GraphSummary, LoopReport, Milliseconds, ScanLog
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load

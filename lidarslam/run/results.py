@@ -29,8 +29,7 @@ from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.run.calibration import Elevation
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap, summarise
+from lidarslam.run.summary import GraphSummary, RunSummary, ScanLog, WrittenMap, summarise
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import MAP_INDEX, MAP_PLY, MAP_TILES, REPORT, SCANS_CSV, SUMMARY, RunDirectory
 

@@ -43,7 +43,7 @@ from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, reason_of, unless_damaged, write_results
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage.directory import RERUN, RunDirectory, Unfinished
 from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer

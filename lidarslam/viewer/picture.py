@@ -23,19 +23,7 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
 from lidarslam.storage.finished_run import read_scans, read_trajectory, run_directories, shown_map
 from lidarslam.viewer import view as drawing
-from lidarslam.viewer.view import (
-    UNKNOWN,
-    WIDTH,
-    Colour,
-    ColourScale,
-    Entry,
-    Quantity,
-    View,
-    draw_layer,
-    fit_scale,
-    fit_view,
-    turning_views,
-)
+from lidarslam.viewer.view import Colour, ColourScale, Entry, Quantity, View
 
 TOP, OBLIQUE = 90.0, 35.0
 # Factor of the pixels along each side that are drawn and then averaged.
@@ -98,14 +86,16 @@ def fit_frame(
     runs: Sequence[DrawnRun],
     elevation_deg: float = TOP,
     reference: FloatArray | None = None,
-    width: int = WIDTH,
+    width: int = drawing.WIDTH,
     quantity: Quantity = "height",
     turn_deg: float | None = None,
 ) -> Frame:
     """The frame of an orthographic picture, from an elevation above the horizon, that holds all but diverging runs."""
     found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
-    scale = fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
-    return Frame(fit_view(*framed(runs, reference), elevation_deg, turn_deg, width), quantity, scale)
+    scale = drawing.fit_scale(
+        quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)])
+    )
+    return Frame(drawing.fit_view(*framed(runs, reference), elevation_deg, turn_deg, width), quantity, scale)
 
 
 def framed(runs: Sequence[DrawnRun], reference: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
@@ -174,7 +164,7 @@ def _draw_maps(
     count = np.zeros(len(total), dtype=np.uint16)
     for run, colour in zip(runs, colours, strict=True):
         if len(run.cloud):
-            layer = draw_layer(run.cloud.points, run.cloud.normals, view)
+            layer = drawing.draw_layer(run.cloud.points, run.cloud.normals, view)
             surface = _point_colours(run, frame)[layer.points] if colour is None else _tint(colour)
             total[layer.pixels] += (surface * layer.brightness[:, None]).astype(np.uint16)
             count[layer.pixels] += 1
@@ -189,7 +179,7 @@ def _point_colours(run: DrawnRun, frame: Frame) -> NDArray[np.uint8]:
     if frame.quantity == "rgb" and rgb is not None:
         return rgb
     if frame.scale is None or values is None:
-        return np.tile(np.array(UNKNOWN, dtype=np.uint8), (len(run.cloud), 1))
+        return np.tile(np.array(drawing.UNKNOWN, dtype=np.uint8), (len(run.cloud), 1))
     return frame.scale.colours(values)
 
 
@@ -328,7 +318,7 @@ def turn_runs(
     """
     frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
     turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)
-    for number, view in enumerate(turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
+    for number, view in enumerate(drawing.turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
         yield draw_runs(runs, replace(frame, view=view))
         count(number, frames)
 

@@ -1,13 +1,12 @@
 """Trajectories of known shape, and a comparison of methods with everything a report has to cope with."""
 
 from collections.abc import Callable
-from itertools import accumulate
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.geometry import exp
+from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.evaluation.comparison.comparison import (
     Comparison,
     MethodResult,
@@ -24,11 +23,6 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \x00"
 
 
-def _chain(T_world_first: FloatArray, motions: FloatArray) -> FloatArray:
-    """Poses from a first pose and relative motions."""
-    return np.stack(list(accumulate(motions, np.matmul, initial=T_world_first)))
-
-
 @pytest.fixture
 def random_drive() -> Callable[..., Trajectory]:
     """A vehicle's drive: about a metre a scan at 10 Hz, turning, with a little pitch and roll; from a seed."""
@@ -39,7 +33,7 @@ def random_drive() -> Callable[..., Trajectory]:
         xi = rng.normal(0.0, 0.003, (scans - 1, 6))
         xi[:, 2] += yaw_rate
         xi[:, 3] += step_m * rng.uniform(0.7, 1.3, scans - 1)
-        return Trajectory(100.0 + 0.1 * np.arange(scans), _chain(np.eye(4), exp(xi)))
+        return Trajectory(100.0 + 0.1 * np.arange(scans), chain(np.eye(4), exp(xi)))
 
     return drive
 
@@ -61,7 +55,7 @@ def noisy() -> Callable[..., Trajectory]:
     def disturb(trajectory: Trajectory, seed: int, sigma: float = 0.005) -> Trajectory:
         noise = np.random.default_rng(seed).normal(0.0, sigma, (len(trajectory) - 1, 6))
         motions = trajectory.relative_motions() @ exp(noise * [0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
-        return Trajectory(trajectory.stamps, _chain(trajectory.T_world_lidar[0], motions))
+        return Trajectory(trajectory.stamps, chain(trajectory.T_world_lidar[0], motions))
 
     return disturb
 

@@ -33,7 +33,7 @@ from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, unless_damaged, write_results
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage.directory import RunDirectory
 
 EXTRA = "pip install 'lidarslam[peers]'"
