@@ -188,8 +188,7 @@ class Slam:
             self._settle()
             if not self._log.table["points"].any():
                 raise InputError("there is nothing to save: no scan with points was registered")
-            for warning in self._imu.warnings if self._imu is not None else ():
-                self._log.warn(warning)
+            self._log.warn(*(self._imu.warnings if self._imu is not None else ()))
             self._pipeline.map.slides.finish()
             described = {"version": version("lidarslam"), "source": None}
             with RunDirectory.create(Path(directory), overwrite) as run:

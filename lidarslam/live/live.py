@@ -238,8 +238,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
         if not log.table["points"].any():
             why = "; ".join(faults.warnings()) or ("its scans had no valid point" if len(log) else "none came")
             raise InputError(f"{topic.name}: no scan could be used: {why}")
-        for warning in [*counts.warnings(), *(imu.stream.warnings if imu is not None else ())]:
-            log.warn(warning)
+        log.warn(*counts.warnings(), *(imu.stream.warnings if imu is not None else ()))
         tracked = Tracked(TrackedScans.of(log, faults, pipeline.map), pipeline.map.global_map)
         described: dict[str, Any] = {"version": version("lidarslam"), "source": None, "topic": topic.name}
         described |= {"domain": request.domain, "base_frame": request.base_frame}

@@ -68,8 +68,7 @@ def close_loops(
     result = graph.finish() if track is None else _placed(graph, log, track)
     closed = correct(log, graph, result, global_map)
     loops = () if closed is None else closed.summary.loops
-    for warning in _not_closed(graph, loops, len(log)):
-        log.warn(warning)
+    log.warn(*_not_closed(graph, loops, len(log)))
     if closed is not None:
         pairs = [loop.scans for loop in loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)

@@ -152,8 +152,7 @@ def write_results(
         written, failed = WrittenMap(0, drawn.voxel_size_m, drawn.moved), error
         log.warn(f"there is no map: {error}")
     log.warnings.extend(scans.faults.warnings())
-    if drawn.warning is not None:
-        log.warn(drawn.warning)
+    log.warn(drawn.warning)
     if drawn.cloud is not None and not len(drawn.cloud):
         log.warn("the map is empty: min_range_m and max_range_m of global_map leave no point")
     skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out

@@ -301,8 +301,7 @@ def track(
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
     with suppress(InputError):  # raised again when the scans are read
-        for warning in recording.warnings:
-            log.warn(warning)
+        log.warn(*recording.warnings)
     error = _process(pipeline, scans, session, truth, lambda number, result: progress(number, len(chosen), result))
     if not log.table["points"].any():
         if isinstance(error, KeyboardInterrupt):
@@ -310,9 +309,8 @@ def track(
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
     elevation = Elevation.found(recording, estimator)
-    found = [odometry.warning if isinstance(odometry, ExternalOdometry) else None, elevation and elevation.warning]
-    for warning in (*(inertial.warnings if inertial is not None else ()), *filter(None, found)):
-        log.warn(warning)
+    log.warn(*(inertial.warnings if inertial is not None else ()))
+    log.warn(odometry.warning if isinstance(odometry, ExternalOdometry) else None, elevation and elevation.warning)
     tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 

@@ -88,10 +88,11 @@ class ScanLog(Stateful):
         self.messages.append(result.message)
         self._rows += np.array(row, dtype=_ROW).tobytes()  # last, as Ctrl-C may interrupt: `len` counts rows
 
-    def warn(self, message: str) -> None:
-        """Keep a sentence for the summary, without repetition."""
-        if message not in self.warnings:
-            self.warnings.append(message)
+    def warn(self, *sentences: str | None) -> None:
+        """Keep sentences for the summary, each once."""
+        for sentence in sentences:
+            if sentence is not None and sentence not in self.warnings:
+                self.warnings.append(sentence)
 
     def correct(self, T_world_lidar: FloatArray) -> None:
         """Replace the poses (N, 4, 4) by those that the pose graph corrected."""
