@@ -310,7 +310,8 @@ def track(
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
     elevation = Elevation.found(recording, estimator)
     log.warn(*(inertial.warnings if inertial is not None else ()))
-    log.warn(odometry.warning if isinstance(odometry, ExternalOdometry) else None, elevation and elevation.warning)
+    log.warn(odometry.warning if isinstance(odometry, ExternalOdometry) else None)
+    log.warn(None if elevation is None else elevation.warning)
     tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 

@@ -125,7 +125,7 @@ def draw_runs(runs: Sequence[DrawnRun], frame: Frame, reference: FloatArray | No
         widths = [_REFERENCE_WIDER]
     if around is not None:
         for run, wider in zip(runs, widths, strict=True):
-            drawing.draw_outline(image, fine, run.positions, around, wider)
+            drawing.draw_path(image, fine, run.positions, [around] * len(run.positions), wider + 1.0)
     for run, colour, wider in zip(runs, colours, widths, strict=True):
         drawing.draw_path(image, fine, run.positions, _path_colours(run, colour, frame), wider)
     for run, colour, wider in zip(runs, colours, widths, strict=True):

@@ -299,12 +299,7 @@ def draw_path(
     """Draw a path through positions (N, 3) above everything, in the colours of its poses, widened by a factor."""
     pixels = view.project(positions)
     for first, last in _stretches(colours):
-        _line(picture, pixels[first : last + 1], colours[last], wider * _line_width(view))
-
-
-def draw_outline(picture: Image.Image, view: View, positions: FloatArray, colour: Colour, wider: float = 1.0) -> None:
-    """Draw the outline below a path that is widened by a factor."""
-    _line(picture, view.project(positions), colour, (wider + 1.0) * _line_width(view))
+        _line(picture, pixels[first : last + 1], colours[last], wider * max(2.0, view.width * _LINE))
 
 
 def draw_end(picture: Image.Image, view: View, position: FloatArray, colour: Colour, wider: float = 1.0) -> None:
@@ -408,10 +403,6 @@ def _mark(pen: ImageDraw.ImageDraw, column: float, row: float, radius: float, co
     box = [column - radius, row - radius, column + radius, row + radius]
     draw = pen.ellipse if colour == START else pen.rectangle
     draw(box, fill=colour, outline=INK if colour == START else HALO, width=max(1, round(radius / 4)))
-
-
-def _line_width(view: View) -> float:
-    return max(2.0, view.width * _LINE)
 
 
 def _line(picture: Image.Image, pixels: FloatArray, colour: Colour, width: float) -> None:
