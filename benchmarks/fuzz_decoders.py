@@ -32,8 +32,8 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
     from lidarslam.simulation.recorder import Rig, SimulatedScan
     from lidarslam.simulation.writers import FORMATS
+    from lidarslam.storage.directory import About
     from lidarslam.storage.finished_run import read_summary
-    from lidarslam.storage.unfinished import About
 
 # Of memory, seconds for one input, and its bytes.
 _LIMITS = ("-rss_limit_mb=2048", "-timeout=20", "-max_len=65536")

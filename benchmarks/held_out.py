@@ -23,8 +23,8 @@ from mapping_accuracy import METHODS, Recorded, pipeline_results, print_header, 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
-from lidarslam.evaluation.trajectory.association import Association
-from lidarslam.evaluation.trajectory.drift import segment_errors
+from lidarslam.evaluation.trajectory.alignment import Association
+from lidarslam.evaluation.trajectory.metrics import segment_errors
 from lidarslam.odometry.config import LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import Motion
 from lidarslam.pipeline.threads import in_order

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.compare.comparison import Narrator, compare
-from lidarslam.compare.methods import parse_methods
-from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.core.tasks import Where
 from lidarslam.simulation.record import RecordRequest, record
 

@@ -54,11 +54,10 @@ from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.run import open_odometry
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import Spinning
-from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.directory import RunDirectory, Unfinished
 
 
 @dataclass(frozen=True)

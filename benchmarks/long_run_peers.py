@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from memory import resident_mb
 
-from lidarslam.compare.peers.estimation import estimate
+from lidarslam.compare.peers.estimation import PEERS, Peer, estimate
 from lidarslam.compare.peers.interface import Poses, Sweep
-from lidarslam.compare.peers.registry import PEERS, Peer
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan

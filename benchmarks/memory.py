@@ -44,12 +44,11 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.sensors import SENSORS, Spinning
 from lidarslam.simulation.world import WORLDS
-from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.storage.directory import RunDirectory, Unfinished
 
 _NOISE_M, _STILL_POINTS = 0.005, 300
 _WITHOUT_ODOMETRY = ["odometry.method=constant-velocity"]

@@ -16,9 +16,8 @@ from concurrent.futures.process import BrokenProcessPool
 
 from mapping_accuracy import make_simulation, print_row
 
-from lidarslam.compare.peers.estimation import estimate
+from lidarslam.compare.peers.estimation import PEERS, estimate
 from lidarslam.compare.peers.interface import PeerError
-from lidarslam.compare.peers.registry import PEERS
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory

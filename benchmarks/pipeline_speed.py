@@ -31,9 +31,8 @@ import numpy as np
 from mapping_accuracy import make_simulation, print_header, print_row
 from numpy.typing import NDArray
 
-from lidarslam.compare.methods import parse_method
-from lidarslam.compare.peers.estimation import estimate
-from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.estimation import PEERS, estimate
+from lidarslam.compare.plan import parse_method
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.recording import Recording

@@ -36,12 +36,12 @@ from mapping_accuracy import print_header, print_row
 from peers import run_peer
 
 from lidarslam.cli import main as lidarslam
+from lidarslam.compare.peers.estimation import PEERS
 from lidarslam.compare.peers.interface import PeerError
-from lidarslam.compare.peers.registry import PEERS
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.alignment import associate
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.pipeline.threads import in_order
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.compare import compare, demo
-from lidarslam.commands.config import config
-from lidarslam.commands.evaluate import evaluate
+from lidarslam.commands.compare import compare, demo, evaluate
 from lidarslam.commands.exports import edit, export_bag, export_geo, export_grid, export_mesh
 from lidarslam.commands.network import export, train
+from lidarslam.commands.options import config
 from lidarslam.commands.recordings import datasets, info, simulate
 from lidarslam.commands.runs import live, localise, merge, run
 from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option

@@ -20,8 +20,7 @@ from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.request import RunRequest, describe_run, log_choices, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, format_end, format_times
 from lidarslam.run.run import Progress, RunSession, open_session, track
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import WrittenMap, summarise
+from lidarslam.run.summary import ScanLog, WrittenMap, summarise
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY
 from lidarslam.storage.finished_run import load_map

@@ -17,7 +17,7 @@ from lidarslam.commands.runs import run
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.merge.parts import MergedRecording, MergeOutcome, MergeSummary
+from lidarslam.merge.merge import MergedRecording, MergeOutcome, MergeSummary
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network

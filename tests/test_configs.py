@@ -5,8 +5,7 @@ from typing import get_args
 
 import pytest
 
-from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
-from lidarslam.config.yaml_text import YamlError, parse_yaml
+from lidarslam.config.settings import Config, YamlError, dump_yaml, load_config, parse_yaml, reader_settings
 from lidarslam.core.errors import ConfigError
 from lidarslam.mapping.config import MappingConfig, MappingName
 from lidarslam.train.settings import TrainConfig, load_train_config

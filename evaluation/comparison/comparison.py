@@ -15,8 +15,7 @@ from lidarslam.core.settings import Settings
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.map.metrics import CloudErrors
-from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
+from lidarslam.evaluation.trajectory.metrics import SHORT_LENGTHS_M, TrajectoryMetrics, metrics_json
 
 Value = float | str | None
 
@@ -71,10 +70,7 @@ class Table:
     folded: bool = False  # whether the page shows it on request only
 
     def best(self) -> set[tuple[int, int]]:
-        """(row, column) of the best value of each ranked column, and of all that look equal to it.
-
-        None in a column without two comparable numbers that differ.
-        """
+        """(row, column) of the best values of each ranked column with two comparable numbers that differ."""
         found = set()
         for number, column in enumerate(self.columns):
             cells = [row.cells[number] for row in self.rows]

@@ -8,8 +8,7 @@ from typing import Literal
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.evaluation.comparison.comparison import SequenceComparison, look_up
-from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M
-from lidarslam.evaluation.trajectory.metrics import metrics_json
+from lidarslam.evaluation.trajectory.metrics import KITTI_LENGTHS_M, SHORT_LENGTHS_M, metrics_json
 
 Figures = Mapping[str, object]
 """metrics.json and summary.json under the keys `metrics` and `summary`."""

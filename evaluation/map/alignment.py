@@ -119,10 +119,7 @@ def _is_same(T_a: FloatArray, T_b: FloatArray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Clouds:
-    """Both clouds, thinned, each relative to its own median, for the digits of ICP whatever the survey's origin.
-
-    Poses are between these local frames.
-    """
+    """Both clouds, thinned, each relative to its own median, for the digits of ICP; poses are between these frames."""
 
     mapped: FloatArray
     reference: FloatArray

@@ -16,7 +16,7 @@ from lidarslam.evaluation.comparison.comparison import (
     lost_intervals,
     times_note,
 )
-from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
+from lidarslam.evaluation.trajectory.metrics import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
 _SUMMARY = (
     "ate_rmse_m",

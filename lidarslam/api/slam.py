@@ -34,7 +34,7 @@ from lidarslam.run.calibration import make_imu_stream
 from lidarslam.run.loop_closing import GraphOutcome, begin_graph, correct
 from lidarslam.run.results import Tracked, TrackedScans, corrected_map, write_results
 from lidarslam.run.run import draw_report, open_odometry
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage.directory import RunDirectory
 
 logger = logging.getLogger(__name__)
@@ -188,8 +188,7 @@ class Slam:
             self._settle()
             if not self._log.table["points"].any():
                 raise InputError("there is nothing to save: no scan with points was registered")
-            for warning in self._imu.warnings if self._imu is not None else ():
-                self._log.warn(warning)
+            self._log.warn(*(self._imu.warnings if self._imu is not None else ()))
             self._pipeline.map.slides.finish()
             described = {"version": version("lidarslam"), "source": None}
             with RunDirectory.create(Path(directory), overwrite) as run:

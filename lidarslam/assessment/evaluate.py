@@ -32,10 +32,16 @@ from lidarslam.evaluation.map.metrics import (
     compare_maps,
 )
 from lidarslam.evaluation.report.drawing import DEFAULT_CLIP_M, DISTANCE_FIELD, error_colours
-from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, align_poses
-from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, common_instants
-from lidarslam.evaluation.trajectory.drift import Drift
+from lidarslam.evaluation.trajectory.alignment import (
+    DEFAULT_MAX_GAP_S,
+    DEFAULT_TOLERANCE_S,
+    AlignmentMethod,
+    align,
+    align_poses,
+    common_instants,
+)
 from lidarslam.evaluation.trajectory.metrics import (
+    Drift,
     TrajectoryMetrics,
     disagreement,
     evaluate_trajectory,
@@ -164,7 +170,7 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         metrics = evaluate_trajectory(trajectory, true, request.tolerance_s, request.max_gap_s, request.alignment)
         notes += [warning] if (warning := disagreement(metrics)) is not None else []
     # Poses of KITTI's camera do not give the LiDAR's world.
-    in_camera = estimate.run is not None and reference is not None and reference.stamps is None
+    in_camera = estimate.run is not None and reference is not None and not reference.has_stamps
     compared = _evaluate_map(request, estimate, None if in_camera else metrics, notes)
     if request.errors and compared is None:
         raise InputError("--errors colours a map by its distance to a reference; name one with --reference-map MAP")
@@ -229,10 +235,7 @@ def _evaluate_map(
 def evaluate_map(
     estimate: Estimate, metrics: TrajectoryMetrics | None, reference: ReferenceMap, options: MapOptions | None = None
 ) -> MapEvaluation:
-    """Compare the map of an estimate, in the world of its poses, with a reference map.
-
-    The metrics are those of its trajectory, None when that has no reference.
-    """
+    """Compare the map of an estimate with a reference; the metrics are its trajectory's, None without a reference."""
     options = options or MapOptions()
     points = estimate.map_points()
     T_reference_world, positions = _along_trajectory(estimate, metrics, reference)
@@ -251,16 +254,16 @@ def _along_trajectory(
 
     The positions are the true ones where there are any, as those of a lost trajectory are wrong.
     """
-    poses, method = estimate.poses, "se3" if metrics is None else metrics.alignment
+    trajectory, method = estimate.poses.trajectory, "se3" if metrics is None else metrics.alignment
     association = None if metrics is None else metrics.association
     T_reference_world = None if metrics is None else metrics.T_reference_estimate_joint
-    if reference.truth is not None and poses.stamps is not None:
-        association = common_instants(Trajectory(poses.stamps, poses.T_world_lidar), reference.truth)
+    if reference.truth is not None and estimate.poses.has_stamps:
+        association = common_instants(trajectory, reference.truth)
         if association is not None:
             pair = association.estimate, association.reference
             T_reference_world = align_poses(*pair, align(*pair, method), method)
     if association is None or T_reference_world is None:
-        return None, poses.T_world_lidar[:, :3, 3]
+        return None, trajectory.positions
     return T_reference_world, transform_points(inverse(T_reference_world), association.reference.positions)
 
 

@@ -9,19 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.config.settings import Config, load_config
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import Config, load_config, read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
 from lidarslam.datasets.point_table import coordinates
 from lidarslam.datasets.registry import absent, is_recording, open_recording
 from lidarslam.simulation.record import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.storage import directory as files
+from lidarslam.storage.directory import require_whole
 from lidarslam.storage.finished_run import read_trajectory
-from lidarslam.storage.unfinished import require_whole
 
 # Surveys end well within this; squares of much more overflow.
 _FARTHEST_M = 1e9
@@ -116,8 +115,6 @@ _READERS: dict[str, Callable[[Path], FloatArray]] = {
 }
 
 
-# KITTI's LiDAR turns ten times a second; only speeds depend on it.
-_KITTI_PERIOD_S = 0.1
 _KITTI_COLUMNS = 12
 _ADVICE = "name a trajectory with --reference or a map with --reference-map"
 
@@ -127,20 +124,9 @@ class Poses:
     """A trajectory with or without stamps."""
 
     label: str  # for messages
-    stamps: FloatArray | None  # (N,), None in KITTI's text format
-    T_world_lidar: FloatArray  # (N, 4, 4); of KITTI's camera where the file is in that frame
+    trajectory: Trajectory  # of KITTI's camera where the file is in that frame
+    has_stamps: bool = True  # not in KITTI's text format: those are made up, and only speeds depend on them
     T_cam_lidar: FloatArray | None = None  # of a KITTI recording, whose pose files are in the camera's frame
-
-    @classmethod
-    def of(cls, label: str, trajectory: Trajectory, T_cam_lidar: FloatArray | None = None) -> "Poses":
-        """Those of a trajectory."""
-        return cls(label, trajectory.stamps, trajectory.T_world_lidar, T_cam_lidar)
-
-    def in_camera(self) -> "Poses":
-        """The same in the frame of KITTI's camera, if there is one."""
-        if self.T_cam_lidar is None:
-            return self
-        return Poses(self.label, self.stamps, self.T_cam_lidar @ self.T_world_lidar @ inverse(self.T_cam_lidar))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +158,12 @@ class Estimate:
 def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Estimate:
     """A run directory, or a trajectory, in memory or in TUM or KITTI text, with a map given separately."""
     if isinstance(path, Trajectory):
-        return Estimate(Poses.of("the trajectory", path), map_file=map_file)
+        return Estimate(Poses("the trajectory", path), map_file=map_file)
     if not path.exists():
         raise InputError(absent(path))
     if not path.is_dir():
         return Estimate(_read_poses(path), map_file=map_file)
-    poses, config_file = Poses.of(str(path), read_trajectory(path)), path / files.CONFIG
+    poses, config_file = Poses(str(path), read_trajectory(path)), path / files.CONFIG
     own_map = path / files.MAP_PLY
     chosen_map = map_file or (own_map if own_map.is_file() else None)
     if not config_file.is_file():
@@ -192,12 +178,12 @@ def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Esti
 def read_reference(path: Path | Trajectory, config: ReaderConfig) -> Poses:
     """A trajectory in memory or in TUM or KITTI text, that of a run directory, or the truth of a recording."""
     if isinstance(path, Trajectory):
-        return Poses.of("the reference", path)
+        return Poses("the reference", path)
     if not path.exists():
         raise InputError(absent(path))
     require_whole(path)
     if (path / files.TRAJECTORY_TUM).is_file():
-        return Poses.of(f"the run {path}", read_trajectory(path))
+        return Poses(f"the run {path}", read_trajectory(path))
     if path.is_dir() or is_recording(path):
         return _recording_truth(path, config)
     return _read_poses(path)
@@ -208,15 +194,14 @@ def _recording_truth(source: Path, config: ReaderConfig) -> Poses:
     truth = recording.ground_truth
     if truth is None:
         raise InputError(f"{source}: came with no ground truth; {_ADVICE}")
-    return Poses.of(f"the ground truth of {source}", truth, recording.T_cam_lidar)
+    return Poses(f"the ground truth of {source}", truth, T_cam_lidar=recording.T_cam_lidar)
 
 
 def truth_of_run(run: Path) -> Trajectory | None:
     """The ground truth that came with the recording of a run; None without, or where it is not available."""
     estimate = read_estimate(run)
     with suppress(InputError):
-        truth = estimate.truth()
-        return None if truth.stamps is None else Trajectory(truth.stamps, truth.T_world_lidar)
+        return estimate.truth().trajectory
     return None
 
 
@@ -230,8 +215,8 @@ def _read_poses(path: Path) -> Poses:
             f"{path}: neither a TUM nor a KITTI trajectory; it is not text. Name a run directory or a trajectory file"
         ) from error
     if columns == _KITTI_COLUMNS:
-        return Poses(str(path), None, read_kitti_poses(path))
-    return Poses.of(str(path), read_tum(path))
+        return Poses(str(path), Trajectory.from_kitti(path), has_stamps=False)
+    return Poses(str(path), read_tum(path))
 
 
 def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
@@ -240,22 +225,20 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
     KITTI's text has no stamps, so that its poses are matched by their number, and is in the camera's frame: the truth
     of a recording is brought there, and a run is represented by its own trajectory in that format.
     """
-    poses = estimate.poses
-    if reference.stamps is None and estimate.run is not None and (estimate.run / files.TRAJECTORY_KITTI).is_file():
-        poses = Poses(poses.label, poses.stamps, read_kitti_poses(estimate.run / files.TRAJECTORY_KITTI))
-    if poses.stamps is None:
-        reference = reference.in_camera()
-    if poses.stamps is not None and reference.stamps is not None:
-        return Trajectory(poses.stamps, poses.T_world_lidar), Trajectory(reference.stamps, reference.T_world_lidar)
-    count = len(poses.T_world_lidar)
-    if count != len(reference.T_world_lidar):
+    ours, true, T_cam_lidar = estimate.poses.trajectory, reference.trajectory, reference.T_cam_lidar
+    if estimate.poses.has_stamps and reference.has_stamps:
+        return ours, true
+    if not reference.has_stamps and estimate.run is not None and (estimate.run / files.TRAJECTORY_KITTI).is_file():
+        ours = Trajectory.from_kitti(estimate.run / files.TRAJECTORY_KITTI, ours.stamps)
+    if not estimate.poses.has_stamps and T_cam_lidar is not None:
+        true = Trajectory(true.stamps, T_cam_lidar @ true.T_world_lidar @ inverse(T_cam_lidar))
+    if len(ours) != len(true):
         raise InputError(
-            f"{poses.label} has {count:,} poses, {reference.label} has {len(reference.T_world_lidar):,}, and KITTI's"
-            " text format has no stamps to match them by; give both as TUM files, or the same poses in both"
+            f"{estimate.poses.label} has {len(ours):,} poses, {reference.label} has {len(true):,}, and KITTI's text"
+            " format has no stamps to match them by; give both as TUM files, or the same poses in both"
         )
-    stamps = poses.stamps if poses.stamps is not None else reference.stamps
-    stamps = _KITTI_PERIOD_S * np.arange(count, dtype=np.float64) if stamps is None else stamps
-    return Trajectory(stamps, poses.T_world_lidar), Trajectory(stamps, reference.T_world_lidar)
+    stamps = ours.stamps if estimate.poses.has_stamps else true.stamps
+    return Trajectory(stamps, ours.T_world_lidar), Trajectory(stamps, true.T_world_lidar)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""`lidarslam compare`: several methods in one table; `lidarslam demo`: on a simulated recording."""
+"""`lidarslam evaluate`: accuracy of a run; `compare`: several methods in one table; `demo`: a simulated recording."""
 
 import sys
 from pathlib import Path
@@ -8,8 +8,102 @@ import click
 from click.core import ParameterSource
 
 from lidarslam.commands import options as opt
+from lidarslam.commands.options import FILE, PATH, POSITIVE
 from lidarslam.commands.terminal import EXIT_GATE, EXIT_MENDABLE, note, say
 from lidarslam.core.errors import ConfigError
+
+_SECONDS = click.FloatRange(min=0.0)
+
+
+@opt.command(
+    """lidarslam evaluate
+    lidarslam evaluate runs/04
+    lidarslam evaluate runs/04 --max ate=0.1 --max lost=0
+    lidarslam evaluate runs/site --reference-map survey.laz --errors errors.ply
+    lidarslam evaluate kitti_00.txt --reference poses/00.txt"""
+)
+@click.argument("run", type=PATH, required=False)
+@click.option(
+    "--reference",
+    type=PATH,
+    metavar="TRAJ",
+    help="TUM or KITTI file, run directory, or recording with ground truth.  [default: that of the source]",
+)
+@click.option("--no-reference", is_flag=True, help="Compute only the entropy of the map.")
+@click.option(
+    "--alignment",
+    type=click.Choice(["se3", "first_pose", "none"]),
+    default="se3",
+    show_default=True,
+    help="Alignment of the trajectory to the reference for the ATE.",
+)
+@click.option("--tolerance-s", type=_SECONDS, help="Largest time between matching poses.  [default: 0.02]")
+@click.option("--max-gap-s", type=_SECONDS, help="Largest gap of the reference to interpolate.  [default: 0.5]")
+@click.option(
+    "--reference-map",
+    type=PATH,
+    metavar="MAP",
+    help=".ply, .pcd, .las, .laz or .e57 file.  [default: the exact map of a simulated source]",
+)
+@click.option("--map", "map_file", type=PATH, metavar="FILE", help="Map to evaluate.  [default: that of the run]")
+@click.option(
+    "--map-alignment",
+    metavar="[auto|trajectory|global|none|FILE]",
+    default="auto",
+    show_default=True,
+    help="Alignment of the map to the reference map: by the trajectories, by a global search, none, or the 4x4 matrix"
+    " in a text file, which takes the map to the reference.",
+)
+@click.option("--refine/--no-refine", default=None, help="Refine the alignment by ICP.  [default: refine, unless none]")
+@click.option("--spacing", "spacing_m", type=POSITIVE, help="Voxel that both maps are thinned to, m.  [default: 0.05]")
+@click.option(
+    "--max-range",
+    "max_range_m",
+    type=POSITIVE,
+    help="Distance from the path up to which the map should be complete, m.  [default: the range of the run's map]",
+)
+@click.option("--errors", type=PATH, multiple=True, metavar="FILE", help="Save the map coloured by error: .ply, .rrd.")
+@click.option(
+    "--errors-clip",
+    "errors_clip_m",
+    type=POSITIVE,
+    default=0.5,
+    show_default=True,
+    help="Error of the brightest colour, m.",
+)
+@click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.  [default: report]")
+@opt.gate_options(with_method=False)
+@click.option("-o", "--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
+@click.pass_context
+def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
+    """Evaluate a trajectory and its map.
+
+    RUN is a run directory, or a trajectory in TUM or KITTI text.  [default: the latest run in runs]
+
+    Exit status 4 if a bound of --max or --min is not met; everything is written then too.
+    """
+    from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
+    from lidarslam.evaluation.comparison.gates import format_gates, judge
+    from lidarslam.storage.finished_run import read_summary
+
+    gates = (*options.pop("maxima"), *options.pop("minima"))
+    given = {name: value for name, value in options.items() if value is not None}
+    if given.get("reference") and given["no_reference"]:
+        raise click.UsageError("--reference and --no-reference exclude each other; choose one")
+    named = {"map_alignment": "alignment", "refine": "refine", "spacing_m": "spacing_m", "max_range_m": "max_range_m"}
+    map_options = MapOptions(**{named[name]: given.pop(name) for name in named if name in given})
+    request = EvaluateRequest(
+        run or opt.latest_run(), needs_reference=not given.pop("no_reference"), map_options=map_options, **given
+    )
+    evaluation = evaluate(request)
+    say(format_evaluation(evaluation))
+    if gates:
+        directory = evaluation.estimate.run
+        summary = {} if directory is None else read_summary(directory)
+        judged = judge(gates, {"metrics": evaluation.to_json(), "summary": summary})
+        say(f"\n{format_gates(judged)}")
+        if not all(gate.passed for gate in judged):
+            ctx.exit(EXIT_GATE)
 
 
 @opt.command(
@@ -23,7 +117,7 @@ from lidarslam.core.errors import ConfigError
     lidarslam compare --benchmark kitti --data KITTI
     lidarslam compare --benchmark simulated --jobs 4"""
 )
-@click.argument("sources", type=opt.PATH, nargs=-1, metavar="[SOURCE]...")
+@click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
 @opt.out_option("Folder for runs and report.", "compared/SOURCE_TIME, after the first, or the benchmark")
 @click.option(
     "--methods",
@@ -37,14 +131,12 @@ from lidarslam.core.errors import ConfigError
     type=opt.ShippedFile("benchmark", "BENCHMARKS"),
     help="Recordings and methods: a name of lidarslam config --list, or a YAML file.",
 )
-@click.option(
-    "--data", type=opt.PATH, metavar="DIR", help="Root of the benchmark's paths.  [default: the current folder]"
-)
-@click.option("--prior", type=opt.FILE, metavar="TUM_FILE", help="Trajectory of prior, prior+map and prior+loam.")
+@click.option("--data", type=PATH, metavar="DIR", help="Root of the benchmark's paths.  [default: the current folder]")
+@click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory of prior, prior+map and prior+loam.")
 @click.option("--reference", metavar="METHOD|FILE", help="Reference.  [default: the ground truth]")
-@click.option("--reference-map", type=opt.FILE, metavar="FILE", help="Point cloud to compare the maps with.")
-@click.option("--memory-limit-mb", type=opt.POSITIVE, help="Memory limit of a method.")
-@click.option("--timeout-s", type=opt.POSITIVE, help="Time limit of a method.")
+@click.option("--reference-map", type=FILE, metavar="FILE", help="Point cloud to compare the maps with.")
+@click.option("--memory-limit-mb", type=POSITIVE, help="Memory limit of a method.")
+@click.option("--timeout-s", type=POSITIVE, help="Time limit of a method.")
 @opt.scan_options
 @opt.gate_options(with_method=True)
 @opt.jobs_options
@@ -64,11 +156,10 @@ def compare(
     """
     from lidarslam.compare.comparison import run_compare
     from lidarslam.compare.method_run import Limits
-    from lidarslam.compare.methods import DEFAULT_METHODS, parse_methods
-    from lidarslam.compare.plan import CompareRequest, RecordingEntry
+    from lidarslam.compare.plan import DEFAULT_METHODS, CompareRequest, RecordingEntry, parse_methods
     from lidarslam.config.settings import reader_settings
     from lidarslam.core.text import command_line
-    from lidarslam.storage.default_places import source_name
+    from lidarslam.storage.finished_run import source_name
 
     if (benchmark is None) == (not sources):
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
@@ -112,7 +203,7 @@ def compare(
 
 @opt.command("lidarslam demo -o demo")
 @click.option(
-    "-o", "--out", type=opt.PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
+    "-o", "--out", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
 )
 @click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:

@@ -69,11 +69,11 @@ def edit(sources: tuple[Path, ...], out: Path, overwrite: bool, **options: Any) 
     SOURCE is a run directory, or a .ply or .pcd cloud; several are in one frame unless --transform or --register says
     where they lie. The edits are made in the order of the options here.
     """
-    from lidarslam.exports.map import SUFFIXES, MapEdits, edit_map
+    from lidarslam.exports.map import MAP_SUFFIXES, MapEdits, edit_map
     from lidarslam.exports.source import require_new
     from lidarslam.mapping.global_map.point_cloud import require_format
 
-    _require_suffix(out, SUFFIXES)
+    _require_suffix(out, MAP_SUFFIXES)
     if options["transforms"] and len(options["transforms"]) != len(sources) - 1:
         raise click.UsageError(f"expected a --transform for each of the {len(sources) - 1} further sources")
     box = options["box"]
@@ -160,10 +160,10 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, overwrite: boo
     RUN is a run directory. The grid is map.yaml and map.pgm; obstacles are points between two heights above the local
     ground.
     """
-    from lidarslam.exports.grid import SUFFIXES, export_grid
+    from lidarslam.exports.map import GRID_SUFFIXES, export_grid
     from lidarslam.exports.source import require_new
 
-    _require_suffix(out, SUFFIXES)
+    _require_suffix(out, GRID_SUFFIXES)
     for file in (out, out.with_suffix(".pgm")):
         require_new(file, overwrite)
     for line in export_grid(run, out, resolution_m, heights):
@@ -182,10 +182,10 @@ def export_mesh(run: Path, out: Path, cell_m: float | None, overwrite: bool) -> 
 
     RUN is a run directory. Poisson reconstruction, without the surface where the map has no points.
     """
-    from lidarslam.exports.mesh import SUFFIXES, export_mesh
+    from lidarslam.exports.map import MESH_SUFFIXES, export_mesh
     from lidarslam.exports.source import require_new
 
-    _require_suffix(out, SUFFIXES)
+    _require_suffix(out, MESH_SUFFIXES)
     require_new(out, overwrite)
     for line in export_mesh(run, out, cell_m):
         say(line)

@@ -50,7 +50,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     --jobs and --ray are for the preparation of recordings.
     """
     from lidarslam.odometry.registry import require_train_extra
-    from lidarslam.storage.default_places import source_name
+    from lidarslam.storage.finished_run import source_name
 
     if out is None:
         if options["resume"]:

@@ -1,6 +1,6 @@
-"""Options that several commands share, and the configuration they result in."""
+"""Options that several commands share; `lidarslam config`: the configuration they result in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import click
 from click.shell_completion import CompletionItem
 
-from lidarslam.commands.terminal import note, verbose_option
+from lidarslam.commands.terminal import note, say, verbose_option
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.plugins import PlugPoint
+from lidarslam.core.text import printable
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
@@ -176,7 +177,7 @@ def out_option(what: str, default: str) -> _Decorator:
 
 def default_out(folder: str, name: str) -> Path:
     """A new directory FOLDER/NAME_TIME, which is noted."""
-    from lidarslam.storage.default_places import new_place
+    from lidarslam.storage.finished_run import new_place
 
     out = new_place(Path(folder), name)
     note(f"results go to {out}")
@@ -185,11 +186,11 @@ def default_out(folder: str, name: str) -> Path:
 
 def latest_run() -> Path:
     """The latest run in `runs`, which is noted; UsageError where there is none."""
-    from lidarslam.storage import default_places
+    from lidarslam.storage import finished_run
 
-    run = default_places.latest_run()
+    run = finished_run.latest_run()
     if run is None:
-        raise click.UsageError(f"name a RUN; {default_places.RUNS} holds no finished one")
+        raise click.UsageError(f"name a RUN; {finished_run.RUNS} holds no finished one")
     note(f"taking the latest run, {run}")
     return run
 
@@ -200,12 +201,18 @@ def take_config(options: dict[str, Any], *sources: Path) -> "Config":
     Options that a source does not use are noted.
     """
     from lidarslam.config.settings import load_config, reader_settings
+    from lidarslam.datasets.registry import choose_reader, takes_sequence
 
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     settings = [*options.pop("settings"), *_method_settings(options), *reader_settings(**reader)]
     config = load_config(options.pop("config_file"), settings)
+    topic, sequence = reader["topic"], reader["sequence"]
     for source in sources:
-        _note_unused(source, config.reader.name, reader["topic"], reader["sequence"])
+        chosen = choose_reader(source, config.reader.name)
+        if topic is not None and chosen != "rosbag":
+            note(f"--topic {topic} is ignored: {source} is not a bag ({chosen})")
+        if sequence is not None and not takes_sequence(source, chosen):
+            note(f"--sequence {sequence} is ignored: {source} is one recording ({chosen})")
     return config
 
 
@@ -239,16 +246,6 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
     ]
 
 
-def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
-    from lidarslam.datasets.registry import choose_reader, takes_sequence
-
-    chosen = choose_reader(source, reader)
-    if topic is not None and chosen != "rosbag":
-        note(f"--topic {topic} is ignored: {source} is not a bag ({chosen})")
-    if sequence is not None and not takes_sequence(source, chosen):
-        note(f"--sequence {sequence} is ignored: {source} is one recording ({chosen})")
-
-
 def gate_options(with_method: bool) -> _Decorator:
     """The options `--max` and `--min`, in a comparison also of one method; their values are `maxima` and `minima`."""
 
@@ -277,3 +274,33 @@ def take_where(options: dict[str, Any]) -> "Where":
     if cluster is not None and jobs > 1:
         raise click.UsageError("--jobs is of this machine; a cluster computes as many tasks at once as it has CPUs")
     return Where(jobs, cluster)
+
+
+@command(
+    """lidarslam config --list
+    lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5"""
+)
+@click.option("--list", "listing", is_flag=True, help="List the configurations and benchmarks that come along.")
+@config_options
+def config(listing: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
+    """Print the resolved configuration as YAML."""
+    from lidarslam.config.settings import dump_yaml, load_config
+
+    if listing:
+        say("\n".join(_shipped()))
+        return
+    click.echo(printable(dump_yaml(load_config(config_file, settings))), nl=False)
+
+
+def _shipped() -> Iterator[str]:
+    from lidarslam.config.settings import BENCHMARKS, CONFIGS, headline, read_yaml, shipped_files
+
+    kinds = {"--config NAME": shipped_files(CONFIGS), "compare --benchmark NAME": shipped_files(BENCHMARKS)}
+    width = max(len(name) for files in kinds.values() for name in files) + 2
+    for kind, files in kinds.items():
+        yield kind
+        for name, path in files.items():
+            yield f"  {name:<{width}}{headline(path)}"
+            if data := read_yaml(path).get("data"):
+                yield f"  {'':<{width}}--data: {data}"
+    yield f"The files are in {CONFIGS}"

@@ -117,7 +117,7 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
             from lidarslam.run.request import RunRequest
             from lidarslam.run.results import format_outcome, format_stop
             from lidarslam.run.run import execute
-            from lidarslam.storage.default_places import source_name, unfinished_run
+            from lidarslam.storage.finished_run import source_name, unfinished_run
 
             config, map_formats = opt.take_config(options, source), _take_map_formats(options)
             given, sequence = _take_loops(options), config.reader.sequence
@@ -260,7 +260,7 @@ def localise(
         with _loading(source.name) as progress:
             from lidarslam.localise import LocaliseRequest, execute, format_localisation, format_not_found
             from lidarslam.run.request import RunRequest
-            from lidarslam.storage.default_places import source_name
+            from lidarslam.storage.finished_run import source_name
 
             config = opt.take_config(options, source)
             out = out or opt.default_out("localised", source_name(source, config.reader.sequence))
@@ -302,10 +302,10 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     map, and for each recording a run directory with its poses in the common frame. A recording without a loop closure
     to the others is left out of the common map, and the exit status is 1.
     """
+    from lidarslam.merge.merge import MergeRequest, format_merge
     from lidarslam.merge.merge import merge as execute
-    from lidarslam.merge.parts import MergeRequest, format_merge
     from lidarslam.run.progress import show_progress
-    from lidarslam.storage.default_places import source_name
+    from lidarslam.storage.finished_run import source_name
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a merge, --overwrite replaces it; choose one")

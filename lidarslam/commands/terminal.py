@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import time
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import click
@@ -28,13 +27,11 @@ def note(line: str) -> None:
     click.echo(f"lidarslam: {one_line(line)}", err=True)
 
 
-@contextlib.contextmanager
-def serving() -> "Iterator[WebPage]":
+def serving() -> "contextlib.AbstractContextManager[WebPage]":
     """A page, whose address is printed when there is something to show."""
     from lidarslam.viewer.rerun_program import served_page
 
-    with served_page(_announce) as page:
-        yield page
+    return served_page(_announce)
 
 
 def wait_for_interrupt(announcement: str | None = None) -> None:

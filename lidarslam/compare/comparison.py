@@ -1,28 +1,23 @@
 """A comparison: every method on every recording, each in its own process; one result for all, and its text."""
 
 import contextlib
+import os
+import platform
+import subprocess
 import tarfile
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 
 from lidarslam.assessment.evaluate import evaluate_map
 from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
-from lidarslam.compare.method_run import (
-    COMMAND,
-    PROCESS,
-    Limits,
-    MethodRun,
-    clear,
-    finished_before,
-    obstacle,
-    run_method,
-)
-from lidarslam.compare.methods import scene_note
+from lidarslam.compare import method_run
+from lidarslam.compare.method_run import Limits, MethodRun
 from lidarslam.compare.plan import (
     CompareRequest,
     PlannedRecording,
@@ -31,10 +26,11 @@ from lidarslam.compare.plan import (
     make_plan,
     make_recordings,
     require_data,
+    scene_note,
 )
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer
-from lidarslam.core.tasks import open_tasks
+from lidarslam.core.tasks import open_tasks, usable_cores
 from lidarslam.core.text import as_typed, command_line, count, joined
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.fetched import fetch, url_of
@@ -54,10 +50,8 @@ from lidarslam.evaluation.comparison.comparison import (
     times_note,
 )
 from lidarslam.evaluation.comparison.gates import format_gates, judge_comparison, require_methods
-from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.evaluation.trajectory.metrics import SHORT_LENGTHS_M, evaluate_trajectory
 from lidarslam.run.interruption import ended_like_interrupted
-from lidarslam.run.machine import machine, versions
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.finished_run import COMPARISON, REPORT_HTML, REPORT_MD, read_summary
@@ -113,7 +107,7 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
     return replace(outcome, gates_passed=all(gate.passed for gate in judged))
 
 
-def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = COMMAND) -> CompareOutcome:
+def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = method_run.COMMAND) -> CompareOutcome:
     """Run, evaluate, and write comparison.json and the report.
 
     A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. The command is the
@@ -174,7 +168,7 @@ class _Turns:
             nonlocal counted
             (planned, run), (result, packed) = wanted[index], done
             if packed is not None:
-                clear(run.request.out)
+                method_run.clear(run.request.out)
                 with tarfile.open(fileobj=BytesIO(packed)) as archive:
                     archive.extractall(run.request.out, filter="data")
             counted += scans[index]
@@ -182,7 +176,7 @@ class _Turns:
             self._done[run.request.out] = result
             self.narrator.tell(format_result(planned.name, result))
 
-        command, is_remote = None if self.command == COMMAND else self.command, where.cluster is not None
+        command, is_remote = None if self.command == method_run.COMMAND else self.command, where.cluster is not None
         limits, here = self.request.limits, str(Path.cwd())
         tasks = [MethodTask(r, limits, command, here, url_of(r.request.source), is_remote) for _, r in wanted]
         with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
@@ -196,9 +190,9 @@ class _Turns:
         """An earlier result, or why there is none; None where the method has to be run."""
         if self.interrupted:
             return MethodResult(run.name, "not run", _INTERRUPTED)
-        if self.request.reuse and (earlier := finished_before(run)) is not None:
+        if self.request.reuse and (earlier := method_run.finished_before(run)) is not None:
             return earlier
-        why = obstacle(run, planned.recording)
+        why = method_run.obstacle(run, planned.recording)
         return None if why is None else MethodResult(run.name, "not run", why)
 
     def measured(self, planned: PlannedRecording) -> SequenceComparison:
@@ -222,7 +216,7 @@ class _Turns:
         result = MethodResult(run.name, "not run", _INTERRUPTED)
         try:
             with self.narrator.counting(f"{planned.name} {run.name}") as counter:
-                result, self.interrupted = run_method(run, self.request.limits, counter, self.command)
+                result, self.interrupted = method_run.run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
         return result
@@ -253,7 +247,7 @@ def run_task(task: MethodTask) -> tuple[MethodResult, bytes | None]:
             # The last two parts are in the result.
             request = replace(request, out=place / request.out.parent.name / request.out.name)
         run = replace(task.run, request=request)
-        result, _ = run_method(run, task.limits, lambda *_: None, task.command or COMMAND)
+        result, _ = method_run.run_method(run, task.limits, lambda *_: None, task.command or method_run.COMMAND)
         return result, _packed(request.out) if task.is_remote else None
 
 
@@ -261,7 +255,7 @@ def _packed(folder: Path) -> bytes:
     """The files of a run directory; last the one that says how the process ended, which marks a whole one."""
     packed = BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:
-        for path in sorted(folder.iterdir(), key=lambda path: (path.name == PROCESS, path)):
+        for path in sorted(folder.iterdir(), key=lambda path: (path.name == method_run.PROCESS, path)):
             archive.add(path, path.name)
     return packed.getvalue()
 
@@ -423,3 +417,46 @@ def _table_lines(table: Table) -> Iterator[str]:
     if table.note:
         yield table.note
     yield from (f"[{number}] {source}" for number, source in enumerate(sources, start=1))
+
+
+_PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "onnxruntime", "open3d", "open3d-cpu", "torch")
+
+
+def versions() -> dict[str, str]:
+    """Versions of the programs that results depend on, and the commit of a checkout."""
+    found = {}
+    for name in _PROGRAMS:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    found["python"] = platform.python_version()
+    commit = _commit(Path(__file__).resolve().parents[2])
+    return found if commit is None else found | {"commit": commit}
+
+
+def machine() -> dict[str, str]:
+    """Processor, cores of this process, memory and system; unknown entries are left out."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    system = f"{platform.system()} {platform.release()} ({platform.machine()})"
+    described = {"processor": _processor(), "cores": str(usable_cores()), "memory": f"{memory:.1f} GiB"}
+    return {name: text for name, text in (described | {"system": system}).items() if text}
+
+
+def _commit(folder: Path) -> str | None:
+    """The commit of a checkout, marked where files differ from it; None without git or checkout."""
+    if not (folder / ".git").exists():
+        return None
+    command = ["git", "--no-optional-locks", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        done = subprocess.run([*command, "--exclude=*"], capture_output=True, text=True, timeout=10.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return " ".join(value.split())
+    return platform.processor()

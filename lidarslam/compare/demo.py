@@ -11,8 +11,7 @@ from pathlib import Path
 
 from lidarslam.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare, format_comparison
-from lidarslam.compare.methods import parse_methods
-from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text import as_typed, command_line
 from lidarslam.run.progress import show_count
@@ -34,10 +33,7 @@ class Demo:
 
 
 def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], None] = lambda _: None) -> Demo:
-    """Record this many sweeps, run the methods, compare them, draw the maps; an earlier demonstration is replaced.
-
-    `tell` is called with a line for each finished method.
-    """
+    """Record, run the methods, compare, draw the maps; `tell` is called with a line for each finished method."""
     source = out / RECORDING
     with show_count("recording") as counted:
         request = RecordRequest(

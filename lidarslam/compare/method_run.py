@@ -23,10 +23,8 @@ import psutil
 from pydantic import ConfigDict, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
-from lidarslam.compare.peers.estimation import describe_peer, execute_peer
-from lidarslam.compare.peers.registry import peer_named
-from lidarslam.config.settings import Config, dump_yaml
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.compare.peers.estimation import describe_peer, execute_peer, peer_named
+from lidarslam.config.settings import Config, dump_yaml, read_yaml
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.files import open_own, remove_partial_files
 from lidarslam.core.json_text import read_json

@@ -76,10 +76,7 @@ def remove_partial_files(directory: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory with its parents, unless it exists, and check that files can be written to it.
-
-    OutputError where they cannot.
-    """
+    """Make a directory with its parents, unless it exists; OutputError where files cannot be written to it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path, prefix=_PARTIAL):
@@ -161,19 +158,13 @@ def _sync(path: Path) -> None:
 
 
 def read_array(file: IO[bytes]) -> NDArray[Any]:
-    """Read one array in NumPy's format; never a pickle.
-
-    Exception where of nearly any kind, where the file is damaged.
-    """
+    """Read one array in NumPy's format, never a pickle; nearly any Exception where the file is damaged."""
     with ONE_READER:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def bounded_lines(path: Path) -> Iterator[str]:
-    """The lines of a file in UTF-8, without their ends.
-
-    InputError where the file is missing, is not text, or it or a line is too long.
-    """
+    """The lines of a text file without their ends; InputError where it is missing, no UTF-8, or too long."""
     read = 0
     try:
         with path.open("rb") as file:

@@ -146,10 +146,7 @@ def exp_rows(
 def rotation_vector(
     r00: float, r01: float, r02: float, r10: float, r11: float, r12: float, r20: float, r21: float, r22: float
 ) -> tuple[float, float, float, float]:
-    """The rotation vector of a matrix, and its angle.
-
-    Each row of 4 q q^T is a multiple of the quaternion; that with the largest diagonal is the best conditioned.
-    """
+    """The rotation vector of a matrix, and its angle, by the best conditioned row of 4 q q^T."""
     i, j, k = r21 - r12, r02 - r20, r10 - r01
     p, q, r = r01 + r10, r02 + r20, r12 + r21
     real, by_x, by_y = 1.0 + r00 + r11 + r22, 1.0 + r00 - r11 - r22, 1.0 - r00 + r11 - r22

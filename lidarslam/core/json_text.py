@@ -1,7 +1,4 @@
-"""JSON of unknown origin: bounded in length, finite numbers, a known shape.
-
-The only place where files of JSON are parsed.
-"""
+"""JSON of unknown origin, parsed here alone: bounded in length, finite numbers, a known shape."""
 
 import json
 import math
@@ -21,10 +18,7 @@ _LONGEST_BYTES = 64 << 20
 
 
 def read_json(path: Path, shape: TypeAdapter[T]) -> T:
-    """The content of a file in UTF-8.
-
-    OSError where it cannot be read; ValueError where it is too long, as `parse_json`.
-    """
+    """The content of a file; OSError where it cannot be read; ValueError where it is too long, as `parse_json`."""
     with path.open("rb") as file:
         content = file.read(_LONGEST_BYTES + 1)
     if len(content) > _LONGEST_BYTES:
@@ -33,10 +27,7 @@ def read_json(path: Path, shape: TypeAdapter[T]) -> T:
 
 
 def parse_json(text: str | bytes, shape: TypeAdapter[T]) -> T:
-    """The values of a text in UTF-8, of a shape.
-
-    ValueError of one line where it is not JSON, is nested too deeply, has another shape, or a number is not finite.
-    """
+    """Values of a shape; ValueError where the text is not JSON, has another shape, or a number is not finite."""
     try:
         values = json.loads(text, parse_float=_finite, parse_constant=_not_finite)
         return shape.validate_python(values)

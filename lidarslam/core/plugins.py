@@ -47,10 +47,7 @@ class PlugPoint:
         return name
 
     def load(self, name: str, kind: Any) -> Any:
-        """The object of another package's entry point.
-
-        ConfigError where it cannot be imported, or is of another kind.
-        """
+        """The object of another package's entry point; ConfigError where it cannot be imported, or is another kind."""
         try:
             loaded = self.added[name].load()
         except Exception as error:  # another package's code

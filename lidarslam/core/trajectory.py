@@ -175,10 +175,7 @@ def chain(T_world_first: FloatArray, relative_motions: FloatArray) -> FloatArray
 
 
 def parse_numbers(path: Path, columns: int) -> FloatArray:
-    """The (N, columns) numbers of a text file; commas count as blanks.
-
-    InputError where the file is missing, is not text, or a line does not hold that many numbers.
-    """
+    """The (N, columns) numbers of a text file, commas as blanks; InputError where a line has others."""
     numbers = array("d")
     for number, line in enumerate(bounded_lines(path), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
@@ -196,10 +193,7 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read a TUM file; lines may be in any order, of equal stamps the first is kept.
-
-    InputError where the file is missing or a line is not a pose.
-    """
+    """Read a TUM file, in any order, of equal stamps the first; InputError where a line is not a pose."""
     table = parse_numbers(path, columns=8)
     if not len(table):
         raise InputError(f"{path}: holds no pose; expected lines `stamp tx ty tz qx qy qz qw`")
@@ -226,10 +220,7 @@ def format_tum(trajectory: Trajectory) -> str:
 
 
 def read_kitti_poses(path: Path) -> FloatArray:
-    """Read the poses (N, 4, 4) of a KITTI file, in whatever frame it holds them.
-
-    InputError where the file is missing or a line is not a pose.
-    """
+    """The poses (N, 4, 4) of a KITTI file, in whatever frame; InputError where a line is not a pose."""
     rows = parse_numbers(path, columns=12).reshape(-1, 3, 4)
     if not len(rows):
         raise InputError(f"{path}: holds no pose; expected twelve numbers a line")
@@ -241,10 +232,7 @@ def read_kitti_poses(path: Path) -> FloatArray:
 
 
 def read_transform(path: Path) -> FloatArray:
-    """A rigid transform (4, 4) from a text file of four rows of four numbers.
-
-    InputError where the file holds anything else.
-    """
+    """A rigid transform (4, 4), four rows of four numbers in a text file; InputError where it is anything else."""
     T = parse_numbers(path, columns=4)
     if T.shape != (4, 4) or not is_rigid(T, tolerance=1e-3):
         raise InputError(f"{path}: expected a rigid transform of four rows of four numbers, the last 0 0 0 1")

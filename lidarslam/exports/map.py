@@ -1,16 +1,20 @@
-"""Maps that people work with: runs and clouds joined, cleaned, levelled and cropped."""
+"""Maps for other programs: runs and clouds joined, cleaned, levelled and cropped; occupancy grids; meshes."""
 
+import json
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from lidarslam.config.settings import load_config
-from lidarslam.core.errors import InputError
-from lidarslam.core.files import make_directory, replacing
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.files import make_directory, replacing, written
 from lidarslam.core.geometry import FloatArray, levelling, make_transform, rotation_angle, transform_points
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import read_transform
@@ -19,14 +23,23 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.exports.source import read_map, read_run_scans, read_source
 from lidarslam.mapping.global_map import edits
+from lidarslam.mapping.global_map.edits import Mesh, reconstruct
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views, seen_through
+from lidarslam.mapping.global_map.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    GridOptions,
+    OccupancyGrid,
+    occupancy_grid,
+)
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.storage.directory import CONFIG
 from lidarslam.storage.finished_run import is_run, read_summary, read_trajectory
 
-SUFFIXES = (".ply", ".pcd", ".laz", ".e57")
+MAP_SUFFIXES = (".ply", ".pcd", ".laz", ".e57")
 _FEWEST_SAMPLES = 10
 
 
@@ -199,3 +212,128 @@ def redrawn(run: Path, least_through: int) -> tuple[PointCloud, int]:
         moved = seen_through(points, views.placed(poses), drawn.voxel_size_m, least_through)
     cloud = drawn.cloud(moved)
     return PointCloud(cloud.points, cloud.normals, cloud.attributes.only(config.fields)), int(moved.sum())
+
+
+GRID_SUFFIXES = (".yaml", ".yml")
+_FINEST_M = 0.05
+_GREY = {OCCUPIED: 0, UNKNOWN: 205, FREE: 254}
+# The shade of the unknown, (255 - 205) / 255 = 0.1961, lies between them.
+_THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
+
+
+def export_grid(run: Path, out: Path, resolution_m: float | None, options: dict[str, float]) -> Iterator[str]:
+    """Write the grid of a run to a .yaml file and an image; lines about it.
+
+    Without a resolution, the edge of a cell is that of the map's voxels, at least 5 cm; the options are those of
+    `GridOptions`.
+    """
+    trajectory, (cloud, voxel_m) = read_trajectory(run), read_map(run)
+    chosen = resolution_m or max(_FINEST_M, round(voxel_m or 0.0, 2))
+    asked = GridOptions(resolution_m=chosen, **options)
+    try:
+        grid = occupancy_grid(cloud.points, cloud.normals, trajectory.positions, asked)
+    except ValueError as error:
+        raise ConfigError(f"the grid would have {error}; take a larger --resolution or a smaller --max-range") from None
+    if grid is None:
+        raise InputError(f"{run}: no ground was found below the sensor; is z of the map upwards?")
+    rows, columns = grid.cells.shape
+    yield f"{columns:,} x {rows:,} cells of {chosen:g} m, {columns * chosen:.1f} x {rows * chosen:.1f} m"
+    free, occupied = (float(np.mean(grid.cells == value)) for value in (FREE, OCCUPIED))
+    yield f"free {100 * free:.1f} %, occupied {100 * occupied:.1f} %, unknown {100 * (1 - free - occupied):.1f} %"
+    yield f"written to {', '.join(map(str, write_grid(out, grid)))}"
+
+
+def write_grid(path: Path, grid: OccupancyGrid) -> list[Path]:
+    """Write `path`, a .yaml file, and the image next to it; the files."""
+    image = path.with_suffix(".pgm")
+    pixels = np.full(grid.cells.shape, _GREY[UNKNOWN], dtype=np.uint8)
+    for value, grey in _GREY.items():
+        pixels[grid.cells == value] = grey
+    origin = [round(float(grid.origin[0]), 6), round(float(grid.origin[1]), 6), 0.0]
+    about = {"image": image.name, "mode": "trinary", "resolution": grid.resolution_m, "origin": origin, "negate": 0}
+    make_directory(path.parent)
+    with written(image) as partial:
+        Image.fromarray(pixels[::-1]).save(partial, format="PPM")  # the first row of an image is its top
+    with written(path) as partial:
+        text = yaml.safe_dump({**about, **_THRESHOLDS}, sort_keys=False, default_flow_style=None)
+        partial.write_text(text, encoding="utf-8")
+    return [path, image]
+
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
+_DEFAULT_CELL_M = 0.1
+_FLOAT, _UINT32, _UINT8 = 5126, 5125, 5121
+_VERTICES, _INDICES = 34962, 34963
+# glTF has y up: a turn by -90 degrees about x takes z there.
+_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+_ALIGNMENT = 4
+
+
+def export_mesh(run: Path, out: Path, cell_m: float | None) -> Iterator[str]:
+    """Write the mesh of a run to a file with one of `MESH_SUFFIXES`; lines about it.
+
+    Without an edge of the smallest cells, it is twice that of the map's voxels.
+    """
+    cloud, voxel_m = read_map(run)
+    mesh = reconstruct(cloud, cell_m or (2.0 * voxel_m if voxel_m else _DEFAULT_CELL_M))
+    if not len(mesh.triangles):
+        raise InputError(f"{run}: no surface comes of the {len(cloud):,} points of its map")
+    _write(out, mesh)
+    yield f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles"
+    yield f"written to {out}"
+
+
+def _write(out: Path, mesh: Mesh) -> None:
+    import open3d as o3d
+
+    triangles = o3d.utility.Vector3iVector(mesh.triangles)
+    surface = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(mesh.vertices), triangles)
+    surface.compute_vertex_normals()
+    if mesh.colours is not None:
+        surface.vertex_colors = o3d.utility.Vector3dVector(mesh.colours.astype(np.float64) / 255.0)
+    make_directory(out.parent)
+    with written(out) as partial, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        if out.suffix == ".glb":
+            write_glb(partial, mesh, np.asarray(surface.vertex_normals))
+        elif not o3d.io.write_triangle_mesh(partial, surface):
+            raise OutputError(f"{out}: cannot be written; is the disk full?")
+
+
+def write_glb(path: Path, mesh: Mesh, normals: FloatArray) -> None:
+    """Write a mesh with normals (N, 3) of its vertices."""
+    vertices, vectors = mesh.vertices.astype("<f4"), {"componentType": _FLOAT, "type": "VEC3"}
+    box = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    arrays: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+        ("", mesh.triangles.astype("<u4").reshape(-1), {"componentType": _UINT32, "type": "SCALAR"}),
+        ("POSITION", vertices, {**vectors, **box}),
+        ("NORMAL", normals.astype("<f4"), vectors),
+    ]
+    if mesh.colours is not None:
+        opaque = np.column_stack([mesh.colours, np.full(len(vertices), 255, np.uint8)])
+        arrays.append(("COLOR_0", opaque, {"componentType": _UINT8, "type": "VEC4", "normalized": True}))
+    views, accessors, offset = [], [], 0
+    for number, (name, values, about) in enumerate(arrays):
+        target = _VERTICES if name else _INDICES
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": target})
+        accessors.append({"bufferView": number, "count": len(values), **about})
+        offset += values.nbytes  # each a multiple of four bytes
+    attributes = {name: number for number, (name, *_) in enumerate(arrays) if name}
+    scene = {
+        "asset": {"version": "2.0", "generator": "lidarslam"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": _Y_UP}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    text = json.dumps(scene, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _ALIGNMENT)
+    with path.open("wb") as file:
+        file.write(b"glTF" + np.array([2, 12 + 8 + len(text) + 8 + offset], "<u4").tobytes())
+        file.write(np.array([len(text)], "<u4").tobytes() + b"JSON" + text)
+        file.write(np.array([offset], "<u4").tobytes() + b"BIN\0")
+        for _, values, _ in arrays:
+            file.write(np.ascontiguousarray(values).tobytes())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan

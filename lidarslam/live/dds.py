@@ -98,10 +98,7 @@ class Subscription:
 
 
 def open_node(domain: int) -> DdsNode:
-    """A participant in the domain.
-
-    InputError where the library cannot join it, as with a missing interface in CYCLONEDDS_URI.
-    """
+    """A participant in the domain; InputError where it cannot join, as with a missing interface in CYCLONEDDS_URI."""
     try:
         return DdsNode(domain)
     except DDSException as error:

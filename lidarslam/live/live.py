@@ -28,10 +28,11 @@ from lidarslam.live.receiving import (
     Arrived,
     ImuReceiver,
     IncomingQueue,
+    LiveCounts,
+    LiveStatistics,
     PublishedTopic,
     find_topic,
 )
-from lidarslam.live.statistics import LiveCounts, LiveStatistics
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.pipeline.compile_ahead import made_up_scans
 from lidarslam.pipeline.estimates import ScanEstimate
@@ -41,7 +42,7 @@ from lidarslam.run.calibration import make_imu_stream
 from lidarslam.run.request import LiveRequest, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans
 from lidarslam.run.run import open_odometry, open_session
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.viewer.rerun_program import WebPage
 
 if TYPE_CHECKING:  # needs the extra
@@ -194,15 +195,16 @@ class LiveOutcome:
 
 
 def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | None = None) -> LiveOutcome:
-    """Follow a robot, publish its poses, and write the run directory.
+    """Follow a robot, publish its poses, and write the run directory; Ctrl-C ends it at any time, with all results.
 
-    Args:
-        request: the topic to follow, and the end of the run; Ctrl-C ends it at any time, with all results.
-        show: called with a short text on the progress, every second while scans arrive.
-        page: shows the run in browsers, with `rerun="web"`.
+    `show` is called with a short text on the progress, every second while scans arrive; the page is of `rerun="web"`.
     """
     require_possible(request)
-    node = _open_node(request.domain)
+    try:
+        from lidarslam.live.dds import open_node
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
+    node = open_node(request.domain)
     request = replace(request, config=bounded(request.config))
     config, faults = request.config, Faults()
     with open_session(request, show) as session:
@@ -236,8 +238,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
         if not log.table["points"].any():
             why = "; ".join(faults.warnings()) or ("its scans had no valid point" if len(log) else "none came")
             raise InputError(f"{topic.name}: no scan could be used: {why}")
-        for warning in [*counts.warnings(), *(imu.stream.warnings if imu is not None else ())]:
-            log.warn(warning)
+        log.warn(*counts.warnings(), *(imu.stream.warnings if imu is not None else ()))
         tracked = Tracked(TrackedScans.of(log, faults, pipeline.map), pipeline.map.global_map)
         described: dict[str, Any] = {"version": version("lidarslam"), "source": None, "topic": topic.name}
         described |= {"domain": request.domain, "base_frame": request.base_frame}
@@ -267,21 +268,10 @@ def bounded(config: Config) -> Config:
 
 
 def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> ImuReceiver | None:
-    """The receiver of the IMU's samples; None where the odometry uses none.
-
-    InputError where no IMU is published, or several.
-    """
+    """The receiver of the IMU's samples, None without; InputError where no IMU is published, or several."""
     stream = make_imu_stream(config, log.warn)
     if stream is None:
         return None
     option = "--set reader.imu_topic=NAME"
     topic = find_topic(node.published, config.reader.imu_topic, (IMU_TYPE,), option, IMU_WITHIN_S)
     return ImuReceiver(node.subscribe(topic, depth=IMU_DEPTH).take, stream)
-
-
-def _open_node(domain: int) -> "DdsNode":
-    try:
-        from lidarslam.live.dds import open_node
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
-    return open_node(domain)

@@ -69,7 +69,9 @@ class CloudDecoder:
         """The scan of a serialised message; None where it cannot be used, which is counted."""
         try:
             header_ns, frame_id = read_header(raw, ros2=True)
-            stamp_ns = self._stamp_ns(header_ns, published_ns)
+            if self._last_ns is None:  # the first one decides
+                self._has_header_stamps = header_ns != 0
+            stamp_ns = header_ns if self._has_header_stamps else published_ns
             if not self._is_wanted(stamp_ns, published_ns, frame_id):
                 return None
             message = BagMessage(published_ns, header_ns, frame_id, self._type, raw)
@@ -84,12 +86,6 @@ class CloudDecoder:
         scan = self._timing.scan(cloud, stamp, self._faults, f"{stamp:.9f}")
         scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
         return LiveScan(scan, stamp_ns, frame_id)
-
-    def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
-        """The header's stamp; the time of publication where the first header has none."""
-        if self._last_ns is None:
-            self._has_header_stamps = header_ns != 0
-        return header_ns if self._has_header_stamps else published_ns
 
     def _is_wanted(self, stamp_ns: int, published_ns: int, frame_id: str) -> bool:
         if self._frame_id is not None and frame_id != self._frame_id:

@@ -74,10 +74,7 @@ class ImuStream(Stateful):
         self._begin_anew(T_lidar_imu)
 
     def add(self, stamp: float, angular_velocity: FloatArray, acceleration: FloatArray) -> None:
-        """Take the next sample, from any thread: seconds on the clock of the scans, rad/s and m/s^2 (3,) each.
-
-        InputError where the stamp is not after the last one.
-        """
+        """Take the next sample, from any thread, rad/s and m/s^2 (3,); InputError where the stamp is not later."""
         with self._lock:
             if not stamp > self.last_s:
                 raise InputError(f"stamps must increase: {stamp:.9f} s is not after the last, {self.last_s:.9f} s")

@@ -25,20 +25,6 @@ from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, SweepMotion
 
 
-class Localiser(Restorable, Protocol):
-    """Estimates the pose of one scan after the other."""
-
-    @property
-    def mapper(self) -> Mapper | None:
-        """The scan-to-map registration with a map of its own; None without one."""
-
-    def sample(self, scan: Scan) -> SampledScan | None:
-        """The computation on the next scan ahead of its pose, on another thread; None where there is none."""
-
-    def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
-        """The pose of a scan, given the odometry of the next; None after the last."""
-
-
 @runtime_checkable
 class ScanMapper(Restorable, Protocol):
     """A scan-to-map registration: with a local map, or in a map that is given."""
@@ -70,14 +56,14 @@ class OdometryAlone(Stateful):
     _check: ConsistencyCheck
     _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
 
-    mapper: ClassVar[None] = None
+    mapper: ClassVar[None] = None  # it has no map
 
     def __init__(self, check: ConsistencyCheck) -> None:
         self._check = check
         self._T_odom_lidar = np.eye(4)
 
-    def sample(self, scan: Scan) -> None:
-        """Nothing."""
+    def sample(self, scan: Scan) -> SampledScan | None:
+        """Nothing: there is no computation ahead of the pose."""
 
     def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
         """Chain the motion, and compare the scan with the previous one."""
@@ -129,7 +115,7 @@ class ScanToMap(Stateful):
 
     @property
     def mapper(self) -> Mapper | None:
-        """The mapper, unless the map is given; see `Localiser`."""
+        """The mapper, unless the map is given."""
         return self._mapper if isinstance(self._mapper, Mapper) else None
 
     def state(self) -> State:
@@ -140,7 +126,7 @@ class ScanToMap(Stateful):
         return state
 
     def sample(self, scan: Scan) -> SampledScan | None:
-        """See `ScanMapper`."""
+        """The computation on the next scan ahead of its pose, on another thread."""
         return self._mapper.sample(scan)
 
     def localise(self, odometry: ScanOdometry, following: ScanOdometry | None) -> ScanEstimate:
@@ -204,6 +190,10 @@ class ScanToMap(Stateful):
         if before.turn_rate is not None and velocity is not None:
             velocity = np.concatenate([before.turn_rate, velocity[3:]])
         return replace(before, velocity=velocity)
+
+
+Localiser = OdometryAlone | ScanToMap
+"""Estimates the pose of one scan after the other, given the odometry of it and of the next."""
 
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:

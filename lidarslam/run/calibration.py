@@ -1,17 +1,20 @@
-"""What is estimated of a sensor: the error of its elevations, and how its IMU is mounted and its clock runs."""
+"""What is estimated of a sensor: how its IMU is mounted, errors of clocks, elevations, and times of the points."""
 
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.mounting import elevation_of, recorded_axes, transform_of
@@ -19,6 +22,8 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.run.request import RunRequest
 
@@ -40,10 +45,7 @@ _COMPARED_SCANS = 60
 
 
 def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
-    """The samples that the odometry needs; None where it uses no IMU.
-
-    ConfigError where the recording has no IMU; InputError where the samples are damaged.
-    """
+    """The samples that the odometry needs, None where it needs none; ConfigError without an IMU."""
     if not config.odometry.uses_imu:
         return None
     samples = recording.imu
@@ -74,8 +76,7 @@ def open_inertial(
     T_lidar_imu = samples.T_lidar_imu
     if (T_recorded_imu := config.odometry.T_recorded_imu) is not None:
         T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
-    poses = _Poses(config, recording, chosen)
-    lever_sigma_m = KNOWN_LEVER_M
+    poses, lever_sigma_m = _Poses(config, recording, chosen), KNOWN_LEVER_M
     if T_lidar_imu is None:
         logger.info("finding how the IMU is mounted")
         T_lidar_imu, lever_sigma_m = _found(poses, recording.name, samples), UNKNOWN_LEVER_M
@@ -104,12 +105,20 @@ def make_imu_stream(config: Config, warn: Callable[[str], None]) -> "ImuStream |
     return ImuStream(None if T_recorded_imu is None else transform_of(config.reader.mounting) @ T_recorded_imu, warn)
 
 
+def _registered(config: Config, recording: Recording, chosen: range) -> Iterator[tuple[SampledScan, MappedScan]]:
+    """The first scans, registered to each other without an odometry; up to one that cannot be read."""
+    mapper = Mapper(config.mapping.model_copy(update={"budget_ms": None}))
+    with suppress(InputError):  # raised again when the scans are read
+        for scan in take_in(recording, chosen, Faults()):
+            sampled = mapper.sample(scan)
+            yield sampled, mapper.process(sampled, Prior())
+
+
 class _Poses:
-    """Registered poses of the first scans without the IMU, in their order; registered as they are asked for."""
+    """Poses of the first scans without the IMU, in their order; registered as they are asked for."""
 
     def __init__(self, config: Config, recording: Recording, chosen: range) -> None:
-        self._scans = take_in(recording, chosen, Faults())
-        self._mapper = Mapper(config.mapping.model_copy(update={"budget_ms": None}))
+        self._scans = _registered(config, recording, chosen)
         self._poses: list[tuple[float, FloatArray, bool]] = []
 
     def compared(self, samples: ImuSamples, T_lidar_imu: FloatArray, most: int) -> "Iterator[Comparison]":
@@ -118,30 +127,20 @@ class _Poses:
 
         comparison = Comparison(samples, T_lidar_imu)
         for number in range(most):
-            if number == len(self._poses) and not self._register():
+            if number == len(self._poses):
+                for scan, mapped in islice(self._scans, 1):
+                    follows = mapped.registered and mapped.is_connected
+                    self._poses.append((scan.stamp, mapped.state.T_world_lidar, follows))
+            if number == len(self._poses):
                 break
             comparison.add(*self._poses[number])
             if (number + 1) % _EVERY == 0:
                 yield comparison
         yield comparison
 
-    def _register(self) -> bool:
-        """Register the next scan; whether there is one."""
-        scan = None
-        with suppress(InputError):  # raised again when the scans are read
-            scan = next(self._scans, None)
-        if scan is not None:
-            mapped = self._mapper.process(self._mapper.sample(scan), Prior())
-            follows = mapped.registered and mapped.is_connected
-            self._poses.append((scan.stamp, mapped.state.T_world_lidar, follows))
-        return scan is not None
-
 
 def _found(poses: _Poses, name: str, samples: ImuSamples) -> FloatArray:
-    """(4, 4) T_lidar_imu from the turns of the first scans; its position stays unknown.
-
-    InputError where they do not show it.
-    """
+    """(4, 4) T_lidar_imu by the turns of the scans, its position unknown; InputError where they do not show it."""
     from lidarslam.mapping.inertial.comparison import MountingError
 
     reason = "too few scans"
@@ -214,15 +213,10 @@ class Elevation:
         return cls(raised_deg + angle_deg, float(np.rad2deg(bias.sigma)), raised_deg)
 
     @property
-    def is_certain(self) -> bool:
-        """Whether the correction is wrong."""
-        wrong_deg = self.elevation_bias_deg - self.elevation_correction_deg
-        return abs(wrong_deg) > _CERTAIN_SIGMAS * self.elevation_sigma_deg
-
-    @property
     def warning(self) -> str | None:
-        """The remedy, where the correction is wrong."""
-        if not self.is_certain:
+        """The remedy, where the correction is certainly wrong."""
+        wrong_deg = self.elevation_bias_deg - self.elevation_correction_deg
+        if abs(wrong_deg) <= _CERTAIN_SIGMAS * self.elevation_sigma_deg:
             return None
         return (
             f"elevation bias of {self.elevation_bias_deg:+.2f} +- {self.elevation_sigma_deg:.2f} degrees, where"
@@ -243,17 +237,59 @@ def with_elevations(
         return request, recording
     phase("estimating the error of the elevations")
     estimator = ElevationEstimator()
-    mapper = Mapper(request.config.mapping.model_copy(update={"budget_ms": None}))
-    with suppress(InputError):  # raised again when the scans are read
-        for scan in take_in(recording, range(chosen.start, chosen.stop)[:_MOST_ELEVATION_SCANS], Faults()):
-            sampled = mapper.sample(scan)
-            estimator.add(sampled, mapper.process(sampled, Prior()))
-            if estimator.stretches == _ENOUGH_STRETCHES:
-                break
+    scans = range(chosen.start, chosen.stop)[:_MOST_ELEVATION_SCANS]
+    for sampled, mapped in _registered(request.config, recording, scans):
+        estimator.add(sampled, mapped)
+        if estimator.stretches == _ENOUGH_STRETCHES:
+            break
     found = Elevation.found(recording, estimator)
     angle_deg, _ = elevation_of(recording)
-    if found is not None and found.is_certain:
+    if found is not None and found.warning is not None:
         angle_deg = round(found.elevation_bias_deg, 3)
     reader = request.config.reader.model_copy(update={"elevation_correction_deg": angle_deg})
     request = replace(request, config=request.config.model_copy(update={"reader": reader}))
     return request, open_recording(request.source, reader)
+
+
+# Slower turns, rad/s, and fewer scans decide nothing; between scans farther apart, a shaken sensor turns differently.
+_LEAST_RATE, _FEWEST, _MOST_INTERVAL_S = np.deg2rad(5.0), 15, 0.15
+# A share of the intervals by which they may differ.
+_EVEN = 0.5
+# Ratios with the right times: 0.99 to 1.19 on simulated and real recordings; with doubled ones 0.5 to 0.7.
+_RIGHT = (0.75, 1.4)
+
+
+def time_scale(
+    trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]
+) -> tuple[float, int] | None:
+    """Ratio of the turn rates within sweeps to those from scan to scan; one where the points' times are right.
+
+    Of N scans, the turn rates (N, 3) rad/s within each sweep, in the LiDAR frame and NaN where unknown, and whether the
+    pose is right (N,). With the number of scans that turned; None where too few did.
+    """
+    T, interval_s = trajectory.T_world_lidar, np.diff(trajectory.stamps)
+    if len(T) < _FEWEST or np.median(interval_s) > _MOST_INTERVAL_S:
+        return None
+    rates = log(inverse(T[:-1]) @ T[1:])[:, :3] / interval_s[:, None]
+    is_even = np.abs(interval_s / np.median(interval_s) - 1.0) < _EVEN
+    is_even &= is_tracked[:-1] & is_tracked[1:]
+    # A sweep may lie before or after its stamp.
+    around, within = 0.5 * (rates[:-1] + rates[1:]), turn_rates[1:-1]
+    turns = is_even[:-1] & is_even[1:] & np.isfinite(within).all(axis=1)
+    turns &= np.linalg.norm(around, axis=1) > _LEAST_RATE
+    if turns.sum() < _FEWEST:
+        return None
+    return float((within * around)[turns].sum() / (around[turns] ** 2).sum()), int(turns.sum())
+
+
+def time_scale_warning(found: tuple[float, int] | None) -> str | None:
+    """The error of the points' times by a ratio; None where it is near one, or unknown."""
+    if found is None or _RIGHT[0] < found[0] < _RIGHT[1]:
+        return None
+    ratio, scans = found
+    fault = "backwards" if ratio < 0.0 else "too long" if ratio < 1.0 else "too short"
+    return (
+        f"the points' times are {fault}, as it seems: within the sweeps of {scans} scans the sensor turns {ratio:.2f}"
+        " times as fast as from scan to scan; check reader.time_unit and reader.time_field, or correct them with"
+        f" --set reader.time_scale={'-1' if ratio < 0.0 else 'FACTOR'}"
+    )

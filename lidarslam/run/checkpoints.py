@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.config.settings import CheckpointConfig, Config
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import CheckpointConfig, Config, read_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, write_state
@@ -21,11 +20,10 @@ from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.request import RunRequest, describe_run
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import RERUN
+from lidarslam.storage.directory import RERUN, About, Unfinished
 from lidarslam.storage.finished_run import read_summary, where_astray
-from lidarslam.storage.unfinished import About, Unfinished
 
 logger = logging.getLogger(__name__)
 
@@ -34,10 +32,7 @@ WITHOUT_EFFECT = {"viewer": True, "checkpoints": True}
 
 
 def describe_computed(request: RunRequest, recording: Recording) -> dict[str, Any]:
-    """Everything that determines the results of a run; weights and prior by a digest of their content.
-
-    InputError where a file cannot be read.
-    """
+    """Everything that determines the results of a run; weights and prior by a digest of their content."""
     config = request.config
     tree = config.model_dump(mode="json", exclude=WITHOUT_EFFECT)
     if config.odometry.is_learned:
@@ -49,10 +44,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
 
 
 def lost_when_finished(request: RunRequest) -> bool | None:
-    """Whether tracking was lost, if `out` holds this very run and it is finished; None if it is not.
-
-    InputError where it holds another finished run.
-    """
+    """Whether tracking was lost in this very run, if finished, else None; InputError where `out` has another one."""
     out = request.out
     if About.read(out) is not None or not (out / files.CONFIG).is_file() or not (out / files.SUMMARY).is_file():
         return None

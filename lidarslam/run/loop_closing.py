@@ -13,8 +13,7 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.loops.closure import GivenLoops, RelativePose
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, LoopReport, Milliseconds
+from lidarslam.run.summary import GraphSummary, LoopReport, Milliseconds, ScanLog
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
@@ -44,10 +43,7 @@ def begin_graph(
     takes_gnss: bool = False,
     given: GivenLoops | None = None,
 ) -> "SlamGraph | None":
-    """A pose graph, when the configuration asks for one; its submaps are stored in the directory, or in the file.
-
-    ConfigError where it requires GNSS positions and none are used.
-    """
+    """A configured pose graph, its submaps in the directory or file; ConfigError where it lacks GNSS positions."""
     if config.pose_graph.gnss and not takes_gnss:
         raise ConfigError("pose_graph.gnss is available in lidarslam run only; leave it out here")
     if not config.pose_graph.enabled:
@@ -72,8 +68,7 @@ def close_loops(
     result = graph.finish() if track is None else _placed(graph, log, track)
     closed = correct(log, graph, result, global_map)
     loops = () if closed is None else closed.summary.loops
-    for warning in _not_closed(graph, loops, len(log)):
-        log.warn(warning)
+    log.warn(*_not_closed(graph, loops, len(log)))
     if closed is not None:
         pairs = [loop.scans for loop in loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)

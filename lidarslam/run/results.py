@@ -29,8 +29,7 @@ from lidarslam.mapping.pose_graph.correction import format_g2o
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.run.calibration import Elevation
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap, summarise
+from lidarslam.run.summary import GraphSummary, RunSummary, ScanLog, WrittenMap, summarise
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import MAP_INDEX, MAP_PLY, MAP_TILES, REPORT, SCANS_CSV, SUMMARY, RunDirectory
 
@@ -134,10 +133,7 @@ def write_results(
     map_formats: Sequence[MapFormat] = (),
     show: Callable[[DrawnMap], None] = lambda _: None,
 ) -> RunOutcome:
-    """Draw the map, show it, and write everything; the poses are final.
-
-    OutputError where a file cannot be written; a map that cannot be costs no other file.
-    """
+    """Draw the map and write everything; OutputError where a file fails; a map that fails costs no other file."""
     scans, log = tracked.scans, tracked.scans.log
     drawn = corrected_map(tracked, closed, config.global_map, directory)
     show(drawn)
@@ -156,8 +152,7 @@ def write_results(
         written, failed = WrittenMap(0, drawn.voxel_size_m, drawn.moved), error
         log.warn(f"there is no map: {error}")
     log.warnings.extend(scans.faults.warnings())
-    if drawn.warning is not None:
-        log.warn(drawn.warning)
+    log.warn(drawn.warning)
     if drawn.cloud is not None and not len(drawn.cloud):
         log.warn("the map is empty: min_range_m and max_range_m of global_map leave no point")
     skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out
@@ -213,10 +208,7 @@ class TileWriter:
         self.failure: OutputError | None = None  # of the first tile that could not be written, after which none is
 
     def write(self, tile: Tile, cloud: PointCloud, brightest: float) -> None:
-        """Write a tile with at least one point; see `mapping.global_map.drawing.WriteTile`.
-
-        OutputError where there is a file in place of the folder.
-        """
+        """Write a tile, see `WriteTile`; OutputError where there is a file in place of the folder."""
         if self.failure is None and not self._entries:
             self._begin()
         if self.failure is not None:
@@ -319,14 +311,11 @@ def format_map(written: WrittenMap) -> str:
     fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    if written.tiled is not None:
-        return f"{_tiles(written.tiled)}{fields}{moved}; {MAP_PLY}: {count(written.points, 'point')}, one per {voxel}"
+    if (tiled := written.tiled) is not None:
+        tiles = f"map of {count(tiled.total, 'point')} in {count(len(tiled.points), 'tile')}, {MAP_TILES}/"
+        overview = f"{MAP_PLY}: {count(written.points, 'point')}, one per {voxel}"
+        return f"{tiles}, voxels of {small_length(tiled.tiling.voxel_size_m)}{fields}{moved}; {overview}"
     return f"map of {count(written.points, 'point')}, voxels of {voxel}{fields}{moved}{entropy}"
-
-
-def _tiles(tiled: TiledMap) -> str:
-    voxel, tiles = small_length(tiled.tiling.voxel_size_m), count(len(tiled.points), "tile")
-    return f"map of {count(tiled.total, 'point')} in {tiles}, {MAP_TILES}/, voxels of {voxel}"
 
 
 def _loops(graph: GraphSummary) -> str:

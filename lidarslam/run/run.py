@@ -43,9 +43,8 @@ from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, reason_of, unless_damaged, write_results
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.storage.directory import RERUN, RunDirectory
-from lidarslam.storage.unfinished import Unfinished
+from lidarslam.run.summary import ScanLog
+from lidarslam.storage.directory import RERUN, RunDirectory, Unfinished
 from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer
 
@@ -78,13 +77,8 @@ def execute(
     """Run, and write the run directory.
 
     A damaged recording or an interruption ends the run early, with the results so far. A run that is killed can be
-    resumed, to the same results.
-
-    Args:
-        request: the run to execute.
-        progress: called after every scan.
-        phase: called with a short text on the progress before the first scan and after the last.
-        page: shows the run in browsers, with `rerun="web"`.
+    resumed, to the same results. `phase` is called with a short text on the progress before the first scan and after
+    the last; the page shows the run in browsers, with `rerun="web"`.
     """
     require_possible(request, request.source)
     phase("opening the recording")
@@ -307,8 +301,7 @@ def track(
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
     with suppress(InputError):  # raised again when the scans are read
-        for warning in recording.warnings:
-            log.warn(warning)
+        log.warn(*recording.warnings)
     error = _process(pipeline, scans, session, truth, lambda number, result: progress(number, len(chosen), result))
     if not log.table["points"].any():
         if isinstance(error, KeyboardInterrupt):
@@ -316,9 +309,9 @@ def track(
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
     elevation = Elevation.found(recording, estimator)
-    found = [odometry.warning if isinstance(odometry, ExternalOdometry) else None, elevation and elevation.warning]
-    for warning in (*(inertial.warnings if inertial is not None else ()), *filter(None, found)):
-        log.warn(warning)
+    log.warn(*(inertial.warnings if inertial is not None else ()))
+    log.warn(odometry.warning if isinstance(odometry, ExternalOdometry) else None)
+    log.warn(None if elevation is None else elevation.warning)
     tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 

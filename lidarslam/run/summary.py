@@ -1,5 +1,7 @@
-"""A run in numbers, and sentences about what is wrong with it: the content of summary.json."""
+"""The log of a run, a row a scan, for scans.csv; the run in numbers, and what is wrong with it, for summary.json."""
 
+import csv
+import io
 import resource
 import sys
 from collections.abc import Iterator, Sequence
@@ -10,18 +12,151 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.text import count
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.pipeline.estimates import STAGES
-from lidarslam.run.calibration import Elevation
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.storage.directory import SCANS_CSV
+from lidarslam.pipeline.estimates import STAGES, ScanEstimate
+from lidarslam.run.calibration import Elevation, time_scale, time_scale_warning
+from lidarslam.storage.directory import SCANS_CSV, SIGMAS
 from lidarslam.storage.finished_run import is_unconstrained
+
+COLUMNS = (
+    *("index", "stamp", "status", "points", "points_dropped", "points_used", "residual_m", "inlier_ratio"),
+    *("degenerate_directions", *SIGMAS, "odometry_asked", *(f"ms_{stage}" for stage in STAGES), "message"),
+)
+
+_STATUSES = tuple(Status)
+# The numbers of a scan; NaN where there is none.
+_ROW = np.dtype(
+    [
+        ("stamp", "f8"),
+        ("status", "u1"),
+        ("points", "i8"),
+        ("points_dropped", "i8"),
+        ("points_used", "i8"),
+        ("residual_m", "f8"),
+        ("inlier_ratio", "f8"),
+        ("sigmas", "f8", len(SIGMAS)),
+        ("turn_rate", "f8", 3),
+        ("odometry_asked", "?"),
+        ("total_ms", "f8"),  # from the scan before done to this one done
+        ("stage_ms", "f8", len(STAGES)),
+        ("T_world_lidar", "f8", (4, 4)),
+        ("T_odom_lidar", "f8", (4, 4)),
+    ]
+)
+
+
+class ScanLog(Stateful):
+    """The scans of a run so far; no points."""
+
+    messages: list[str]  # of each scan
+    warnings: list[str]  # sentences for the summary
+    degenerate: list[str]  # of each scan, the names of its degenerate directions with spaces between
+
+    def __init__(self) -> None:
+        self.messages, self.warnings, self.degenerate = [], [], []
+        self._rows = bytearray()  # of `_ROW`
+
+    def __len__(self) -> int:
+        return len(self._rows) // _ROW.itemsize
+
+    def add(self, result: ScanEstimate, total_ms: float = 0.0) -> None:
+        """Log one scan; `total_ms` is the wall time since the previous scan was done."""
+        row = (
+            result.stamp,
+            _STATUSES.index(result.status),
+            result.points_read,
+            result.points_dropped,
+            result.points_used,
+            np.nan if result.residual_m is None else result.residual_m,
+            np.nan if result.inlier_ratio is None else result.inlier_ratio,
+            np.full(len(SIGMAS), np.nan) if result.covariance is None else np.sqrt(np.diag(result.covariance)),
+            np.full(3, np.nan) if result.turn_rate is None else result.turn_rate,
+            result.is_odometry_asked,
+            total_ms,
+            [result.stage_ms.get(stage, 0.0) for stage in STAGES],
+            result.T_world_lidar,
+            result.T_odom_lidar,
+        )
+        self.degenerate.append(" ".join(result.degenerate))
+        self.messages.append(result.message)
+        self._rows += np.array(row, dtype=_ROW).tobytes()  # last, as Ctrl-C may interrupt: `len` counts rows
+
+    def warn(self, *sentences: str | None) -> None:
+        """Keep sentences for the summary, each once."""
+        for sentence in sentences:
+            if sentence is not None and sentence not in self.warnings:
+                self.warnings.append(sentence)
+
+    def correct(self, T_world_lidar: FloatArray) -> None:
+        """Replace the poses (N, 4, 4) by those that the pose graph corrected."""
+        rows = self.table
+        rows["T_world_lidar"] = T_world_lidar
+        self._rows = bytearray(rows.tobytes())
+
+    def mark(self, indices: Sequence[int], status: Status, message: str) -> None:
+        """Replace the status of scans, and its reason."""
+        rows = self.table
+        rows["status"][list(indices)] = _STATUSES.index(status)
+        self._rows = bytearray(rows.tobytes())
+        for index in indices:
+            self.messages[index] = message
+
+    @property
+    def table(self) -> NDArray[np.void]:
+        """(N,) the numbers of all scans, by the names of `_ROW`; a copy, as a view would keep the log from growing."""
+        return np.frombuffer(bytearray(self._rows), _ROW)
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Of each scan."""
+        return [_STATUSES[index] for index in self.table["status"]]
+
+    @property
+    def stamps(self) -> FloatArray:
+        """(N,) seconds."""
+        return self.table["stamp"]
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The final poses."""
+        return Trajectory(self.stamps, self.table["T_world_lidar"])
+
+    @property
+    def odometry(self) -> Trajectory:
+        """The poses of the odometry alone."""
+        return Trajectory(self.stamps, self.table["T_odom_lidar"])
+
+    def format_csv(self) -> str:
+        """The content of scans.csv: a row per scan, empty where there is no number."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        rows = zip(self.table, self.degenerate, self.messages, strict=False)
+        for index, (row, degenerate, message) in enumerate(rows):
+            counts = (row["points"], row["points_dropped"], row["points_used"])
+            fit = ("" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in ("residual_m", "inlier_ratio"))
+            sigmas = ("" if np.isnan(sigma) else f"{sigma:.3g}" for sigma in row["sigmas"])
+            ms = (f"{ms:.2f}" for ms in row["stage_ms"])
+            status, asked = _STATUSES[row["status"]].value, int(row["odometry_asked"])
+            numbers = (*counts, *fit, degenerate, *sigmas, asked, *ms)
+            writer.writerow([index, f"{row['stamp']:.9f}", status, *numbers, message])
+        return out.getvalue()
+
+    def state(self) -> State:
+        """See `Stateful`."""
+        return super().state() | {"rows": self.table}
+
+    def restore(self, saved: Saved) -> None:
+        """See `Stateful`."""
+        super().restore(saved)
+        self._rows = bytearray(saved.value("rows").tobytes())
 
 
 @dataclass(frozen=True)
@@ -173,12 +308,8 @@ class RunSummary:
     @property
     def went_astray(self) -> bool:
         """Whether a scan is lost, the map contradicts itself, or much of the path is a prediction."""
-        return bool(self.lost_scans or self.contradictions or self.is_unconstrained)
-
-    @property
-    def is_unconstrained(self) -> bool:
-        """Whether the length is uncertain for lack of structure along the path."""
-        return is_unconstrained(self.unconstrained_m, self.length_m)
+        is_uncertain = is_unconstrained(self.unconstrained_m, self.length_m)
+        return bool(self.lost_scans or self.contradictions or is_uncertain)
 
     @property
     def lost_scans(self) -> int:
@@ -336,47 +467,3 @@ def peak_rss_mb() -> float:
     unit = 1.0 if sys.platform == "darwin" else 1024.0
     usages = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(usages) * unit / 2**20
-
-
-# Slower turns, rad/s, and fewer scans decide nothing; between scans farther apart, a shaken sensor turns differently.
-_LEAST_RATE, _FEWEST, _MOST_INTERVAL_S = np.deg2rad(5.0), 15, 0.15
-# A share of the intervals by which they may differ.
-_EVEN = 0.5
-# Ratios with the right times: 0.99 to 1.19 on simulated and real recordings; with doubled ones 0.5 to 0.7.
-_RIGHT = (0.75, 1.4)
-
-
-def time_scale(
-    trajectory: Trajectory, turn_rates: FloatArray, is_tracked: NDArray[np.bool_]
-) -> tuple[float, int] | None:
-    """Ratio of the turn rates within sweeps to those from scan to scan; one where the points' times are right.
-
-    Of N scans, the turn rates (N, 3) rad/s within each sweep, in the LiDAR frame and NaN where unknown, and whether the
-    pose is right (N,). With the number of scans that turned; None where too few did.
-    """
-    T, interval_s = trajectory.T_world_lidar, np.diff(trajectory.stamps)
-    if len(T) < _FEWEST or np.median(interval_s) > _MOST_INTERVAL_S:
-        return None
-    rates = log(inverse(T[:-1]) @ T[1:])[:, :3] / interval_s[:, None]
-    is_even = np.abs(interval_s / np.median(interval_s) - 1.0) < _EVEN
-    is_even &= is_tracked[:-1] & is_tracked[1:]
-    # A sweep may lie before or after its stamp.
-    around, within = 0.5 * (rates[:-1] + rates[1:]), turn_rates[1:-1]
-    turns = is_even[:-1] & is_even[1:] & np.isfinite(within).all(axis=1)
-    turns &= np.linalg.norm(around, axis=1) > _LEAST_RATE
-    if turns.sum() < _FEWEST:
-        return None
-    return float((within * around)[turns].sum() / (around[turns] ** 2).sum()), int(turns.sum())
-
-
-def time_scale_warning(found: tuple[float, int] | None) -> str | None:
-    """The error of the points' times by a ratio; None where it is near one, or unknown."""
-    if found is None or _RIGHT[0] < found[0] < _RIGHT[1]:
-        return None
-    ratio, scans = found
-    fault = "backwards" if ratio < 0.0 else "too long" if ratio < 1.0 else "too short"
-    return (
-        f"the points' times are {fault}, as it seems: within the sweeps of {scans} scans the sensor turns {ratio:.2f}"
-        " times as fast as from scan to scan; check reader.time_unit and reader.time_field, or correct them with"
-        f" --set reader.time_scale={'-1' if ratio < 0.0 else 'FACTOR'}"
-    )

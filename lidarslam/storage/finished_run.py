@@ -1,9 +1,12 @@
-"""Runs and comparisons read back from disk."""
+"""Runs and comparisons read back from disk, and where they are by default."""
 
 import csv
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +17,16 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.text import require_name
+from lidarslam.core.text import require_name, safe_name
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
 from lidarslam.datasets.point_table import coordinates, read_colours, read_intensities, scalar_fields
-from lidarslam.datasets.registry import absent, choose_reader
+from lidarslam.datasets.published.evalio import full_name, is_of_evalio, resolved
+from lidarslam.datasets.registry import absent, choose_reader, takes_sequence
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import TRAJECTORY_TUM
-from lidarslam.storage.unfinished import require_whole
+from lidarslam.storage.directory import TRAJECTORY_TUM, About, require_whole
 
 _LISTED = 5
 # How deep a folder is searched for runs.
@@ -56,7 +59,6 @@ class FinishedRun:
     lost: NDArray[np.bool_]  # (N,) which scans were lost
     map_points: FloatArray  # (M, 3) in the world, none when the map is missing
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
-    map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
     frame_of: Path | None = None  # the run, or file, in whose map this one was localised
     path: Path | None = None  # its path, resolved
 
@@ -85,7 +87,7 @@ def load_run(path: Path) -> FinishedRun:
     lost, loops = read_scans(path, len(trajectory)).lost, _loops(path, len(trajectory))
     cloud, other = shown_map(path), localised_in(path)
     name, frame_of = path.resolve().name, None if other is None else other.resolve()
-    return FinishedRun(name, trajectory, lost, cloud.points, loops, cloud.attributes, frame_of, path.resolve())
+    return FinishedRun(name, trajectory, lost, cloud.points, loops, frame_of, path.resolve())
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -248,3 +250,66 @@ def run_directories(path: Path) -> list[Path]:
         raise InputError(f"{path}: none of its methods came to a result")
     # Next to its methods' folders, or, of one of several recordings, in the same folder as these.
     return [path / run if (path / run).is_dir() else path.parent / run for run in runs]
+
+
+RUNS = Path("runs")
+_TIME = "%Y-%m-%d_%H-%M-%S"
+# Of a simulated recording that was itself written to a default place.
+_TIMED = re.compile(r"_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(-\d+)?$")
+
+
+def new_place(folder: Path, name: str) -> Path:
+    """A path that does not exist yet: FOLDER/NAME_TIME, with the local time; a number follows if the name is taken."""
+    first = folder / f"{safe_name(name)}_{datetime.now():{_TIME}}"
+    numbered = (first.with_name(f"{first.name}-{number}") for number in count(2))
+    return first if not first.exists() else next(path for path in numbered if not path.exists())
+
+
+def source_name(source: Path, sequence: str | None = None) -> str:
+    """The name for the results of a recording: its file or folder, without suffix and time.
+
+    Of a folder with several sequences, followed by the one that is read; of evalio's, with that of the data set.
+    """
+    source = resolved(source)
+    if is_of_evalio(source):
+        return safe_name(full_name(source))
+    name = _TIMED.sub("", source.name if source.is_dir() else source.stem)
+    chooses = sequence not in (None, source.name) and takes_sequence(source)
+    return safe_name(f"{name}_{sequence}" if chooses else name)
+
+
+def latest_run() -> Path | None:
+    """The run in `runs` whose trajectory was written last; None without any. Running ones are left out."""
+    runs = (path.parent for path in RUNS.glob(f"*/{TRAJECTORY_TUM}"))
+    found = [run for run in runs if (about := _about(run)) is None or about.standing != "at work"]
+    return max(found, key=lambda run: (run / TRAJECTORY_TUM).stat().st_mtime, default=None)
+
+
+def unfinished_run(source: Path, sequence: str | None = None) -> Path:
+    """The only unfinished run of a recording in `runs`; InputError where there is none, or there are several."""
+    found = [path for path in sorted(RUNS.glob("*/")) if _is_of(path, source, sequence)]
+    if not found:
+        raise InputError(
+            f"{RUNS}: holds no unfinished run of {source}; name one with --out, or leave --resume out to begin one"
+        )
+    if len(found) > 1:
+        listed = ", ".join(map(str, found))
+        raise InputError(f"{source}: has several unfinished runs ({listed}); name the one to resume with --out")
+    return found[0]
+
+
+def _is_of(run: Path, source: Path, sequence: str | None) -> bool:
+    about = _about(run)
+    if about is None or "merge" in about.description:
+        return False
+    reader = about.description.get("reader")
+    same_sequence = not isinstance(reader, dict) or reader.get("sequence") == sequence
+    return about.description.get("source") == str(resolved(source)) and same_sequence
+
+
+def _about(run: Path) -> About | None:
+    """The unfinished run there; None also where its file is damaged."""
+    try:
+        return About.read(run)
+    except InputError:
+        return None

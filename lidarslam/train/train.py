@@ -15,8 +15,7 @@ import torch
 from torch import Generator, Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from lidarslam.config.settings import SOURCES_SECTION, reader_settings
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import SOURCES_SECTION, read_yaml, reader_settings
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer, remove_partial_files, require_no_link
 from lidarslam.core.tasks import SERIAL, Where

@@ -17,15 +17,13 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.evaluation.report.drawing import DISTANCE_FIELD, beyond_m, leaves, paths_in_bulk
-from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.association import common_instants
+from lidarslam.evaluation.trajectory.alignment import align, common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
 from lidarslam.storage.finished_run import read_scans, read_trajectory, run_directories, shown_map
-from lidarslam.viewer import annotations as notes
-from lidarslam.viewer.annotations import UNKNOWN, Colour, ColourScale, Entry, Quantity, fit_scale
-from lidarslam.viewer.view import WIDTH, View, draw_layer, fit_view, turning_views
+from lidarslam.viewer import view as drawing
+from lidarslam.viewer.view import Colour, ColourScale, Entry, Quantity, View
 
 TOP, OBLIQUE = 90.0, 35.0
 # Factor of the pixels along each side that are drawn and then averaged.
@@ -88,14 +86,16 @@ def fit_frame(
     runs: Sequence[DrawnRun],
     elevation_deg: float = TOP,
     reference: FloatArray | None = None,
-    width: int = WIDTH,
+    width: int = drawing.WIDTH,
     quantity: Quantity = "height",
     turn_deg: float | None = None,
 ) -> Frame:
     """The frame of an orthographic picture, from an elevation above the horizon, that holds all but diverging runs."""
     found = [values for run in runs for values in (run.point_values(quantity), run.pose_values(quantity))]
-    scale = fit_scale(quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)]))
-    return Frame(fit_view(*framed(runs, reference), elevation_deg, turn_deg, width), quantity, scale)
+    scale = drawing.fit_scale(
+        quantity, np.concatenate([np.empty(0), *(values for values in found if values is not None)])
+    )
+    return Frame(drawing.fit_view(*framed(runs, reference), elevation_deg, turn_deg, width), quantity, scale)
 
 
 def framed(runs: Sequence[DrawnRun], reference: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
@@ -118,22 +118,22 @@ def draw_runs(runs: Sequence[DrawnRun], frame: Frame, reference: FloatArray | No
     colours = [_RUN_COLOURS[n % len(_RUN_COLOURS)] if len(runs) > 1 else None for n in range(len(runs))]
     image = Image.fromarray(_draw_maps(runs, colours, fine, frame))
     if reference is not None:
-        notes.draw_path(image, fine, reference, [_REFERENCE] * len(reference), _REFERENCE_WIDER)
+        drawing.draw_path(image, fine, reference, [_REFERENCE] * len(reference), _REFERENCE_WIDER)
     widths = [1.0 + _WIDENING * below for below in reversed(range(len(runs)))]
     around = _outline(runs, frame)
-    if around == notes.INK:  # the path is to be read by its colour
+    if around == drawing.INK:  # the path is to be read by its colour
         widths = [_REFERENCE_WIDER]
     if around is not None:
         for run, wider in zip(runs, widths, strict=True):
-            notes.draw_outline(image, fine, run.positions, around, wider)
+            drawing.draw_path(image, fine, run.positions, [around] * len(run.positions), wider + 1.0)
     for run, colour, wider in zip(runs, colours, widths, strict=True):
-        notes.draw_path(image, fine, run.positions, _path_colours(run, colour, frame), wider)
+        drawing.draw_path(image, fine, run.positions, _path_colours(run, colour, frame), wider)
     for run, colour, wider in zip(runs, colours, widths, strict=True):
-        notes.draw_end(image, fine, run.positions[-1:], colour or notes.INK, wider)
+        drawing.draw_end(image, fine, run.positions[-1:], colour or drawing.INK, wider)
     for run in runs:
-        notes.draw_end(image, fine, run.positions[:1], notes.START)
+        drawing.draw_end(image, fine, run.positions[:1], drawing.START)
     entries = list(_entries(runs, colours, widths, frame, reference is not None))
-    return np.asarray(notes.with_strip(image.reduce(_SUPERSAMPLING), entries))
+    return np.asarray(drawing.with_strip(image.reduce(_SUPERSAMPLING), entries))
 
 
 def draw_apart(runs: Sequence[DrawnRun], folder: Path, frame: Frame) -> list[Path]:
@@ -164,11 +164,11 @@ def _draw_maps(
     count = np.zeros(len(total), dtype=np.uint16)
     for run, colour in zip(runs, colours, strict=True):
         if len(run.cloud):
-            layer = draw_layer(run.cloud.points, run.cloud.normals, view)
+            layer = drawing.draw_layer(run.cloud.points, run.cloud.normals, view)
             surface = _point_colours(run, frame)[layer.points] if colour is None else _tint(colour)
             total[layer.pixels] += (surface * layer.brightness[:, None]).astype(np.uint16)
             count[layer.pixels] += 1
-    picture = np.full(total.shape, notes.PAPER, dtype=np.uint8)
+    picture = np.full(total.shape, drawing.PAPER, dtype=np.uint8)
     drawn = np.flatnonzero(count)
     picture[drawn] = total[drawn] // count[drawn, None]
     return picture.reshape(view.height, view.width, 3)
@@ -179,7 +179,7 @@ def _point_colours(run: DrawnRun, frame: Frame) -> NDArray[np.uint8]:
     if frame.quantity == "rgb" and rgb is not None:
         return rgb
     if frame.scale is None or values is None:
-        return np.tile(np.array(UNKNOWN, dtype=np.uint8), (len(run.cloud), 1))
+        return np.tile(np.array(drawing.UNKNOWN, dtype=np.uint8), (len(run.cloud), 1))
     return frame.scale.colours(values)
 
 
@@ -199,8 +199,8 @@ def _path_colours(run: DrawnRun, colour: Colour | None, frame: Frame) -> list[Co
 def _outline(runs: Sequence[DrawnRun], frame: Frame) -> Colour | None:
     """The colour around paths: dark where these are pale, white on maps, none on paper."""
     if len(runs) == 1 and runs[0].pose_values(frame.quantity) is not None:
-        return notes.INK
-    return notes.HALO if any(len(run.cloud) for run in runs) else None
+        return drawing.INK
+    return drawing.HALO if any(len(run.cloud) for run in runs) else None
 
 
 def _entries(
@@ -219,26 +219,26 @@ def _entries(
         if len(run.positions) or colour is not None:
             text = f"{_named(run, runs)}, {length_m:.0f} m" if len(run.positions) else run.name
             line = colour or _PATH_COLOURS[Status.OK]
-            yield notes.line_entry(text, line, view.width, wider) if by_status else Entry(text)
+            yield drawing.line_entry(text, line, view.width, wider) if by_status else Entry(text)
     found = {status for run in runs for status in run.statuses} if by_status else set()
     shown = (Status.LOST,) if single is None else (Status.DEGRADED, Status.LOST)
-    yield from (notes.line_entry(s.value, _PATH_COLOURS[s], view.width) for s in shown if s in found)
+    yield from (drawing.line_entry(s.value, _PATH_COLOURS[s], view.width) for s in shown if s in found)
     if with_reference:
-        yield notes.line_entry("ground truth", _REFERENCE, view.width)
+        yield drawing.line_entry("ground truth", _REFERENCE, view.width)
     if any(len(run.positions) for run in runs):
-        yield notes.end_entry("start", notes.START, view.width)
-        yield notes.end_entry("end", notes.INK, view.width)
+        yield drawing.end_entry("start", drawing.START, view.width)
+        yield drawing.end_entry("end", drawing.INK, view.width)
     if single is not None and frame.scale is not None and (len(single.cloud) or not by_status):
         ramp = frame.scale.ramp[np.linspace(0, 255, round(_RAMP_LENGTH * view.width)).astype(np.intp)]
-        yield notes.ramp_entry(*frame.scale.ends, ramp, view.width)
+        yield drawing.ramp_entry(*frame.scale.ends, ramp, view.width)
     across, up = view.size_m
-    yield notes.scale_entry(view)
+    yield drawing.scale_entry(view)
     yield Entry(f"{across:.0f} m x {up:.0f} m" if view.axes[2, 2] == 1.0 else f"{across:.0f} m wide")
     half = 0.5 * view.pixel_m * np.array([view.width, view.height])
     for run in runs:
         outside_m = beyond_m(run.positions @ view.axes[:2].T - view.centre, -half, half)
         if outside_m > 0.0:
-            yield Entry(f"{leaves(notes.short(_named(run, runs)), {' m': outside_m})} outside")
+            yield Entry(f"{leaves(drawing.short(_named(run, runs)), {' m': outside_m})} outside")
 
 
 def _named(run: DrawnRun, runs: Sequence[DrawnRun]) -> str:
@@ -318,7 +318,7 @@ def turn_runs(
     """
     frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
     turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)
-    for number, view in enumerate(turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
+    for number, view in enumerate(drawing.turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
         yield draw_runs(runs, replace(frame, view=view))
         count(number, frames)
 

@@ -29,8 +29,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.report.drawing import viridis
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.viewer import rerun_environment
-from lidarslam.viewer.annotations import levels
 from lidarslam.viewer.rerun_program import GRPC_PORT, WebPage, open_window, require_window
+from lidarslam.viewer.view import levels
 from lidarslam.viewer.viewer import Viewer
 
 _log = logging.getLogger(__name__)
@@ -184,10 +184,7 @@ def log_map(
     colour: tuple[int, int, int] | None = None,
     static: bool = False,
 ) -> None:
-    """A cloud (N, 3) coloured by height, thinned to this many points.
-
-    With a colour, the height is its brightness.
-    """
+    """A cloud (N, 3), thinned to so many points, coloured by height, or with a colour of that brightness."""
     points = every_nth(points, count)
     height = levels(points[:, 2])
     if colour is None:

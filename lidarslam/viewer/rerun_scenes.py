@@ -20,28 +20,12 @@ from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.map.metrics import MapComparison
 from lidarslam.evaluation.report.drawing import error_colours, viridis
-from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.association import common_instants
+from lidarslam.evaluation.trajectory.alignment import align, common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
-from lidarslam.viewer.annotations import levels
-from lidarslam.viewer.rerun_recording import (
-    BACKGROUND,
-    MAP_RADIUS,
-    PATH_RADIUS,
-    REFERENCE_COLOUR,
-    SCAN_RADIUS,
-    STATUS_COLOURS,
-    TIME,
-    Show,
-    about_its_start,
-    every_nth,
-    log_map,
-    set_stamp,
-    stamp_column,
-    true_path,
-    whole_past,
-)
+from lidarslam.viewer import rerun_recording as rec
+from lidarslam.viewer.rerun_recording import BACKGROUND, Show
+from lidarslam.viewer.view import levels
 
 # The rest of Okabe and Ito's palette, without those of the reference and of lost scans.
 _COLOURS = ((86, 180, 233), (230, 159, 0), (204, 121, 167), (240, 228, 66), (0, 114, 178))
@@ -75,12 +59,12 @@ def show_runs(runs: Sequence[FinishedRun], reference: Trajectory | None, config:
     own world, which begins at its first scan.
     """
     if reference is not None:
-        reference = about_its_start(reference, least=1)
+        reference = rec.about_its_start(reference, least=1)
     shown = list(_in_one_world(runs, reference))
 
     def log(recording: rr.RecordingStream) -> None:
         if reference is not None:
-            recording.log("world/ground truth", true_path(reference), static=True)
+            recording.log("world/ground truth", rec.true_path(reference), static=True)
         for one in shown:
             _log_run(recording, one, len(shown) > 1, config)
 
@@ -127,23 +111,23 @@ def _log_run(recording: rr.RecordingStream, shown: _Shown, several: bool, config
     def log(name: str, style: rr.AsComponents, stamps: FloatArray, columns: rr.ComponentColumnList) -> None:
         if len(stamps):
             recording.log(f"{entity}/{name}", style, static=True)
-            recording.send_columns(f"{entity}/{name}", [stamp_column(stamps)], columns)
+            recording.send_columns(f"{entity}/{name}", [rec.stamp_column(stamps)], columns)
 
-    line = rr.LineStrips3D.from_fields(colors=[colour], radii=[PATH_RADIUS])
+    line = rr.LineStrips3D.from_fields(colors=[colour], radii=[rec.PATH_RADIUS])
     pieces = np.stack([positions[:-1], positions[1:]], axis=1)
     log("trajectory", line, stamps[1:], rr.LineStrips3D.columns(strips=[[piece] for piece in pieces]))
     loops = rr.LineStrips3D.columns(strips=[[loop] for loop in positions[run.loops]])
     log("loops", line, stamps[run.loops.max(axis=1, initial=0)], loops)
-    place = rr.Points3D.from_fields(colors=[colour], radii=[2.5 * PATH_RADIUS], labels=[shown.name])
+    place = rr.Points3D.from_fields(colors=[colour], radii=[2.5 * rec.PATH_RADIUS], labels=[shown.name])
     log("lidar", place, stamps, rr.Points3D.columns(positions=positions))
-    lost = rr.Points3D.from_fields(colors=[STATUS_COLOURS[Status.LOST]], radii=[2.0 * PATH_RADIUS])
+    lost = rr.Points3D.from_fields(colors=[rec.STATUS_COLOURS[Status.LOST]], radii=[2.0 * rec.PATH_RADIUS])
     log("lost", lost, stamps[run.lost], rr.Points3D.columns(positions=positions[run.lost]))
-    log_map(recording, f"{entity}/map", run.map_points, config.map_points, colour if several else None, static=True)
+    rec.log_map(recording, f"{entity}/map", run.map_points, config.map_points, colour if several else None, static=True)
     if len(shown.errors_m):
         series = rr.new_entity_path([_ERRORS, shown.name])
         recording.log(series, rr.SeriesLines(names=shown.name, colors=[colour]), static=True)
         values = rr.Scalars.columns(scalars=shown.errors_m)
-        recording.send_columns(series, [stamp_column(shown.error_stamps)], values)
+        recording.send_columns(series, [rec.stamp_column(shown.error_stamps)], values)
 
 
 def _layout_of_runs(shown: Sequence[_Shown]) -> rrb.Blueprint:
@@ -151,7 +135,7 @@ def _layout_of_runs(shown: Sequence[_Shown]) -> rrb.Blueprint:
     overrides: dict[rr.encodings.EntityPath | str, rrb.VisibleTimeRanges | rrb.EntityBehavior] = {}
     for number, one in enumerate(shown):
         for name in ("trajectory", "loops", "lost"):
-            overrides[f"{one.entity}/{name}"] = rrb.VisibleTimeRanges(whole_past())
+            overrides[f"{one.entity}/{name}"] = rrb.VisibleTimeRanges(rec.whole_past())
         overrides[f"{one.entity}/map"] = rrb.EntityBehavior(visible=number == 0)
     space = rrb.Spatial3DView(origin="/world", name="Trajectories and maps", background=BACKGROUND, overrides=overrides)
     views: list[rrb.View] = [space]
@@ -159,7 +143,7 @@ def _layout_of_runs(shown: Sequence[_Shown]) -> rrb.Blueprint:
         views.append(rrb.TimeSeriesView(origin=f"/{_ERRORS}", name="Distance to the ground truth [m]"))
     return rrb.Blueprint(
         rrb.Vertical(*views, row_shares=[4, 1][: len(views)]),
-        rrb.TimePanel(timeline=TIME, play_state="following", state="collapsed"),
+        rrb.TimePanel(timeline=rec.TIME, play_state="following", state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
     )
 
@@ -179,14 +163,14 @@ def show_scans(
     """
     truth = recording.ground_truth
     if truth is not None:
-        truth = about_its_start(truth, least=2)
+        truth = rec.about_its_start(truth, least=2)
 
     def log(stream: rr.RecordingStream) -> None:
         if truth is not None:
-            path = rr.LineStrips3D([truth.positions], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
+            path = rr.LineStrips3D([truth.positions], colors=[rec.REFERENCE_COLOUR], radii=rec.PATH_RADIUS)
             stream.log("world/ground truth", path, static=True)
             # The eye follows only drawn entities.
-            place = rr.Points3D([[0.0, 0.0, 0.0]], colors=[REFERENCE_COLOUR], radii=2.0 * PATH_RADIUS)
+            place = rr.Points3D([[0.0, 0.0, 0.0]], colors=[rec.REFERENCE_COLOUR], radii=2.0 * rec.PATH_RADIUS)
             stream.log(_LIDAR, place, static=True)
         faults, done = Faults(), 0
         with bar(source.name) as count:
@@ -202,16 +186,16 @@ def show_scans(
 
 
 def _log_scan(recording: rr.RecordingStream, index: int, scan: Scan, truth: Trajectory | None, points: int) -> None:
-    set_stamp(recording, index, scan.stamp)
+    rec.set_stamp(recording, index, scan.stamp)
     if truth is not None:  # beyond its ends its first or last pose
         stamp = np.clip(scan.stamp, truth.stamps[0], truth.stamps[-1])
         T_world_lidar = truth.at(np.array([stamp]))[0]
         recording.log(_LIDAR, rr.Transform3D(translation=T_world_lidar[:3, 3], mat3x3=T_world_lidar[:3, :3]))
-    shown = every_nth(scan.points, points)
+    shown = rec.every_nth(scan.points, points)
     values = shown[:, 2]
     if scan.intensities is not None:  # the darkest where there is none
-        values = np.nan_to_num(every_nth(scan.intensities, points).astype(np.float64))
-    recording.log(f"{_LIDAR}/scan", rr.Points3D(shown, colors=viridis(levels(values)), radii=SCAN_RADIUS))
+        values = np.nan_to_num(rec.every_nth(scan.intensities, points).astype(np.float64))
+    recording.log(f"{_LIDAR}/scan", rr.Points3D(shown, colors=viridis(levels(values)), radii=rec.SCAN_RADIUS))
 
 
 def _layout_of_scans(has_truth: bool) -> rrb.Blueprint:
@@ -221,7 +205,7 @@ def _layout_of_scans(has_truth: bool) -> rrb.Blueprint:
         eye = rrb.EyeControls3D(position=_BEHIND, look_target=(0.0, 0.0, 0.0), tracking_entity=f"/{_LIDAR}")
         on_path = rrb.Spatial3DView(origin="/world", name="On the true path", background=BACKGROUND, eye_controls=eye)
         views.append(on_path)
-    panel = rrb.TimePanel(timeline=TIME, play_state="playing", loop_mode="all", state="collapsed")
+    panel = rrb.TimePanel(timeline=rec.TIME, play_state="playing", loop_mode="all", state="collapsed")
     return rrb.Blueprint(rrb.Horizontal(*views), panel, collapse_panels=True)
 
 
@@ -241,9 +225,9 @@ def show_errors(comparison: MapComparison, positions: FloatArray, clip_m: float)
     def log(recording: rr.RecordingStream) -> None:
         for entity, (errors, _) in clouds.items():
             colours = error_colours(errors.distances_m, clip_m)
-            cloud = rr.Points3D(errors.points - middle, colors=colours, radii=MAP_RADIUS)
+            cloud = rr.Points3D(errors.points - middle, colors=colours, radii=rec.MAP_RADIUS)
             recording.log(f"world/{entity}", cloud, static=True)
-        line = rr.LineStrips3D([positions - middle], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
+        line = rr.LineStrips3D([positions - middle], colors=[rec.REFERENCE_COLOUR], radii=rec.PATH_RADIUS)
         recording.log("world/path", line, static=True)
         origin = ", ".join(f"{m:.0f}" for m in middle)
         text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"

@@ -13,8 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from lidarslam.config.settings import Config, load_config
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import Config, load_config, read_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text import count, scan_span, small_length, up_to
@@ -22,7 +21,7 @@ from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResul
 from lidarslam.evaluation.report.report import render_run
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage import directory as files
-from lidarslam.storage.directory import MAP_TILES, SCANS_CSV, RunDirectory
+from lidarslam.storage.directory import MAP_TILES, SCANS_CSV, RunDirectory, flat
 from lidarslam.storage.finished_run import read_scans, read_summary, read_trajectory, where_astray
 from lidarslam.viewer.picture import draw_runs, fit_frame, load_drawn_runs
 
@@ -38,14 +37,9 @@ _LISTED = 3
 
 
 def leave_report(run: Path, errors: MethodResult, reference: str = GROUND_TRUTH, notes: Sequence[str] = ()) -> bool:
-    """Draw the page and the pictures of a finished run; whether it could be done. A failure is a warning.
+    """Draw the page and the pictures of a run's directory; whether it could be done. A failure is a warning.
 
-    Args:
-        run: its directory.
-        errors: of the run, as far as there are references; a trajectory there is the one that was compared, if not the
-            run's own.
-        reference: name of the reference trajectory.
-        notes: remarks for the reader.
+    A trajectory in the errors is the one that was compared with the reference, if that is not the run's own.
     """
     try:
         directory, (drawn,) = RunDirectory(run), load_drawn_runs([run])
@@ -185,18 +179,9 @@ def describe_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
 
 def changed_settings(config: Config) -> dict[str, str]:
     """Settings that differ from the defaults, with these."""
-    usual = dict(_flat(Config().model_dump(mode="json")))
-    ours = dict(_flat(config.model_dump(mode="json")))
+    usual, ours = (flat(one.model_dump(mode="json")) for one in (Config(), config))
     changed = {name: value for name, value in ours.items() if value != usual.get(name)}
     return {name: f"{_as_yaml(value)} (default {_as_yaml(usual.get(name))})" for name, value in changed.items()}
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _as_yaml(value: Any) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from peers import NAMES, run_peer
 
-from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.estimation import PEERS
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 

@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.alignment import associate
 
 # Constant body velocity, so that interpolation and extrapolation are exact.
 TWIST = np.array([0.1, -0.2, 0.3, 2.0, 0.5, -0.1])

@@ -8,8 +8,8 @@ from kiss_icp.metrics import sequence_error
 
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.evaluation.trajectory.association import associate
-from lidarslam.evaluation.trajectory.drift import kitti_drift, segment_errors, short_drift
+from lidarslam.evaluation.trajectory.alignment import associate
+from lidarslam.evaluation.trajectory.metrics import kitti_drift, segment_errors, short_drift
 
 # KISS-ICP, like the development kit's first version, takes pi for 3.14 and returns single precision.
 KISS_ICP_PI = 3.14

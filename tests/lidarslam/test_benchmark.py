@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.compare.methods import parse_method, parse_methods
-from lidarslam.compare.plan import Benchmark, CompareRequest, fill_request, load_benchmark
+from lidarslam.compare.plan import Benchmark, CompareRequest, fill_request, load_benchmark, parse_method, parse_methods
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError
 from lidarslam.simulation.motion import CARRIERS

@@ -25,9 +25,8 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run import checkpoints
 from lidarslam.run.checkpoints import Checkpoints, scans_left
 from lidarslam.run.results import TileWriter
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.storage.directory import CONFIG, RunDirectory
-from lidarslam.storage.unfinished import About, Unfinished, require_whole
+from lidarslam.run.summary import ScanLog
+from lidarslam.storage.directory import CONFIG, About, RunDirectory, Unfinished, require_whole
 
 
 @dataclass

@@ -14,8 +14,7 @@ import pytest
 
 from lidarslam.compare.comparison import CompareOutcome, compare, format_comparison
 from lidarslam.compare.method_run import Limits
-from lidarslam.compare.methods import parse_methods
-from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
@@ -227,7 +226,7 @@ def test_an_interruption_before_any_turn_is_written_for_every_recording(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lidarslam.compare.comparison.run_method", interrupted)
+    monkeypatch.setattr("lidarslam.compare.method_run.run_method", interrupted)
     entries = (RecordingEntry(recording), RecordingEntry(recording, start=1))
     outcome = compare(_request(recording, tmp_path, "kiss-icp", recordings=entries), told.narrator)
     assert outcome.interrupted

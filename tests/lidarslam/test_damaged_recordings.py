@@ -20,8 +20,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_kitti_poses, read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE, header, point_cloud
-from lidarslam.storage.directory import UNFINISHED
-from lidarslam.storage.unfinished import About
+from lidarslam.storage.directory import UNFINISHED, About
 
 from ..conftest import succeeds
 from .conftest import FAST, ends_well, fuzzed, summary_of

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.storage import default_places
-from lidarslam.storage.default_places import latest_run, source_name, unfinished_run
-from lidarslam.storage.unfinished import About, Unfinished
+from lidarslam.storage import finished_run
+from lidarslam.storage.directory import About, Unfinished
+from lidarslam.storage.finished_run import latest_run, source_name, unfinished_run
 
 from ..conftest import lidarslam, succeeds
 from . import conftest
@@ -142,8 +142,8 @@ def test_evaluate_and_view_take_the_latest_run(whole_run: Path) -> None:
         refused = lidarslam(*command)
         assert refused.exit_code == 2
         assert "name a RUN; runs holds no finished one" in refused.stderr
-    default_places.RUNS.mkdir()
-    (default_places.RUNS / "whole").symlink_to(whole_run)
+    finished_run.RUNS.mkdir()
+    (finished_run.RUNS / "whole").symlink_to(whole_run)
     evaluated = lidarslam("evaluate", "-o", "metrics.json")
     assert (evaluated.exit_code, evaluated.stderr) == (0, "lidarslam: taking the latest run, runs/whole\n")
     assert evaluated.stdout.endswith("written to metrics.json\nnext: lidarslam view runs/whole\n")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import read_yaml
 from lidarslam.core.geometry import exp
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation

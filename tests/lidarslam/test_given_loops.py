@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from lidarslam.config.yaml_text import read_yaml
+from lidarslam.config.settings import read_yaml
 
 from ..conftest import succeeds
 from .conftest import FAST, refused, summary_of

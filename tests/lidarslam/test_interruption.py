@@ -15,7 +15,7 @@ from click.testing import Result
 from lidarslam.core.trajectory import read_tum
 from lidarslam.run import interruption
 from lidarslam.run.interruption import Interruptions, ended_like_interrupted
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 
 from ..conftest import lidarslam
 from .conftest import FAST

@@ -28,8 +28,7 @@ from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.made_messages import header, point_cloud
 from lidarslam.live.live import bounded
 from lidarslam.live.messages import CloudDecoder, PosePublisher, serialize_transform
-from lidarslam.live.receiving import IncomingQueue, PublishedTopic, Received, find_topic
-from lidarslam.live.statistics import LiveStatistics, count_missing
+from lidarslam.live.receiving import IncomingQueue, LiveStatistics, PublishedTopic, Received, count_missing, find_topic
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.run import machine as described
-from lidarslam.run.machine import versions
+from lidarslam.compare import comparison as described
+from lidarslam.compare.comparison import versions
 
 
 def test_the_programs_that_results_depend_on_are_named() -> None:

@@ -12,7 +12,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.storage.directory import MAPS
-from lidarslam.storage.finished_run import load_map, load_run
+from lidarslam.storage.finished_run import load_map
 
 from ..conftest import succeeds
 
@@ -88,7 +88,7 @@ def test_the_map_has_the_intensities_and_colours_of_its_surfaces(
     assert off.max() < 50.0 * 0.2
     assert not known.rgb[~has].any()
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["map_fields"] == ["intensity", "rgb"]
-    assert len(dict(load_run(tmp_path / "run").map_attributes.present())) == 2
+    assert len(dict(load_map(tmp_path / "run").attributes.present())) == 2
 
 
 @pytest.mark.long

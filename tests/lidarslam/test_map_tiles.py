@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from lidarslam.storage.directory import remove_run
 from lidarslam.storage.finished_run import load_map
-from lidarslam.storage.unfinished import remove_run
 
 from ..conftest import lidarslam, succeeds
 

@@ -20,8 +20,7 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_tum
-from lidarslam.merge.merge import merge
-from lidarslam.merge.parts import MergeOutcome, MergeRequest, format_merge
+from lidarslam.merge.merge import MergeOutcome, MergeRequest, format_merge, merge
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.run.run import Progress
 from lidarslam.simulation.motion import Motion

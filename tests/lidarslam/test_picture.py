@@ -15,7 +15,6 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.viewer.annotations import INK, START, round_length
 from lidarslam.viewer.picture import (
     OBLIQUE,
     TOP,
@@ -28,7 +27,7 @@ from lidarslam.viewer.picture import (
     save_video,
     turn_runs,
 )
-from lidarslam.viewer.view import View, draw_layer, fit_view, turning_views
+from lidarslam.viewer.view import INK, START, View, draw_layer, fit_view, round_length, turning_views
 
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 WIDTH = 400

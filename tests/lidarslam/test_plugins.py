@@ -14,7 +14,7 @@ import pytest
 
 from lidarslam.commands.options import take_config
 from lidarslam.commands.runs import run
-from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.plan import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.scan import Scan

@@ -10,8 +10,7 @@ from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.results import format_times
-from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import Milliseconds, SlowestScan, WrittenMap, summarise
+from lidarslam.run.summary import Milliseconds, ScanLog, SlowestScan, WrittenMap, summarise
 
 from .conftest import scan_estimate
 

@@ -10,8 +10,7 @@ import pytest
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from lidarslam.config.settings import Config, load_config
-from lidarslam.config.yaml_text import bounds_of, bounds_text
+from lidarslam.config.settings import Config, bounds_of, bounds_text, load_config
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan

@@ -19,15 +19,13 @@ import numpy as np
 import pytest
 
 from lidarslam.compare.comparison import CompareOutcome, compare
-from lidarslam.compare.methods import parse_methods
-from lidarslam.compare.plan import CompareRequest, RecordingEntry
+from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import SERIAL, Where
-from lidarslam.merge import parts as tracking
-from lidarslam.merge.merge import merge
-from lidarslam.merge.parts import MergeOutcome, MergeRequest
+from lidarslam.merge import merge as tracking
+from lidarslam.merge.merge import MergeOutcome, MergeRequest, merge
 from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam

@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.run.summary import time_scale, time_scale_warning
+from lidarslam.run.calibration import time_scale, time_scale_warning
 
 from ..conftest import lidarslam, succeeds
 

@@ -1,19 +1,24 @@
-"""A recording through a peer: its poses, a map of them, and its times, as of any other method."""
+"""The peers by name, their libraries loaded on use; a recording through a peer: poses, map and times."""
 
+import importlib.util
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
 from lidarslam.compare.peers.interface import Estimator, PeerError, Poses, Sweep
-from lidarslam.compare.peers.registry import Peer
+from lidarslam.compare.peers.libraries import KissSlamEstimator, RkoLioEstimator, SmallGicpEstimator
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, orthonormalize
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.plugins import PlugPoint
 from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory
@@ -28,8 +33,57 @@ from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, unless_damaged, write_results
-from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary import ScanLog
 from lidarslam.storage.directory import RunDirectory
+
+EXTRA = "pip install 'lidarslam[peers]'"
+
+Make = Callable[[Sweep, ImuSamples | None, float | None], Estimator]
+"""From the first sweep with points, the IMU, and the maximum range by the size of the scene; None: its defaults."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another program on the same scans."""
+
+    name: str  # in `--methods`
+    library: str  # the module that it needs
+    package: str  # that holds it
+    make: Make
+    needs_imu: bool = False
+    has_voxels: bool = True  # whether it has settings that follow the size of the scene
+
+    @property
+    def version(self) -> str:
+        """Package and version, such as `evalio 0.6.1`."""
+        return f"{self.package} {version(self.package)}"
+
+    def require(self, has_imu: Callable[[], bool]) -> None:
+        """Refuse where it cannot run."""
+        if importlib.util.find_spec(self.library) is None:
+            extra = EXTRA if self.name in PEERS else f"pip install {self.package}"
+            raise PeerError(f"runs with {self.package}, which is not installed: {extra}")
+        if self.needs_imu and not has_imu():
+            raise PeerError("needs an IMU, and the recording has none")
+
+
+_ALL = (
+    *(
+        Peer(name, "evalio", "evalio", partial(EvalioEstimator, one), one.needs_imu, bool(one.voxels_m))
+        for name, one in PIPELINES.items()
+    ),
+    Peer("kiss-slam", "kiss_slam", "kiss-slam", KissSlamEstimator),
+    Peer("small-gicp", "small_gicp", "small_gicp", SmallGicpEstimator),
+    Peer("rko-lio", "rko_lio", "rko_lio", RkoLioEstimator, needs_imu=True),
+)
+PEERS = {peer.name: peer for peer in _ALL}
+ALL_PEERS = PlugPoint("peer", tuple(PEERS))
+
+
+def peer_named(name: str) -> Peer:
+    """The peer of a name in `ALL_PEERS`."""
+    return PEERS.get(name) or cast(Peer, ALL_PEERS.load(name, Peer))
+
 
 PEER_KEY = "peer"
 # Fewer points do not fix six degrees of freedom, and some libraries abort on a handful.

@@ -134,16 +134,12 @@ class EvalioEstimator:
         if how == "elastic":
             rows, instants = elastic_instants(starts, middles, ends)
             return Poses(instants, poses[rows])
-        rows = _fresh(poses)
+        # Without repetitions of the one before, as of a sweep that was skipped or came too early.
+        repeated = (np.diff(poses, axis=0) == 0.0).all(axis=(1, 2))
+        rows = np.flatnonzero(np.concatenate([[True], ~repeated]))
         stamps = np.array([stamp for stamp, _ in self._saved])[rows]
         instants = middles[np.searchsorted(0.5 * (starts[1:] + starts[:-1]), stamps)]
         return Poses(instants, poses[rows]) if how == "middle" else Poses(instants[:-1], poses[rows[1:]])
-
-
-def _fresh(poses: FloatArray) -> NDArray[np.intp]:
-    """The poses without repetitions of the one before, as of a sweep that was skipped or came too early."""
-    repeated = (np.diff(poses, axis=0) == 0.0).all(axis=(1, 2))
-    return np.flatnonzero(np.concatenate([[True], ~repeated]))
 
 
 def elastic_instants(starts: FloatArray, middles: FloatArray, ends: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:

@@ -59,10 +59,7 @@ class Estimator(Protocol):
         """Take the sample with this number; called for peers that need an IMU alone."""
 
     def load(self, sweep: Sweep) -> Callable[[], None]:
-        """Convert a sweep to the peer's own types; the registration, still to be called.
-
-        The time of a scan is that of the registration alone.
-        """
+        """Convert a sweep to the peer's own types; the registration, still to be called, which alone is timed."""
 
     def finish(self) -> Poses:
         """The poses, after the last scan."""

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.compare.methods import scene_range_m
-from lidarslam.compare.peers.estimation import estimate, is_covered
+from lidarslam.compare.peers.estimation import PEERS, estimate, is_covered
 from lidarslam.compare.peers.interface import PeerError, Poses, Sweep
-from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.plan import scene_range_m
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
