@@ -140,19 +140,18 @@ class LearnedOdometry(Stateful):
         sweeps = SweepPair(sweep.images.alignment, last.images.alignment, interval_s, previous)
         starts = [_initial_estimate(candidate, candidates[0]) for candidate in candidates]
         if previous is not None:
-            starts.append(InitialEstimate(exp(previous.velocity * interval_s), sigmas=_SIGMAS_OF_GOING_ON))
+            expected = exp(previous.velocity * interval_s)
+            starts.append(InitialEstimate(expected, sigmas=_SIGMAS_OF_GOING_ON))
         best = align_best(starts, sweeps)
         degeneracy = find_degeneracy(best.information, best.inliers, sweep.images.alignment)
-        if len(degeneracy) and previous is not None and self._last_covariance is not None:
-            expected = exp(previous.velocity * interval_s)
-            scale = (interval_s / previous.interval_s) ** 2
-            covariance = scale * self._last_covariance + np.diag((_ACCELERATION * interval_s**2) ** 2)
-            held = _HELD * degeneracy.projector()
-            start = replaced_along(best.T_prev_curr, expected, degeneracy)
-            best = align(InitialEstimate(start, held, held), sweeps)
-            information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
-        elif len(degeneracy):
+        if len(degeneracy):
             covariance = candidates[0].covariance
+            if previous is not None and self._last_covariance is not None:
+                scale = (interval_s / previous.interval_s) ** 2
+                covariance = scale * self._last_covariance + np.diag((_ACCELERATION * interval_s**2) ** 2)
+                held = _HELD * degeneracy.projector()
+                start = replaced_along(best.T_prev_curr, expected, degeneracy)
+                best = align(InitialEstimate(start, held, held), sweeps)
             information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
         else:
             information = INFORMATION_PER_M2 * best.information + best.prior_information
