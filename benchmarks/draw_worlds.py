@@ -6,10 +6,9 @@ r"""Draw the exact map of every simulated world, as one lap of its route sees it
         --scans 150 --width 800
 """
 
-import argparse
 from pathlib import Path
 
-from mapping_accuracy import in_world
+from mapping_accuracy import in_world, make_parser
 
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.simulation.recorder import Simulation
@@ -28,20 +27,18 @@ def draw_map(simulation: Simulation, path: Path, width: int) -> int:
 
 def main() -> None:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
     parser.add_argument("--motion", default="car")
     parser.add_argument("--sensor", default="os0-64")
     parser.add_argument("--scans", type=int, help="draw what the first scans see; default: a lap")
     parser.add_argument("--width", type=int, default=1600, help="pixels")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.worlds:
         path = arguments.out / f"{name}.png"
-        world, seed = build_world(name, arguments.seed), arguments.seed
-        simulation = in_world(world, arguments.motion, arguments.sensor, arguments.scans, seed)
+        simulation = in_world(build_world(name, 0), arguments.motion, arguments.sensor, arguments.scans, 0)
         points = draw_map(simulation, path, arguments.width)
         print(f"{path}: {points:,} points", flush=True)
 

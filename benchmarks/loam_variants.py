@@ -11,14 +11,13 @@ Prints a Markdown table, a row for each recording: ATE in metres after SE(3) ali
 - discrete: the sweep compensated with the odometry's velocity, not with one that is estimated with the pose.
 """
 
-import argparse
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import add_simulation_arguments, localise, print_header, print_row, recordings
+from mapping_accuracy import add_simulation_arguments, localise, make_parser, print_header, print_row, recordings
 from numpy.typing import NDArray
 
 from lidarslam.config.settings import Config
@@ -65,7 +64,7 @@ _VARIANTS: dict[str, tuple[Callable[[], AbstractContextManager[None]], MappingCo
 
 def main() -> None:
     """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     parser.add_argument("--odometry", choices=("learned", "constant-velocity"), default="learned")
     add_simulation_arguments(parser, (), ("tracked",))

@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 from long_run_peers import FedPeer, add_line, feed_peers
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import make_parser, make_simulation, print_header, print_row
 from memory import resident_mb
 
 from lidarslam.config.settings import Config
@@ -255,7 +255,7 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
 
 def main() -> None:
     """Parse the command line, run everything, print and draw it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of what was measured")
     parser.add_argument("--world", default="town")
     parser.add_argument("--motion", default="car-fast")

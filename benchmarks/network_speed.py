@@ -11,7 +11,6 @@ taken, because other work on the machine only adds to it; then the mean over all
 simulated, a car in a street.
 """
 
-import argparse
 import itertools
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from mapping_accuracy import simulate
+from mapping_accuracy import make_parser, simulate
 from mapping_speed import Stopwatch
 
 from lidarslam.core.scan import Scan
@@ -67,16 +66,16 @@ _GRAPHS = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--sensors", nargs="+", default=["vlp-16", "hdl-64e"], help="simulated")
     parser.add_argument("--recordings", nargs="+", type=Path, default=[])
     parser.add_argument("--scans", type=int, default=SCANS)
     parser.add_argument("--rounds", type=int, default=5)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     torch.set_num_threads(options.threads)
     recordings = {sensor: list(simulate("street", "car", sensor, options.scans, 0).scans) for sensor in options.sensors}
     imager = Imager(ImageConfig())

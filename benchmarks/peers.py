@@ -7,14 +7,13 @@ column says by how many milliseconds the stamps are shifted before the compariso
 instants are right, the least error stands at zero.
 """
 
-import argparse
 import multiprocessing
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import make_parser, make_simulation, print_row
 
 from lidarslam.compare.peers.estimation import estimate
 from lidarslam.compare.peers.interface import PeerError
@@ -47,15 +46,15 @@ def _estimate(name: str, scans: Sequence[Scan], imu: ImuSamples | None) -> Traje
     return estimate(PEERS[name], scans, imu).trajectory
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS))
     parser.add_argument("--world", default="street")
     parser.add_argument("--motion", default="car")
     parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--scans", type=int, default=100)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     simulation = make_simulation(options.world, options.motion, options.sensor, options.scans, seed=0)
     scans = list(simulation.scans())
     print_row(["peer", *(f"{shift:+d} ms" for shift in SHIFTS_MS)])

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import make_parser, make_simulation, print_header, print_row
 from numpy.typing import NDArray
 
 from lidarslam.compare.methods import parse_method
@@ -60,9 +60,9 @@ class Times:
     stage_ms: dict[str, list[float]] = field(default_factory=dict)  # of the stages of ours, of single scans
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Print a table for every recording."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
     parser.add_argument("--methods", nargs="+", default=["learned+map", "constant-velocity+map", "learned+map+graph"])
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--warm-up", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", nargs=2, metavar=("PEER", "FILE"), help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     if options.only is not None:
         print(json.dumps(_run_peer(options.only[0], Path(options.only[1]), options.warm_up)))
     for source in options.sources:

@@ -14,14 +14,13 @@ Prints a Markdown table for each:
 Seconds and milliseconds are of the processor.
 """
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -225,7 +224,7 @@ def rms(poses: FloatArray, truth: FloatArray) -> float:
 
 def main() -> None:
     """Parse the command line and print what was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--kitti-00", type=Path, metavar="DIR", help="KISS-ICP's trajectory and the truth")
     parser.add_argument("--step-m", type=float, default=2.0, help="between keyframes on KITTI 00")
     parser.add_argument("--false-percent", type=float, nargs="+", default=[0.0, 10.0, 30.0], help="of the true loops")

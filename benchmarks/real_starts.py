@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 from peers import run_peer
 
 from lidarslam.cli import main as lidarslam
@@ -224,9 +224,9 @@ def print_starts(name: str, step: int, runs: dict[str, list[Judged]]) -> None:
     print(flush=True)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Parse the command line, run, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=DEFAULT_METHODS)
     parser.add_argument("--steps", nargs="+", type=int, default=[1], help="take every n-th scan")
@@ -243,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--wrong-percent", type=float, default=3.0)
     parser.add_argument("--all", action="store_true", help="every run too")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     rows = []
     logging.basicConfig(stream=sys.stderr, level=logging.ERROR)  # not to the streams of a run, which end with it
     for source in options.sources:

@@ -12,13 +12,12 @@ Prints a Markdown table, a row for each fault, place and budget (`mapping.budget
 Milliseconds are CPU time of the thread, and so is the clock of the budget here: other programs do not matter.
 """
 
-import argparse
 import time
 from collections.abc import Iterator
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import make_parser, make_simulation, print_header, print_row
 from simulated_faults import Faulty, carried_off, covered, dropped, index_back
 from threadpoolctl import threadpool_limits
 
@@ -82,7 +81,7 @@ _BACK = ({Status.OK, Status.DEGRADED}, {Status.OK})
 
 def main() -> None:
     """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--faults", nargs="+", choices=_FAULTS, default=_FAULTS)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=list(_PLACES))
     parser.add_argument("--budgets-ms", nargs="+", type=float, default=[0.0, 100.0, 50.0])

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mapping_accuracy import DEFAULT_METHODS, METHODS, make_simulation, print_header, print_row
+from mapping_accuracy import DEFAULT_METHODS, METHODS, make_parser, make_simulation, print_header, print_row
 from simulated_faults import (
     Cover,
     Faulty,
@@ -218,7 +218,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
 
 def main() -> None:
     """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     kinds = [*_FAULTS, "traffic", "still", "featureless"]
     parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=["office", "tunnel", "street"])
