@@ -37,6 +37,8 @@ DRIFT_M, DRIFT_DEG = 0.05, 0.033  # for the root of a metre
 # How the drift of two thousand learned pairs compares with that of registration to the map.
 LOOSER = 5.0
 LOOP_M, LOOP_DEG = 0.1, 0.5
+# Between keyframes on KITTI 00, and false loops there, of the true ones.
+STEP_M, FALSE_PERCENTS = 2.0, (0.0, 10.0, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +112,17 @@ def timed_optimise(
     return optimised, time.process_time() - start
 
 
-def close_kitti(folder: Path, step_m: float, seed: int, false_percents: Sequence[float]) -> None:
+def close_kitti(folder: Path) -> None:
     """KITTI 00 with loops from the truth."""
     estimate, truth = (read_kitti_poses(folder / f"{name}_kitti.txt") for name in ("estimate", "ground_truth"))
-    scans = every(estimate, step_m)
+    scans = every(estimate, STEP_M)
     poses = estimate[scans]
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     scene = Scene(poses, truth[scans], lengths[:, None, None] * covariance(DRIFT_DEG, DRIFT_M))
     pairs = revisits(scene.truth, scans, within_m=4.0, apart_s=30.0)
     print_header(["loops", "false ones", "ATE before", "online", "optimised", "s", "true kept", "false kept"])
-    for percent in false_percents:
-        rng = np.random.default_rng(seed)
+    for percent in FALSE_PERCENTS:
+        rng = np.random.default_rng(0)
         loops = true_loops(scene, pairs, rng)
         lies = false_loops(len(scans), round(percent / 100.0 * len(loops)), rng)
         every_loop = sorted([(e, True) for e in loops] + [(e, False) for e in lies], key=lambda pair: pair[0].second)
@@ -189,9 +191,9 @@ def _ahead(heading: int) -> FloatArray:
     return np.array([np.cos(heading * np.pi / 2), np.sin(heading * np.pi / 2)]).round()
 
 
-def measure_time(keyframes: int, loops: int, seed: int) -> None:
+def measure_time(keyframes: int, loops: int) -> None:
     """The time of a simulated graph's parts."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     scene = drive_round_town(keyframes, rng)
     pairs = revisits(scene.truth, 20 * np.arange(keyframes), within_m=3.0, apart_s=30.0)
     pairs = pairs[np.sort(rng.choice(len(pairs), min(loops, len(pairs)), replace=False))]
@@ -226,16 +228,13 @@ def main() -> None:
     """Parse the command line and print what was asked for."""
     parser = make_parser(__doc__)
     parser.add_argument("--kitti-00", type=Path, metavar="DIR", help="KISS-ICP's trajectory and the truth")
-    parser.add_argument("--step-m", type=float, default=2.0, help="between keyframes on KITTI 00")
-    parser.add_argument("--false-percent", type=float, nargs="+", default=[0.0, 10.0, 30.0], help="of the true loops")
     parser.add_argument("--keyframes", type=int, default=0, help="of the simulated drive")
     parser.add_argument("--loops", type=int, default=500, help="likewise")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.kitti_00:
-        close_kitti(arguments.kitti_00, arguments.step_m, arguments.seed, arguments.false_percent)
+        close_kitti(arguments.kitti_00)
     if arguments.keyframes:
-        measure_time(arguments.keyframes, arguments.loops, arguments.seed)
+        measure_time(arguments.keyframes, arguments.loops)
 
 
 if __name__ == "__main__":

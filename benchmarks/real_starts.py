@@ -11,11 +11,11 @@ With `--yaws`, our methods start again with the axes turned by each angle: the s
 - worst, median ATE: metres, after SE(3) alignment, over the starts; with ground truth only;
 - worst start: the scan that the worst run starts at, by ATE, or by length where there is no truth;
 - worst length error: of the path's length against the truth's, without truth against KISS-ICP's, in % of the latter or
-  of `--shortest` metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
+  of 10 metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
   whose truth is satellite navigation with errors of several percent over such short runs;
 - lost, degraded: scans, of all runs;
 - ok: runs that end with exit status 0;
-- ok but wrong: of these, the runs whose length is wrong by more than `--wrong-percent`.
+- ok but wrong: of these, the runs whose length is wrong by more than 3 %.
 
 Our methods and KISS-ICP run as `lidarslam run` does, with its exit status; for KISS-ICP that is `--no-mapping`, where
 each scan is held against the one before. Other peers know no status, and are ok when their process comes to its end.
@@ -57,6 +57,8 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 METHODS = (*OPTIONS, *PEERS)
 DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "ct-icp")
 REFERENCE = "KISS-ICP"
+# The least length that errors of it are in % of; a run whose length is wrong by more is wrong.
+SHORTEST_M, WRONG_PERCENT = 10.0, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,24 +129,22 @@ def run_other(method: str, recording: Recording, scans: range) -> Ended:
     return Ended(trajectory, None, None, 0)
 
 
-def judge(
-    ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None, shortest_m: float
-) -> Judged:
+def judge(ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None) -> Judged:
     """Hold a run against the truth, and the length of its path against that of another trajectory."""
     trajectory = ended.trajectory
     ate_m = length_error_percent = None
     if trajectory is not None and of_length is not None:
-        length_error_percent = length_error(trajectory, of_length, shortest_m)
+        length_error_percent = length_error(trajectory, of_length)
     if trajectory is not None and truth is not None:
         ate_m = evaluate_trajectory(trajectory, truth).errors.ate_rmse_m
     return Judged(scans.start, len(scans), ate_m, length_error_percent, ended.lost, ended.degraded, ended.status)
 
 
-def length_error(trajectory: Trajectory, reference: Trajectory, shortest_m: float) -> float:
+def length_error(trajectory: Trajectory, reference: Trajectory) -> float:
     """How much longer a path is than the reference's at the same instants, in percent."""
     matched = associate(trajectory, reference)
     true_m = matched.reference.length_m
-    return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, shortest_m)
+    return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, SHORTEST_M)
 
 
 def judged_runs(
@@ -164,7 +164,7 @@ def judged_runs(
             ended = run_ours(method, source, scans, yaw_deg) if is_ours else run_other(method, recording, scans)
             if method == REFERENCE and of_length is None:
                 of_length = ended.trajectory
-            judged = judge(ended, scans, truth, of_length, arguments.shortest)
+            judged = judge(ended, scans, truth, of_length)
             _report(f"{recording.name} step {step} start {scans.start} {method}: {_line(judged)} {ended.message}")
             yield method, judged
 
@@ -177,13 +177,13 @@ def _report(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def row(name: str, method: str, step: int, runs: Sequence[Judged], wrong_percent: float) -> list[str]:
+def row(name: str, method: str, step: int, runs: Sequence[Judged]) -> list[str]:
     """The cells of one method."""
     worst = max(runs, key=lambda run: run.badness)
     ates = [run.ate_m for run in runs if run.ate_m is not None]
     errors = [run.length_error_percent for run in runs if run.length_error_percent is not None]
     ok = [run for run in runs if run.status == 0]
-    wrong = [run for run in ok if run.length_error_percent is None or abs(run.length_error_percent) > wrong_percent]
+    wrong = [run for run in ok if run.length_error_percent is None or abs(run.length_error_percent) > WRONG_PERCENT]
     return [
         name,
         str(step),
@@ -233,15 +233,11 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=10, help="scans from one start to the next")
     parser.add_argument("--scans", type=int, default=50, help="of a run")
     parser.add_argument(
-        "--shortest", type=float, default=10.0, help="metres that an error of length is in %% of at least"
-    )
-    parser.add_argument(
         "--lengths-of", choices=["truth", REFERENCE], default="truth", help="what lengths are held against"
     )
     parser.add_argument(
         "--yaws", nargs="+", type=float, default=[0.0], help="angles by which the axes are turned, degrees"
     )
-    parser.add_argument("--wrong-percent", type=float, default=3.0)
     parser.add_argument("--all", action="store_true", help="every run too")
     options = parser.parse_args()
     rows = []
@@ -254,9 +250,7 @@ def main() -> None:
                 runs.setdefault(method, []).append(judged)
             if options.all:
                 print_starts(recording.name, step, runs)
-            rows += [
-                row(recording.name, method, step, judged, options.wrong_percent) for method, judged in runs.items()
-            ]
+            rows += [row(recording.name, method, step, judged) for method, judged in runs.items()]
     header = ["recording", "step", "method", "starts", "worst ATE, m", "median ATE, m", "worst start"]
     header += ["worst length error, %", "lost", "degraded", "ok", "ok but wrong"]
     print_header(header)
