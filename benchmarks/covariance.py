@@ -45,7 +45,6 @@ from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
-from lidarslam.simulation.world import WORLDS
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]
@@ -126,14 +125,11 @@ def rows(recorded: Recorded, method: str) -> Iterator[list[str]]:
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--methods", nargs="+", choices=_MAPPED, default=_DEFAULT)
     options = parser.parse_args()
-    if not options.sources and not options.worlds:
-        options.worlds = list(WORLDS)
     header = ["recording", "method", "of", "count", "left out", "median NEES/6"]
     header += [f"within {sigma} sigma, %" for sigma in SIGMAS]
     print_header(header)

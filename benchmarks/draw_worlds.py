@@ -26,7 +26,6 @@ def draw_map(simulation: Simulation, path: Path, width: int) -> int:
 
 
 def main() -> None:
-    """Parse the command line."""
     parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))

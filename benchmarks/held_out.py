@@ -70,7 +70,6 @@ class Outcome:
 
 
 def main() -> None:
-    """Print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", metavar="RECORDING[=WEIGHTS]")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 3, 5])

@@ -111,7 +111,6 @@ def cluster(starts: Path, kill_after: int | None) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=int, default=12)
     parser.add_argument("--scans", type=int, default=40)

@@ -136,7 +136,6 @@ def compare(source: Path, rounds: int) -> None:
 
 
 def main() -> None:
-    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+", type=Path, help="KITTI sequences/NN folders or raw drive folders")
     parser.add_argument("--rounds", type=int, default=5)

@@ -35,7 +35,6 @@ from lidarslam.pipeline.threads import in_order
 
 
 def main() -> None:
-    """Parse the command line, and time both on every recording."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")

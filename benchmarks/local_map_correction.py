@@ -186,7 +186,6 @@ def _most(milliseconds: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Parse the command line and print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth, or the one of --pairs")
     parser.add_argument("--pairs", type=Path, metavar="FILE", help="known relative poses of the recording's scans")

@@ -171,7 +171,6 @@ def of_run(arguments: argparse.Namespace, config: Config) -> None:
 
 
 def main() -> None:
-    """Parse and run."""
     parser = make_parser(__doc__)
     parser.add_argument("--worlds", nargs="*", default=list(WORLDS), choices=WORLDS)
     parser.add_argument("--starts", type=int, default=8)

@@ -354,7 +354,6 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
 
 
 def main() -> None:
-    """Parse the command line, run everything, print and draw it."""
     parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of what was measured")
     parser.add_argument("--columns", type=int, help="of a turn, to make less of the sensor")

@@ -226,7 +226,6 @@ def _squared(closure: LoopClosure, truth: FloatArray) -> float:
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     parser.add_argument(
         "--worlds",

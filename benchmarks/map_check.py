@@ -75,7 +75,6 @@ def row(name: str, distortion: str, summary: RunSummary) -> str:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+", help="RECORDING, or RECORDING,POSES.tum")
     print("| recording | poses | contradiction | votes at the poses | lost scans | map entropy |")

@@ -63,7 +63,6 @@ def watch(built: GlobalMap, store: TileStore, scans: int, points: int, every: in
 
 
 def main() -> None:
-    """Parse the command line, print the table and the cost of the final map."""
     parser = make_parser(__doc__)
     parser.add_argument("--most-points", default="1000000", help="global_map.most_points; none: any number")
     parser.add_argument("--scans", type=int, default=6_000)

@@ -18,17 +18,15 @@ from mapping_accuracy import (
     Outcome,
     Recorded,
     add_simulation_arguments,
+    config_of,
     localise,
     make_parser,
     print_header,
     print_row,
     simulated_recordings,
-    with_odometry,
-    without_odometry,
     wrong_odometry,
 )
 
-from lidarslam.config.settings import Config
 from lidarslam.mapping.config import MappingConfig
 
 _PARTS: dict[str, MappingConfig] = {
@@ -42,9 +40,9 @@ _PARTS: dict[str, MappingConfig] = {
 def run_variants(recorded: Recorded, seed: int) -> list[Outcome]:
     """One recording through all variants, without odometry, with the learned and with the wrong one."""
     prior, mappings = wrong_odometry(recorded, seed), _PARTS.values()
-    alone = [localise(recorded, without_odometry(mapping)) for mapping in mappings]
-    learned = [localise(recorded, Config(mapping=mapping)) for mapping in mappings]
-    return alone + learned + [localise(recorded, with_odometry(mapping), prior) for mapping in mappings]
+    alone = [localise(recorded, config_of("constant-velocity", mapping)) for mapping in mappings]
+    learned = [localise(recorded, config_of("learned", mapping)) for mapping in mappings]
+    return alone + learned + [localise(recorded, config_of("external", mapping), prior) for mapping in mappings]
 
 
 def _labels() -> list[str]:
@@ -59,7 +57,6 @@ def _cells(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def main() -> None:
-    """Parse the command line, run everything, print the table."""
     parser = make_parser(__doc__)
     add_simulation_arguments(parser, ("office", "tunnel", "hall"), ("handheld", "legged", "tracked"))
     arguments = parser.parse_args()

@@ -33,7 +33,7 @@ from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.metrics import TrajectoryErrors, evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.odometry.config import KissConfig, OdometryConfig
+from lidarslam.odometry.config import KissConfig, OdometryConfig, OdometryName
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
@@ -50,17 +50,6 @@ from lidarslam.simulation.world import WORLDS, World, build_world
 BEYOND_TRUTH_S = 0.2
 # Errors of the wrong odometry at every scan.
 WRONG_DEG, WRONG_M = 2.0, 0.1
-
-METHODS = {
-    "learned+map": Config(),
-    "learned+loam": Config(mapping=MappingConfig(method="loam")),
-    "constant-velocity+map": Config(odometry=OdometryConfig(method="constant-velocity")),
-    "constant-velocity+loam": Config(
-        odometry=OdometryConfig(method="constant-velocity"), mapping=MappingConfig(method="loam")
-    ),
-    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(method="off")),
-}
-DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP")
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,14 +159,19 @@ def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
     return evaluate_trajectory(estimate, recorded.truth).errors
 
 
-def without_odometry(mapping: MappingConfig) -> Config:
-    """The configuration for scan-to-map refinement that goes on with the motion it saw last."""
-    return Config(odometry=OdometryConfig(method="constant-velocity"), mapping=mapping)
+def config_of(odometry: OdometryName, mapping: MappingConfig) -> Config:
+    """The configuration of an odometry in front of scan-to-map refinement."""
+    return Config(odometry=OdometryConfig(method=odometry), mapping=mapping)
 
 
-def with_odometry(mapping: MappingConfig) -> Config:
-    """The configuration for an external odometry in front of scan-to-map refinement."""
-    return Config(odometry=OdometryConfig(method="external"), mapping=mapping)
+METHODS = {
+    "learned+map": config_of("learned", MappingConfig()),
+    "learned+loam": config_of("learned", MappingConfig(method="loam")),
+    "constant-velocity+map": config_of("constant-velocity", MappingConfig()),
+    "constant-velocity+loam": config_of("constant-velocity", MappingConfig(method="loam")),
+    "KISS-ICP": config_of("kiss-icp", MappingConfig(method="off")),
+}
+DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP")
 
 
 def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
@@ -186,19 +180,14 @@ def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
     return localise(recorded, Config(odometry=odometry, mapping=MappingConfig(method="off")))
 
 
-def tune_kiss(recorded: Recorded, voxels: Sequence[float]) -> tuple[float, Outcome]:
-    """The voxel size with the smallest ATE, and what came of it."""
-    outcomes = {voxel_m: run_kiss(recorded, KissConfig(voxel_size_m=voxel_m)) for voxel_m in voxels}
-    return min(outcomes.items(), key=lambda item: item[1].ate_m)
-
-
 def row(recorded: Recorded, voxels: Sequence[float], seed: int) -> list[str]:
     """The cells of one recording."""
     kiss = run_kiss(recorded, KissConfig())
-    voxel_m, tuned = tune_kiss(recorded, voxels)
+    outcomes = [(run_kiss(recorded, KissConfig(voxel_size_m=voxel_m)), voxel_m) for voxel_m in voxels]
+    tuned, voxel_m = min(outcomes, key=lambda one: one[0].ate_m)
     prior = wrong_odometry(recorded, seed)
-    alone = localise(recorded, without_odometry(MappingConfig()))
-    helped = localise(recorded, with_odometry(MappingConfig()), prior)
+    alone = localise(recorded, config_of("constant-velocity", MappingConfig()))
+    helped = localise(recorded, config_of("external", MappingConfig()), prior)
     percents = [100.0 * outcome.ate_m / outcome.length_m for outcome in (alone, helped)]
     return [
         recorded.name,
@@ -214,14 +203,11 @@ def row(recorded: Recorded, voxels: Sequence[float], seed: int) -> list[str]:
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser)
     parser.add_argument("--voxels", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0], help="metres, for KISS-ICP")
     arguments = parser.parse_args()
-    if not arguments.sources and not arguments.worlds:
-        parser.error("give recordings, or worlds to simulate some in with --worlds")
     wrong = f"{WRONG_DEG:g} deg, {WRONG_M:g} m a scan"
     header = ["recording", "scans", "path, m", "KISS-ICP", "KISS-ICP, best voxel", "ours, no odometry"]
     header += [f"odometry wrong by {wrong}", "ours with it", "ours, % of the path: without / with it"]
@@ -254,7 +240,9 @@ def simulated_recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
 
 
 def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterator[Recorded]:
-    """All that are asked for, one in memory at a time; of those on disk at most so many scans."""
+    """All that are asked for, or of all worlds, one in memory at a time; of those on disk at most so many scans."""
+    if not arguments.sources and not arguments.worlds:
+        arguments.worlds = list(WORLDS)
     for source in arguments.sources:
         recorded = read(source)
         yield replace(recorded, scans=recorded.scans[:most])

@@ -185,7 +185,6 @@ def _ratio(ours: Sequence[_Pass], kiss: Sequence[_Pass], kind: int) -> str:
 
 
 def main() -> None:
-    """Parse the command line, and compare on every recording."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")

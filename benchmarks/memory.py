@@ -193,7 +193,6 @@ def growth(rows: list[Row]) -> str:
 
 
 def main() -> None:
-    """Parse the command line, print the table and the growth."""
     parser = make_parser(__doc__)
     cases = {"lap": lap, "rooms": rooms, "still": still}
     parser.add_argument("case", choices=cases)

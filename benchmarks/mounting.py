@@ -70,7 +70,6 @@ class From:
 
 
 def main() -> None:
-    """Print a table, a row for each turn and setting."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path)
     parser.add_argument("--sequence")

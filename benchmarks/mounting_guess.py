@@ -42,7 +42,6 @@ WRONG_DEG = 30.0
 
 
 def main() -> None:
-    """Print a table, a row for each recording, or for each world, sensor and motion."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", type=Path, nargs="*")
     parser.add_argument("--sequence")

@@ -24,7 +24,6 @@ _RIGHT_DEG, _RIGHT_M = 4.0, 0.8
 
 
 def main() -> None:
-    """Print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("source", type=Path)
     parser.add_argument("--weights", type=Path, nargs="+", required=True)

@@ -35,7 +35,7 @@ from lidarslam.odometry.methods import learned
 from lidarslam.odometry.network import candidates
 from lidarslam.odometry.network.candidates import Described, Search
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
-from lidarslam.odometry.network.exported import onnx_search, read_exported
+from lidarslam.odometry.network.exported import load_exported
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.registry import default_weights, make_odometry, shipped_folder
 from lidarslam.pipeline.threads import in_order
@@ -69,7 +69,6 @@ _GRAPHS = {
 
 
 def main() -> None:
-    """Print both tables."""
     parser = make_parser(__doc__)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--sensors", nargs="+", default=["vlp-16", "hdl-64e"], help="simulated")
@@ -102,7 +101,7 @@ def _networks(threads: int) -> list[tuple[str, Search, int]]:
     return [
         ("delora, torch", torch_search(delora, threads=threads), sizes[0]),
         ("correlation, torch", torch_search(shipped, threads=threads), sizes[1]),
-        ("correlation, ONNX Runtime", onnx_search(read_exported(shipped_folder()), threads), sizes[1]),
+        ("correlation, ONNX Runtime", load_exported(shipped_folder(), threads)[0], sizes[1]),
     ]
 
 

@@ -130,7 +130,6 @@ def scans(paths: list[Path]) -> list[tuple[str, FloatArray]]:
 
 
 def main() -> None:
-    """Parse the command line and print the tables."""
     parser = make_parser(__doc__)
     parser.add_argument("--parts", nargs="+", choices=[*_PARTS, "thinning"], default=[*_PARTS, "thinning"])
     parser.add_argument("--worlds", nargs="*", choices=list(WORLDS), default=["street", "office"])

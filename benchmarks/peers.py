@@ -47,7 +47,6 @@ def _estimate(name: str, scans: Sequence[Scan], imu: ImuSamples | None) -> Traje
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS))
     parser.add_argument("--world", default="street")

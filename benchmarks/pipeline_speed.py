@@ -61,7 +61,6 @@ class Times:
 
 
 def main() -> None:
-    """Print a table for every recording."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")

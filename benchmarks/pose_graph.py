@@ -225,7 +225,6 @@ def rms(poses: FloatArray, truth: FloatArray) -> float:
 
 
 def main() -> None:
-    """Parse the command line and print what was asked for."""
     parser = make_parser(__doc__)
     parser.add_argument("--kitti-00", type=Path, metavar="DIR", help="KISS-ICP's trajectory and the truth")
     parser.add_argument("--keyframes", type=int, default=0, help="of the simulated drive")

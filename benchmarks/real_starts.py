@@ -225,7 +225,6 @@ def print_starts(name: str, step: int, runs: dict[str, list[Judged]]) -> None:
 
 
 def main() -> None:
-    """Parse the command line, run, and print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=DEFAULT_METHODS)

@@ -80,7 +80,6 @@ _BACK = ({Status.OK, Status.DEGRADED}, {Status.OK})
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     parser.add_argument("--faults", nargs="+", choices=_FAULTS, default=_FAULTS)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=list(_PLACES))

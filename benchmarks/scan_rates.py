@@ -36,7 +36,6 @@ from peers import NAMES, run_peer
 
 from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.geometry import rotation_angle
-from lidarslam.simulation.world import WORLDS
 
 
 def every_nth(recorded: Recorded, step: int) -> Recorded:
@@ -69,15 +68,12 @@ def row(recorded: Recorded, step: int, methods: Sequence[str]) -> list[str]:
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--steps", nargs="+", type=int, default=[1, 2, 3, 5], help="times the scan interval")
     parser.add_argument("--methods", nargs="+", choices=[*METHODS, *NAMES], default=[*DEFAULT_METHODS, "ct-icp"])
     options = parser.parse_args()
-    if not options.sources and not options.worlds:
-        options.worlds = list(WORLDS)
     print_header(["recording", "step", "scans", "moved, m", "turned, deg", *options.methods])
     for recorded in recordings(options, options.scans):
         for step in options.steps:

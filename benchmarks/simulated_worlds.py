@@ -13,7 +13,6 @@ from lidarslam.simulation.world import WORLDS
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     add_simulation_arguments(parser, worlds=list(WORLDS))
     arguments = parser.parse_args()

@@ -17,7 +17,6 @@ _SENSORS, _SCANS = ("vlp-16", "hdl-64e", "os1-128"), 30
 
 
 def main() -> None:
-    """Print a table with a row for each sensor."""
     parser = make_parser(__doc__)
     parser.add_argument("--world", default="tunnel", choices=WORLDS)
     parser.add_argument("--motion", default="handheld", choices=CARRIERS)

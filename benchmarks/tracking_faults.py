@@ -217,7 +217,6 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
     parser = make_parser(__doc__)
     kinds = [*_FAULTS, "traffic", "still", "featureless"]
     parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)

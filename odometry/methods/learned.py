@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state import Shape
 from lidarslam.odometry.alignment.alignment import (
     INFORMATION_PER_M2,
     InitialEstimate,
@@ -26,7 +26,7 @@ from lidarslam.odometry.alignment.alignment import (
 from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepPair
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.sweep_images import Imager, ScanImages
-from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.interface import Motion, StatefulOdometry
 from lidarslam.odometry.network.candidates import Candidate, Described, Search
 
 # Below this the scan does not fit the last one: see `Alignment.explained`, and inliers.
@@ -58,7 +58,7 @@ class _Sweep:
     middle: float
 
 
-class LearnedOdometry(Stateful):
+class LearnedOdometry(StatefulOdometry):
     """Motions between consecutive scans by the candidates of a trained network, whose images have the size `images`.
 
     Not aligned, the first candidate is the motion as it is.
@@ -129,9 +129,6 @@ class LearnedOdometry(Stateful):
             return self._refined(candidates, last, sweep)
         first, used = candidates[0], shown.with_normal()
         return self._motion(first.T_prev_curr, first.covariance, np.zeros(6), last, sweep, used)
-
-    def close(self) -> None:
-        """Nothing is held."""
 
     def _refined(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep) -> Motion:
         """The candidates, or the motion before, refined by alignment."""
