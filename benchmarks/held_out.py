@@ -45,19 +45,12 @@ _SCANS_OF_A_START = 50
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Runs of one method on parts of one recording.
+    """Runs of one method on parts of one recording."""
 
-    Attributes:
-        drift_percent: (M,) of all segments.
-        wrong: (N, 4, 4) errors of the motions from scan to scan.
-        squared: (N,) of them in standard deviations, summed over the six directions; NaN without a covariance.
-        lost: scans.
-    """
-
-    drift_percent: FloatArray
-    wrong: FloatArray
-    squared: FloatArray
-    lost: int
+    drift_percent: FloatArray  # (M,) of all segments
+    wrong: FloatArray  # (N, 4, 4) errors of the motions from scan to scan
+    squared: FloatArray  # (N,) of them in standard deviations, summed over the six directions; NaN without a covariance
+    lost: int  # scans
 
     def cells(self) -> list[str]:
         """Drift, rotation, translation, lost scans, shares within 1, 2, 3 sigma."""

@@ -51,21 +51,13 @@ _REGISTERED = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
 
 @dataclass(frozen=True, eq=False)
 class Lap:
-    """A recording of which every so manieth scan is used.
+    """A recording of which every third scan is used."""
 
-    Attributes:
-        name: of world and motion.
-        simulation: where scans come from.
-        scans: (M,) which are used.
-        truth: (M, 4, 4) T_world_lidar.
-        way_m: (M,) path length.
-    """
-
-    name: str
-    simulation: Simulation
-    scans: NDArray[np.intp]
-    truth: FloatArray
-    way_m: FloatArray
+    name: str  # of world and motion
+    simulation: Simulation  # where scans come from
+    scans: NDArray[np.intp]  # (M,) which are used
+    truth: FloatArray  # (M, 4, 4) T_world_lidar
+    way_m: FloatArray  # (M,) path length
 
     def points(self) -> Iterator[FloatArray]:
         """(N, 3) of one scan after the other, compensated with the true motion."""

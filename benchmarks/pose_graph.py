@@ -43,16 +43,11 @@ STEP_M, FALSE_PERCENTS = 2.0, (0.0, 10.0, 30.0)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Keyframes as an odometry saw them, and where they were.
+    """Keyframes as an odometry saw them, and where they were."""
 
-    Attributes:
-        poses, truth: (N, 4, 4).
-        covariances: (N - 1, 6, 6) of the motions from each keyframe to the next.
-    """
-
-    poses: FloatArray
-    truth: FloatArray
-    covariances: FloatArray
+    poses: FloatArray  # (N, 4, 4)
+    truth: FloatArray  # (N, 4, 4)
+    covariances: FloatArray  # (N - 1, 6, 6) of the motions from each keyframe to the next
 
     def chain_edges(self, looser: float | None = None) -> list[RelativePose]:
         """The motions between neighbours; with `looser`, those of a worse odometry beside them."""

@@ -63,20 +63,14 @@ SHORTEST_M, WRONG_PERCENT = 10.0, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Ended:
-    """A run that has ended.
-
-    Attributes:
-        trajectory: None when there is none.
-        lost, degraded: scans; None for a method that knows no status.
-        status: exit status.
-        message: why there is no trajectory.
-    """
+    """A run that has ended."""
 
     trajectory: Trajectory | None
+    # lost, degraded: scans; None for a method that knows no status
     lost: int | None
     degraded: int | None
-    status: int
-    message: str = ""
+    status: int  # exit status
+    message: str = ""  # why there is no trajectory
 
 
 @dataclass(frozen=True)

@@ -190,7 +190,6 @@ def _sum_up(
     change of velocity (t + t') times as it does with the motion.
 
     Args:
-        points, count, planes, motion: see above.
         scale_m: of the residuals.
         is_robust: all inliers, with Geman and McClure's weights; else those within twice the scale, unweighted.
         total: (13, 13), zero, written: H (12, 12) and, in the last column, g (12,) and the sum of squared residuals.
