@@ -17,9 +17,12 @@ simulator into memory.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -46,6 +49,7 @@ from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import SENSORS, find_sensor
 from lidarslam.simulation.world import WORLDS, World, build_world
 
+T = TypeVar("T")
 # How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
 BEYOND_TRUTH_S = 0.2
 # Errors of the wrong odometry at every scan.
@@ -214,6 +218,12 @@ def main() -> None:
     print_header(header)
     for recorded in recordings(arguments):
         print_row(row(recorded, arguments.voxels, arguments.seed))
+
+
+def in_process(call: Callable[..., T], *arguments: object) -> T:
+    """What a call returns in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(call, *arguments).result()
 
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:

@@ -7,13 +7,11 @@ column says by how many milliseconds the stamps are shifted before the compariso
 instants are right, the least error stands at zero.
 """
 
-import multiprocessing
 import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
-from mapping_accuracy import make_parser, make_simulation, print_row
+from mapping_accuracy import in_process, make_parser, make_simulation, print_row
 
 from lidarslam.compare.peers.estimation import estimate
 from lidarslam.compare.peers.interface import PeerError
@@ -35,11 +33,10 @@ def run_peer(name: str, scans: Iterable[Scan], imu: ImuSamples | None = None) ->
         PeerError: it is not installed, its process ended early, or it has no usable poses.
     """
     PEERS[name].require(lambda: imu is not None)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(_estimate, name, list(scans), imu).result()
-        except BrokenProcessPool:
-            raise PeerError("its process ended before the last scan") from None
+    try:
+        return in_process(_estimate, name, list(scans), imu)
+    except BrokenProcessPool:
+        raise PeerError("its process ended before the last scan") from None
 
 
 def _estimate(name: str, scans: Sequence[Scan], imu: ImuSamples | None) -> Trajectory:

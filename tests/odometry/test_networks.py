@@ -46,11 +46,10 @@ def turned(scans: tuple[Tensor, Tensor], columns: int) -> tuple[Tensor, Tensor]:
     return points, normals
 
 
-def pairs(previous: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor], turn: float = 0.0) -> PairImages:
-    """Pairs of scans, the current ones turned by so much where they are seen from above."""
+def pairs(previous: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor]) -> PairImages:
+    """Pairs of scans, seen from above as they are."""
     both = torch.stack([torch.cat(previous, dim=1), torch.cat(current, dim=1)], dim=1)
-    headings = torch.tensor([0.0, turn]).expand(len(both), 2)
-    return PairImages(both, birds(both, headings, torch.ones_like(headings)))
+    return PairImages(both, birds(both, torch.zeros(len(both), 2), torch.ones(len(both), 2)))
 
 
 @pytest.mark.parametrize(("name", "count"), [("correlation", 62_005), ("delora", 11_876_019)])
