@@ -20,6 +20,7 @@ drive has errors of its own, which add to the estimate's; those of its first pos
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -55,11 +56,8 @@ EXPECTED_SHARES = tuple(float(erf(sigma / np.sqrt(2.0))) for sigma in SIGMAS)
 
 def estimated_motions(config: OdometryConfig, scans: Sequence[Scan]) -> list[Motion]:
     """What an odometry alone says of each scan."""
-    odometry = make_odometry(config)
-    try:
+    with closing(make_odometry(config)) as odometry:
         return [odometry.estimate(scan) for scan in scans]
-    finally:
-        odometry.close()
 
 
 def squared_errors(covariances: Sequence[FloatArray | None], errors: FloatArray) -> FloatArray:

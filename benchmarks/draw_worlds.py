@@ -11,18 +11,9 @@ from pathlib import Path
 from mapping_accuracy import in_world, make_parser
 
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import reference_map
 from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, fit_frame, save_picture
-
-
-def draw_map(simulation: Simulation, path: Path, width: int) -> int:
-    """Draw what a simulation sees; how many points its map has."""
-    seen = reference_map(simulation, step=max(1, len(simulation) // 200))
-    runs = [DrawnRun(path.stem, PointCloud(seen.points, seen.normals))]
-    save_picture(path, draw_runs(runs, fit_frame(runs, OBLIQUE, width=width)))
-    return len(seen.points)
 
 
 def main() -> None:
@@ -38,8 +29,10 @@ def main() -> None:
     for name in arguments.worlds:
         path = arguments.out / f"{name}.png"
         simulation = in_world(build_world(name, 0), arguments.motion, arguments.sensor, arguments.scans, 0)
-        points = draw_map(simulation, path, arguments.width)
-        print(f"{path}: {points:,} points", flush=True)
+        seen = reference_map(simulation, step=max(1, len(simulation) // 200))
+        runs = [DrawnRun(name, PointCloud(seen.points, seen.normals))]
+        save_picture(path, draw_runs(runs, fit_frame(runs, OBLIQUE, width=arguments.width)))
+        print(f"{path}: {len(seen.points):,} points", flush=True)
 
 
 if __name__ == "__main__":

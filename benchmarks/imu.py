@@ -34,7 +34,7 @@ from mapping_accuracy import (
 )
 
 from lidarslam.config.settings import Config
-from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
@@ -99,9 +99,8 @@ def row(recorded: Recorded, method: str) -> list[str]:
     aligned = transform_points(align(trajectory, true), trajectory.positions)
     height_m = float(np.abs(aligned - true.positions)[:, 2].max())
     tilt = vertical_error_deg(trajectory.T_world_lidar, true.T_world_lidar)
-    turns = (inverse(trajectory.relative_motions()) @ true.relative_motions())[:, :3, :3]
-    cosines = np.clip(0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0), -1.0, 1.0)
-    turn = float(np.rad2deg(np.sqrt((np.arccos(cosines) ** 2).mean())))
+    turns = rotation_angle(inverse(trajectory.relative_motions()) @ true.relative_motions())
+    turn = float(np.rad2deg(np.sqrt((turns**2).mean())))
     return [
         recorded.name,
         f"{errors.length_m:.0f}",

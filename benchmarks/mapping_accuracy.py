@@ -19,6 +19,7 @@ simulator into memory.
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -146,11 +147,8 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
 
 def pipeline_results(scans: Sequence[Scan], config: Config, prior: Trajectory | None = None) -> list[ScanEstimate]:
     """Take scans through the pipeline of `lidarslam run`."""
-    odometry = where_needed(make_odometry(config.odometry, prior), config)
-    try:
+    with closing(where_needed(make_odometry(config.odometry, prior), config)) as odometry:
         return list(Pipeline(odometry, make_localiser(config), config.global_map).run(scans))
-    finally:
-        odometry.close()
 
 
 def trajectory_of(results: Sequence[ScanEstimate]) -> Trajectory:

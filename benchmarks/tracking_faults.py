@@ -19,6 +19,7 @@ that errors are those of the poses as they come, without any alignment:
 
 import argparse
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -156,12 +157,9 @@ def _featureless(kind: str) -> Case:
 
 def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
     """A recording through the pipeline: the results, and the points (M, 3) of the map."""
-    odometry = open_odometry(config, None)
-    try:
+    with closing(open_odometry(config, None)) as odometry:
         pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
         results = list(pipeline.run(case.recorded.scans))
-    finally:
-        odometry.close()
     if pipeline.map.global_map is None:
         return results, np.empty((0, 3))
     points = pipeline.map.global_map.points()
