@@ -158,7 +158,7 @@ def _saved(scans: Sequence[Scan], folder: Path) -> Path:
 
 def _run_kiss(file: Path, warm_up: int) -> Times:
     """KISS-ICP's loop in a process of its own, where it has all the cores."""
-    command = [sys.executable, Path(__file__).with_name("kiss_loop.py"), file, str(warm_up)]
+    command = [sys.executable, str(Path(__file__).with_name("kiss_loop.py")), str(file), str(warm_up)]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return Times(**json.loads(printed.splitlines()[-1]))
 

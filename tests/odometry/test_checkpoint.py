@@ -1,5 +1,6 @@
 """Weights on disk: what is written comes back, and what is no such file is refused in one line."""
 
+import os
 import pickle
 from dataclasses import replace
 
@@ -43,14 +44,30 @@ def test_what_is_saved_comes_back(trained, tmp_path):
     assert torch.equal(one, other)
 
 
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("trap",)
+
+
+@pytest.mark.parametrize(
+    "save", [lambda path: path.write_bytes(pickle.dumps(Trap())), lambda path: torch.save({"weight": Trap()}, path)]
+)
+def test_a_pickle_is_refused_unopened(save, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save(tmp_path / "weights.pt")
+    with pytest.raises(InputError, match="is no safetensors file"):
+        load_checkpoint(tmp_path / "weights.pt")
+    assert not (tmp_path / "trap").exists()
+
+
 @pytest.mark.parametrize(
     ("make", "told"),
     [
         (lambda _, __: None, "no such file"),
         (lambda path, _: path.write_text("some notes that are long enough"), "is no safetensors file"),
         (lambda path, _: path.mkdir(), "is no safetensors file"),
-        (lambda path, weights: path.write_bytes(pickle.dumps(weights)), "is no safetensors file"),
-        (lambda path, weights: torch.save(weights, path), "is no safetensors file"),
         (lambda path, weights: save_file(weights, path), "holds no weights"),
         (lambda path, weights: write_tensor_file(path, Kind("a training", 1), weights, {}), "holds no weights"),
         (lambda path, weights: write_tensor_file(path, Kind("weights", 99), weights, {}), "version 99, .* use a newer"),
