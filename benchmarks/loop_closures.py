@@ -102,10 +102,9 @@ def build_rooms(seed: int) -> World:
     return World(ROOMS, seed, route, Boxes(centres, halves, np.tile(np.eye(3), (len(centres), 1, 1))))
 
 
-def simulate(world: str, seed: int) -> Lap:
+def simulate(world: str, motion: str, seed: int) -> Lap:
     """A recording straight from the simulator."""
     place = build_rooms(seed) if world == ROOMS else build_world(world, seed)
-    motion = _MOTIONS.get(world, "handheld")
     simulation = in_world(place, motion, "vlp-16", None, seed, _LAPS)
     truth = simulation.ground_truth
     used = np.arange(0, len(simulation) - 1, _EVERY)
@@ -237,7 +236,7 @@ def main() -> None:
     header += ["ms a keyframe, median / 95 % / mean"]
     print_header(header)
     for world in arguments.worlds:
-        lap = simulate(world, arguments.seed)
+        lap = simulate(world, _MOTIONS.get(world, "handheld"), arguments.seed)
         estimates = drifting(lap.truth, lap.way_m, arguments.drift, arguments.seed)
         followed = follow(lap, estimates, config)
         print_row(row(lap, estimates, followed))

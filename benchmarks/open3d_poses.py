@@ -86,7 +86,7 @@ class Keyframes:
 
 def simulated(world: str) -> Keyframes:
     """A lap and a third with a VLP-16, at poses that drift."""
-    lap = simulate(world, seed=1)
+    lap = simulate(world, "car" if world == "street" else "handheld", seed=1)
     estimates = drifting(lap.truth, lap.way_m, 1.0, seed=1)
     return _keyframes(lap.name, list(lap.points()), lap.truth, estimates, lap.simulation)
 
