@@ -15,12 +15,12 @@ in the LiDAR frame, NEES is `xi^T Sigma^-1 xi`, chi-square with six degrees of f
 
 NEES over 6 has the median 0.89 where the covariance is right, and more where it is too small. Within 1, 2, 3 sigma are
 shares in %; they should be 68.3, 95.4 and 99.7 (chi-square quantiles of these probabilities). Scans that are not `ok`
-are left out, unless `--all`, and counted. Of recordings on disk at most `--scans` scans are taken. The truth of a real
+are left out, and counted. Of recordings on disk at most `--scans` scans are taken. The truth of a real
 drive has errors of its own, which add to the estimate's; those of its first pose alone make the rows of poses useless.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from mapping_accuracy import (
     METHODS,
     Recorded,
     add_simulation_arguments,
+    make_parser,
     pipeline_results,
     print_header,
     print_row,
@@ -45,7 +46,6 @@ from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
-from lidarslam.simulation.world import WORLDS
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]
@@ -56,11 +56,8 @@ EXPECTED_SHARES = tuple(float(erf(sigma / np.sqrt(2.0))) for sigma in SIGMAS)
 
 def estimated_motions(config: OdometryConfig, scans: Sequence[Scan]) -> list[Motion]:
     """What an odometry alone says of each scan."""
-    odometry = make_odometry(config)
-    try:
+    with closing(make_odometry(config)) as odometry:
         return [odometry.estimate(scan) for scan in scans]
-    finally:
-        odometry.close()
 
 
 def squared_errors(covariances: Sequence[FloatArray | None], errors: FloatArray) -> FloatArray:
@@ -106,11 +103,11 @@ def nees_of_odometry(recorded: Recorded, config: OdometryConfig, truth: FloatArr
     return squared_errors(measured, errors)
 
 
-def rows(recorded: Recorded, method: str, keeps_all: bool) -> Iterator[list[str]]:
+def rows(recorded: Recorded, method: str) -> Iterator[list[str]]:
     """The cells of every kind of estimates that comes with covariances."""
     truth = true_trajectory(recorded).T_world_lidar
-    results = pipeline_results(recorded, METHODS[method])
-    ok = np.array([keeps_all or result.status is Status.OK for result in results])
+    results = pipeline_results(recorded.scans, METHODS[method])
+    ok = np.array([result.status is Status.OK for result in results])
     kinds = {
         "odometry": (nees_of_odometry(recorded, METHODS[method].odometry, truth), np.ones(len(ok) - 1, bool)),
         "registration": (nees_of_registration(results, truth), ok[1:] & ok[:-1]),
@@ -125,22 +122,18 @@ def rows(recorded: Recorded, method: str, keeps_all: bool) -> Iterator[list[str]
         yield [recorded.name, method, kind, *counts, f"{np.median(known) / 6.0:.2f}", *shares]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--methods", nargs="+", choices=_MAPPED, default=_DEFAULT)
-    parser.add_argument("--all", action="store_true", help="lost and degraded scans too, where they have a covariance")
-    options = parser.parse_args(arguments)
-    if not options.sources and not options.worlds:
-        options.worlds = list(WORLDS)
+    options = parser.parse_args()
     header = ["recording", "method", "of", "count", "left out", "median NEES/6"]
     header += [f"within {sigma} sigma, %" for sigma in SIGMAS]
     print_header(header)
     for recorded in recordings(options, options.scans):
         for method in options.methods:
-            for cells in rows(recorded, method, options.all):
+            for cells in rows(recorded, method):
                 print_row(cells)
 
 

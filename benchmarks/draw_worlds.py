@@ -6,44 +6,33 @@ r"""Draw the exact map of every simulated world, as one lap of its route sees it
         --scans 150 --width 800
 """
 
-import argparse
 from pathlib import Path
 
-from mapping_accuracy import in_world
+from mapping_accuracy import in_world, make_parser
 
 from lidarslam.mapping.global_map.point_cloud import PointCloud
-from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import reference_map
 from lidarslam.simulation.world import WORLDS, build_world
 from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, fit_frame, save_picture
 
 
-def draw_map(simulation: Simulation, path: Path, width: int) -> int:
-    """Draw what a simulation sees; how many points its map has."""
-    seen = reference_map(simulation, step=max(1, len(simulation) // 200))
-    runs = [DrawnRun(path.stem, PointCloud(seen.points, seen.normals))]
-    save_picture(path, draw_runs(runs, fit_frame(runs, OBLIQUE, width=width)))
-    return len(seen.points)
-
-
 def main() -> None:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
     parser.add_argument("--motion", default="car")
     parser.add_argument("--sensor", default="os0-64")
     parser.add_argument("--scans", type=int, help="draw what the first scans see; default: a lap")
     parser.add_argument("--width", type=int, default=1600, help="pixels")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.worlds:
         path = arguments.out / f"{name}.png"
-        world, seed = build_world(name, arguments.seed), arguments.seed
-        simulation = in_world(world, arguments.motion, arguments.sensor, arguments.scans, seed)
-        points = draw_map(simulation, path, arguments.width)
-        print(f"{path}: {points:,} points", flush=True)
+        simulation = in_world(build_world(name, 0), arguments.motion, arguments.sensor, arguments.scans, 0)
+        seen = reference_map(simulation, step=max(1, len(simulation) // 200))
+        runs = [DrawnRun(name, PointCloud(seen.points, seen.normals))]
+        save_picture(path, draw_runs(runs, fit_frame(runs, OBLIQUE, width=arguments.width)))
+        print(f"{path}: {len(seen.points):,} points", flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,17 @@ from pathlib import Path
 
 import numpy as np
 from covariance import estimated_motions, shares_within_sigmas, squared_errors
-from mapping_accuracy import METHODS, Recorded, pipeline_results, print_header, print_row, read, true_trajectory
+from mapping_accuracy import (
+    METHODS,
+    Recorded,
+    make_parser,
+    pipeline_results,
+    print_header,
+    print_row,
+    read,
+    trajectory_of,
+    true_trajectory,
+)
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
@@ -35,19 +45,12 @@ _SCANS_OF_A_START = 50
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Runs of one method on parts of one recording.
+    """Runs of one method on parts of one recording."""
 
-    Attributes:
-        drift_percent: (M,) of all segments.
-        wrong: (N, 4, 4) errors of the motions from scan to scan.
-        squared: (N,) of them in standard deviations, summed over the six directions; NaN without a covariance.
-        lost: scans.
-    """
-
-    drift_percent: FloatArray
-    wrong: FloatArray
-    squared: FloatArray
-    lost: int
+    drift_percent: FloatArray  # (M,) of all segments
+    wrong: FloatArray  # (N, 4, 4) errors of the motions from scan to scan
+    squared: FloatArray  # (N,) of them in standard deviations, summed over the six directions; NaN without a covariance
+    lost: int  # scans
 
     def cells(self) -> list[str]:
         """Drift, rotation, translation, lost scans, shares within 1, 2, 3 sigma."""
@@ -59,14 +62,13 @@ class Outcome:
         return [drift, f"{rotation_deg:.3f}", f"{largest_m:.2f}", str(self.lost), shares]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", metavar="RECORDING[=WEIGHTS]")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 3, 5])
     parser.add_argument("--starts", type=int, help="also 50 scans from every so-manieth scan on, at full rate")
     parser.add_argument("--mapped", action="store_true", help="the reference is the mapped trajectory, not the truth")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     columns = ("recording", "scans", "step, m", "method", "drift, %", "rotation, deg", "largest error, m", "lost")
     print_header([*columns, "within 1, 2, 3 sigma, %"])
     for source in options.sources:
@@ -98,10 +100,8 @@ def mapped(source: Path) -> Recorded:
     """A recording with the trajectory that mapping finds for its truth."""
     recording = open_recording(source)
     scans = list(in_order(recording.scans()))
-    nothing = Trajectory(np.array([scan.stamp for scan in scans]), np.tile(np.eye(4), (len(scans), 1, 1)))
-    recorded = Recorded(recording.name, scans, nothing)
-    results = pipeline_results(recorded, METHODS["constant-velocity+map"])
-    return replace(recorded, truth=replace(nothing, T_world_lidar=np.array([one.T_world_lidar for one in results])))
+    results = pipeline_results(scans, METHODS["constant-velocity+map"])
+    return Recorded(recording.name, scans, trajectory_of(results))
 
 
 def _parts(recorded: Recorded, options: argparse.Namespace) -> Iterator[tuple[str, list[Recorded]]]:

@@ -12,31 +12,40 @@ MEMS unit, with noise and a walking bias. Prints a Markdown table, a row for eac
 - the error of the turn from scan to scan, root mean square, degrees;
 - scans that were lost and degraded.
 
-Every method runs in the pipeline of `lidarslam run` with its defaults; a graph is not part of it, but with `--graph`.
+Every method runs in the pipeline of `lidarslam run` with its defaults; a graph is not part of it.
 """
 
 import argparse
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import BEYOND_TRUTH_S, Recorded, make_simulation, print_header, print_row, read
+from mapping_accuracy import (
+    BEYOND_TRUTH_S,
+    Recorded,
+    make_parser,
+    make_simulation,
+    print_header,
+    print_row,
+    read,
+    trajectory_of,
+)
 
 from lidarslam.config.settings import Config
-from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
-from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
+from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.odometry.config import OdometryConfig, OdometryName
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.run.loop_closing import begin_graph
 
 METHODS: dict[str, tuple[OdometryName, bool]] = {
     "KISS-ICP": ("kiss-icp", False),
@@ -48,10 +57,10 @@ METHODS: dict[str, tuple[OdometryName, bool]] = {
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-def simulate(case: str, sensor: str, scans: int, seed: int) -> Recorded:
+def simulate(case: str, scans: int, seed: int) -> Recorded:
     """A recording straight from the simulator, of every STEP-th scan."""
     world, motion, *step = case.split("/")
-    simulation = make_simulation(world, motion, sensor, scans, seed)
+    simulation = make_simulation(world, motion, "vlp-16", scans, seed)
     every = int(step[0]) if step else 1
     name = f"{world}, {motion}, seed {seed}" + (f", {simulation.sensor.rate_hz / every:.1f} Hz" if step else "")
     return Recorded(name, list(simulation.scans(step=every)), simulation.ground_truth, simulation.imu)
@@ -65,17 +74,9 @@ def estimate(recorded: Recorded, config: Config) -> tuple[Trajectory, list[Statu
         assert recorded.imu.T_lidar_imu is not None, f"{recorded.name}: it is not known how the IMU is mounted"
         inertial = Inertial(recorded.imu, recorded.imu.T_lidar_imu)
         scans = [inertial.gyroscope.evened(scan) for scan in scans]
-    odometry, graph = make_odometry(config.odometry), begin_graph(config)
-    try:
-        results = list(Pipeline(odometry, make_localiser(config, inertial), config.global_map, graph).run(scans))
-        poses = np.array([result.T_world_lidar for result in results])
-        corrected = None if graph is None else graph.finish()
-        poses = poses if corrected is None else corrected.T_world_lidar
-    finally:
-        odometry.close()
-        if graph is not None:
-            graph.close()
-    return Trajectory(np.array([result.stamp for result in results]), poses), [result.status for result in results]
+    with closing(make_odometry(config.odometry)) as odometry:
+        results = list(Pipeline(odometry, make_localiser(config, inertial), config.global_map).run(scans))
+    return trajectory_of(results), [result.status for result in results]
 
 
 def vertical_error_deg(estimated: FloatArray, true: FloatArray) -> float:
@@ -86,13 +87,11 @@ def vertical_error_deg(estimated: FloatArray, true: FloatArray) -> float:
     return float(np.rad2deg(np.sqrt((across**2).mean())))
 
 
-def row(recorded: Recorded, method: str, graph: bool) -> list[str]:
+def row(recorded: Recorded, method: str) -> list[str]:
     """The cells of a recording and a method."""
     odometry, has_map = METHODS[method]
     config = Config(
-        odometry=OdometryConfig(method=odometry),
-        mapping=MappingConfig(method="surfels" if has_map else "off"),
-        pose_graph=PoseGraphConfig(enabled=graph and has_map),
+        odometry=OdometryConfig(method=odometry), mapping=MappingConfig(method="surfels" if has_map else "off")
     )
     trajectory, statuses = estimate(recorded, config)
     errors = evaluate_trajectory(trajectory, recorded.truth).errors
@@ -100,13 +99,12 @@ def row(recorded: Recorded, method: str, graph: bool) -> list[str]:
     aligned = transform_points(align(trajectory, true), trajectory.positions)
     height_m = float(np.abs(aligned - true.positions)[:, 2].max())
     tilt = vertical_error_deg(trajectory.T_world_lidar, true.T_world_lidar)
-    turns = (inverse(trajectory.relative_motions()) @ true.relative_motions())[:, :3, :3]
-    cosines = np.clip(0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0), -1.0, 1.0)
-    turn = float(np.rad2deg(np.sqrt((np.arccos(cosines) ** 2).mean())))
+    turns = rotation_angle(inverse(trajectory.relative_motions()) @ true.relative_motions())
+    turn = float(np.rad2deg(np.sqrt((turns**2).mean())))
     return [
         recorded.name,
         f"{errors.length_m:.0f}",
-        method + ("+graph" if config.pose_graph.enabled else ""),
+        method,
         f"{errors.ate_rmse_m:.3f}",
         f"{height_m:.3f}",
         f"{tilt:.2f}",
@@ -119,30 +117,25 @@ def row(recorded: Recorded, method: str, graph: bool) -> list[str]:
 def recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
     """All that were asked for."""
     for source in arguments.sources:
-        recorded = read(source, arguments.step)
-        every = f", every {arguments.step}th scan" if arguments.step > 1 else ""
-        yield replace(recorded, name=recorded.name + every, imu=open_recording(source).imu)
+        yield replace(read(source), imu=open_recording(source).imu)
     for case in arguments.cases:
         for seed in arguments.seeds:
-            yield simulate(case, arguments.sensor, arguments.scans, seed)
+            yield simulate(case, arguments.scans, seed)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth and IMU")
-    parser.add_argument("--step", type=int, default=1, help="take every n-th scan of a source")
     parser.add_argument("--cases", nargs="*", default=[], metavar="WORLD/MOTION[/STEP]")
     parser.add_argument("--seeds", nargs="*", type=int, default=[0])
-    parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--scans", type=int, default=300)
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--graph", action="store_true", help="with the pose graph")
     arguments = parser.parse_args()
     columns = ["Recording", "Path, m", "Method", "ATE, m", "Height, m", "Roll, pitch, deg", "Turn, deg"]
     print_header([*columns, "Lost", "Degraded"])
     for recorded in recordings(arguments):
         for method in arguments.methods:
-            print_row(row(recorded, method, arguments.graph))
+            print_row(row(recorded, method))
 
 
 if __name__ == "__main__":

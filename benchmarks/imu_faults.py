@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 
 from lidarslam.cli import main as lidarslam
 from lidarslam.core.geometry import FloatArray
@@ -96,7 +96,7 @@ def row(source: Path, fault: str, options: list[str]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="folders of scans with imu.csv and a ground truth")
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
     parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of lidarslam run")

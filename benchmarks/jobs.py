@@ -110,7 +110,6 @@ def cluster(starts: Path, kill_after: int | None) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=int, default=12)
     parser.add_argument("--scans", type=int, default=40)
@@ -121,17 +120,6 @@ def main() -> None:
         folder = Path(name)
         entries = make_recordings(folder / "recordings", options.recordings, options.scans)
         (folder / "noted.py").write_text(NOTED)
-
-        def run(
-            label: str, where: Callable[[Path], Any]
-        ) -> tuple[float, list[str], dict[str, bytes], dict[str, float]]:
-            out, starts = folder / label.replace(" ", "_"), folder / f"{label}.txt"
-            command = (sys.executable, str(folder / "noted.py"), str(starts))
-            with where(starts) as chosen:
-                begun = time.perf_counter()
-                compare(CompareRequest(out, entries, methods, where=chosen), quiet, command)
-                wall_s = time.perf_counter() - begun
-            return wall_s, started(starts), contents(out), figures(out)
 
         @contextmanager
         def on_cluster(starts: Path, kill_after: int | None = None) -> Iterator[Where]:
@@ -151,12 +139,17 @@ def main() -> None:
         print("|---|---:|---:|---:|---|---|---:|")
         first, is_same = None, True
         for label, where in ways.items():
-            done = run(label, where)
-            wall_s, starts, files, errors = done
-            first = first or done
+            out, noted = folder / label.replace(" ", "_"), folder / f"{label}.txt"
+            command = (sys.executable, str(folder / "noted.py"), str(noted))
+            with where(noted) as chosen:
+                begun = time.perf_counter()
+                compare(CompareRequest(out, entries, methods, where=chosen), quiet, command)
+                wall_s = time.perf_counter() - begun
+            starts, files, errors = started(noted), contents(out), figures(out)
+            first = first or (wall_s, files, errors)
             again = ", ".join(each for each, times in Counter(starts).items() if times > 1) or "none"
-            same = "yes" if files == first[2] else "no"
-            difference = largest_difference(first[3], errors)
+            same = "yes" if files == first[1] else "no"
+            difference = largest_difference(first[2], errors)
             is_whole = len(files) == len(SAME) * options.recordings * len(methods)
             is_same &= is_whole and same == "yes" and difference < ROUNDING
             row = (label, f"{wall_s:.0f}", f"{wall_s / first[0]:.2f}", len(starts), again, same, f"{difference:.0e}")

@@ -9,18 +9,15 @@ is a column of its own. KISS-ICP's poses belong to the end of each sweep; they a
 where ours are, so that both are compared with the truth at the same instants.
 """
 
-import argparse
 import functools
-import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from mapping_accuracy import in_process, make_parser
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
@@ -50,7 +47,16 @@ class _KittiFiles:
         return points, 0.5 * (1.0 - np.arctan2(points[:, 1], points[:, 0]) / np.pi)
 
 
-def run_kiss(source: Path) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class Ran:
+    """A program's run on a recording."""
+
+    trajectory: Trajectory
+    ms_per_scan: float
+    after_s: float  # after the loop over the scans
+
+
+def run_kiss(source: Path) -> Ran:
     """KISS-ICP's own pipeline on the recording."""
     from kiss_icp.pipeline import OdometryPipeline
 
@@ -59,16 +65,18 @@ def run_kiss(source: Path) -> dict[str, Any]:
     stamps = np.array([scan.stamp for scan in scans])
     ends = np.array([s.stamp if s.time_offsets is None else s.stamp + s.time_offsets.max() for s in scans])
     del scans
-    pipeline = OdometryPipeline(_KittiFiles(source, has_times=bool((ends > stamps).all())))
-    started = time.perf_counter()
-    pipeline._run_pipeline()
-    elapsed_s = time.perf_counter() - started
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ |= {"kiss_icp_out_dir": folder}
+        pipeline = OdometryPipeline(_KittiFiles(source, has_times=bool((ends > stamps).all())))
+        started = time.perf_counter()
+        pipeline._run_pipeline()
+        elapsed_s = time.perf_counter() - started
     within = stamps >= ends[0]
     at_stamps = Trajectory(stamps[within], Trajectory(ends, pipeline.poses).at(stamps[within]))
-    return _report(at_stamps, elapsed_s / len(ends), 0.0)
+    return Ran(at_stamps, 1e3 * elapsed_s / len(ends), 0.0)
 
 
-def run_ours(source: Path) -> dict[str, Any]:
+def run_ours(source: Path) -> Ran:
     """Our run on the recording."""
     from lidarslam.config.settings import load_config
     from lidarslam.core.trajectory import read_tum
@@ -82,30 +90,11 @@ def run_ours(source: Path) -> dict[str, Any]:
         whole_s = time.perf_counter() - started
         trajectory = read_tum(Path(folder) / "run" / "trajectory.tum")
     loop_s = outcome.summary.elapsed_s
-    return _report(trajectory, loop_s / len(trajectory), whole_s - loop_s)
+    return Ran(trajectory, 1e3 * loop_s / len(trajectory), whole_s - loop_s)
 
 
-def _report(trajectory: Trajectory, s_per_scan: float, after_s: float) -> dict[str, Any]:
-    return {
-        "stamps": trajectory.stamps.tolist(),
-        "poses": trajectory.T_world_lidar.tolist(),
-        "ms_per_scan": 1e3 * s_per_scan,
-        "after_s": after_s,
-    }
-
-
-def _in_process(program: str, source: Path) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, __file__, "--only", program, str(source)]
-        environment = os.environ | {"kiss_icp_out_dir": folder}
-        done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
-    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return result
-
-
-def ate_m(runs: list[dict[str, Any]], reference: Trajectory) -> list[float]:
-    """ATE of each run's trajectory, over the scans that all of them have."""
-    trajectories = [Trajectory(np.array(run["stamps"]), np.array(run["poses"])) for run in runs]
+def ate_m(trajectories: list[Trajectory], reference: Trajectory) -> list[float]:
+    """ATE of each trajectory, over the scans that all of them have."""
     common = functools.reduce(np.intersect1d, [trajectory.stamps.round(6) for trajectory in trajectories])
     chosen = [t.select(np.isin(t.stamps.round(6), common)) for t in trajectories]
     return [evaluate_trajectory(trajectory, reference).errors.ate_rmse_m for trajectory in chosen]
@@ -113,22 +102,22 @@ def ate_m(runs: list[dict[str, Any]], reference: Trajectory) -> list[float]:
 
 def compare(source: Path, rounds: int) -> None:
     """Run both in turn and print a table."""
-    runs: dict[str, list[dict[str, Any]]] = {"kiss": [], "ours": []}
+    kiss, ours = list[Ran](), list[Ran]()
     for _ in range(rounds):
-        for program, results in runs.items():
-            results.append(_in_process(program, source))
+        kiss.append(in_process(run_kiss, source))
+        ours.append(in_process(run_ours, source))
     reference = open_recording(source).ground_truth
-    ates = [float("nan")] * 2 if reference is None else ate_m([runs["kiss"][-1], runs["ours"][-1]], reference)
+    last = [kiss[-1].trajectory, ours[-1].trajectory]
+    ates = [float("nan")] * 2 if reference is None else ate_m(last, reference)
     print(f"\n{source.name}: {rounds} rounds, median [min, max]")
-    for name, results, ate in zip(("KISS-ICP's pipeline", "lidarslam run"), runs.values(), ates, strict=True):
-        ms = [result["ms_per_scan"] for result in results]
-        after_s = np.median([result["after_s"] for result in results])
+    for name, results, ate in zip(("KISS-ICP's pipeline", "lidarslam run"), (kiss, ours), ates, strict=True):
+        ms = [result.ms_per_scan for result in results]
+        after_s = np.median([result.after_s for result in results])
         print(
             f"  {name:<20} ATE {ate:.4f} m   {np.median(ms):6.1f} [{min(ms):.1f}, {max(ms):.1f}] ms a scan"
             f"   {after_s:4.1f} s after the loop"
         )
-    pairs = zip(runs["ours"], runs["kiss"], strict=True)
-    ratios = [ours["ms_per_scan"] / kiss["ms_per_scan"] for ours, kiss in pairs]
+    ratios = [one.ms_per_scan / other.ms_per_scan for one, other in zip(ours, kiss, strict=True)]
     print(
         f"  ATE differs by {1e3 * (ates[1] - ates[0]):+.2f} mm; time a scan is"
         f" {np.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}] times KISS-ICP's"
@@ -136,17 +125,12 @@ def compare(source: Path, rounds: int) -> None:
 
 
 def main() -> None:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="KITTI sequences/NN folders or raw drive folders")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", choices=["kiss", "ours"], help=argparse.SUPPRESS)
-    arguments: Any = parser.parse_args()
+    arguments = parser.parse_args()
     for source in arguments.sources:
-        if arguments.only is None:
-            compare(source, arguments.rounds)
-        else:
-            print(json.dumps({"kiss": run_kiss, "ours": run_ours}[arguments.only](source)))
+        compare(source, arguments.rounds)
 
 
 if __name__ == "__main__":

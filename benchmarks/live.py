@@ -62,7 +62,6 @@ def read_stages(file: Path) -> list[float]:
 
 
 def main() -> None:
-    """Print a row for each choice of methods."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, help="a ROS 2 bag, such as of `lidarslam simulate --sensor os1-64`")
     parser.add_argument("--rate", type=float, default=10.0, help="scans a second")

@@ -13,14 +13,13 @@ thread, Open3D on all) of
 Ours are looked for in the 27 voxels around a point only: those farther than an edge may be missed.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
@@ -36,8 +35,7 @@ from lidarslam.pipeline.threads import in_order
 
 
 def main() -> None:
-    """Parse the command line, and time both on every recording."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
     arguments = parser.parse_args()

@@ -11,24 +11,29 @@ Prints a Markdown table, a row for each recording: ATE in metres after SE(3) ali
 - discrete: the sweep compensated with the odometry's velocity, not with one that is estimated with the pose.
 """
 
-import argparse
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import add_simulation_arguments, localise, print_header, print_row, recordings
+from mapping_accuracy import (
+    add_simulation_arguments,
+    config_of,
+    localise,
+    make_parser,
+    print_header,
+    print_row,
+    recordings,
+)
 from numpy.typing import NDArray
 
-from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam import feature_map, features
 from lidarslam.mapping.loam.feature_map import add_moments
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC
 from lidarslam.mapping.surfels.voxel_hash import Rows
-from lidarslam.odometry.config import OdometryConfig
 
 
 @contextmanager
@@ -64,19 +69,17 @@ _VARIANTS: dict[str, tuple[Callable[[], AbstractContextManager[None]], MappingCo
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     parser.add_argument("--odometry", choices=("learned", "constant-velocity"), default="learned")
     add_simulation_arguments(parser, (), ("tracked",))
     arguments = parser.parse_args()
-    odometry = OdometryConfig(method=arguments.odometry)
     print_header(["recording", "scans", *_VARIANTS])
     for recorded in recordings(arguments):
         cells = []
         for variant, mapping in _VARIANTS.values():
             with variant():
-                cells.append(localise(recorded, Config(odometry=odometry, mapping=mapping)).text())
+                cells.append(localise(recorded, config_of(arguments.odometry, mapping)).text())
         print_row([recorded.name, str(len(recorded.scans)), *cells])
 
 

@@ -1,11 +1,10 @@
 """The running local map after loop closures: how far two rounds of a place lie apart in it, and what it costs.
 
-    python benchmarks/local_map_correction.py --cases office/handheld/2 --scans 1200
-    python benchmarks/local_map_correction.py recordings/streets --step 2 --radius-m 40
+    python benchmarks/local_map_correction.py recordings/streets --radius-m 40
     python benchmarks/local_map_correction.py recordings/loop --pairs loop_pairs.txt --radius-m 25
 
-A case is WORLD/MOTION or WORLD/MOTION/STEP, where every STEP-th scan is taken. Prints a Markdown table with two rows
-for each recording, the second one where the local map is drawn anew after loop closures:
+Prints a Markdown table with two rows for each recording, the second one where the local map is drawn anew after loop
+closures:
 
 - apart: each scan of a later round is compared with the scan of the first one nearest to it by ground truth; by how
   much surfaces, as far away as the median range, are apart in the local map of that moment; root mean square and 95 %,
@@ -17,15 +16,13 @@ for each recording, the second one where the local map is drawn anew after loop 
   (on the thread of registration), of the processor: median and most.
 """
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from imu import simulate
-from mapping_accuracy import BEYOND_TRUTH_S, print_header, print_row
+from mapping_accuracy import BEYOND_TRUTH_S, make_parser, print_header, print_row, trajectory_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -108,13 +105,12 @@ def take(scans: Sequence[Scan], config: Config, redraws: bool) -> Outcome:
     mapper = _Mapper(config.mapping, kept_scans=SCANS_LATER)
     results = list(Pipeline(odometry, ScanToMap(mapper), config.global_map, graph).run(scans))
     odometry.close()
-    stamps = np.array([result.stamp for result in results])
-    final = graph.finish()
+    trajectory, final = trajectory_of(results), graph.finish()
     assert final is not None
     graph.close()
     return Outcome(
-        Trajectory(stamps, np.array([result.T_world_lidar for result in results])),
-        Trajectory(stamps, final.T_world_lidar),
+        trajectory,
+        Trajectory(trajectory.stamps, final.T_world_lidar),
         graph,
         sum(final.inliers),
         getattr(mapper, "exchange_ms", []),
@@ -190,15 +186,10 @@ def _most(milliseconds: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Parse the command line and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth, or the one of --pairs")
     parser.add_argument("--pairs", type=Path, metavar="FILE", help="known relative poses of the recording's scans")
-    parser.add_argument("--cases", nargs="*", default=[], metavar="WORLD/MOTION[/STEP]", help="simulated recordings")
-    parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--scans", type=int, default=1000)
-    parser.add_argument("--step", type=int, default=1, help="of recordings")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--odometry", default="constant-velocity")
     parser.add_argument("--radius-m", type=float, default=100.0, help="of the local map")
     options = parser.parse_args()
@@ -211,12 +202,9 @@ def main() -> None:
         "recording", "local map", "scans of later rounds", "apart, RMS / 95 %, m",
         "ATE as registered, m", "ATE in the end, m", "closures", "drawn", "drawing, ms", "exchange, ms",
     ])  # fmt: skip
-    for case in options.cases:
-        recorded = simulate(case, options.sensor, options.scans, options.seed)
-        measure(recorded.name, recorded.scans, recorded.truth, config)
     for source in options.sources:
         recording = open_recording(source)
-        scans = list(in_order(recording.scans(stop=options.scans, step=options.step)))
+        scans = list(in_order(recording.scans(stop=options.scans)))
         if options.pairs is not None:
             measure_pairs(recording.name, scans, np.loadtxt(options.pairs, ndmin=2), config)
             continue

@@ -25,21 +25,25 @@ import json
 import logging
 import multiprocessing
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from long_run_peers import FedPeer, add_line, feed_peers
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import make_parser, make_simulation, print_header, print_row
 from memory import resident_mb
 
+from lidarslam.compare.peers.estimation import PEERS, Peer, estimate
+from lidarslam.compare.peers.interface import Poses, Sweep
 from lidarslam.config.settings import Config
+from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import inverse
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
@@ -55,9 +59,106 @@ from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.run import open_odometry
 from lidarslam.run.summary import ScanLog
-from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import Spinning
 from lidarslam.storage.directory import RunDirectory, Unfinished
+
+# Of the global map in memory.
+_MOST_POINTS = 2_000_000
+# Messages to a peer that waits in vain for the next one.
+_END = None
+
+
+class KissIcpEstimator:
+    """KISS-ICP's own loop, `register_frame` with its defaults, behind the protocol of peers."""
+
+    def __init__(self) -> None:
+        from kiss_icp.config.parser import load_config
+        from kiss_icp.kiss_icp import KissICP
+
+        self._kiss: Any = KissICP(load_config(None))
+        self._poses: list[Any] = []
+        self._instants: list[float] = []
+
+    def add_imu(self, samples: ImuSamples, number: int) -> None:
+        """It uses no IMU."""
+
+    def load(self, sweep: Sweep) -> Callable[[], None]:
+        """The registration, still to be called; see `lidarslam.compare.peers.libraries` on instants."""
+        self._instants.append(sweep.end if len(self._instants) >= 2 else sweep.middle)
+
+        def register() -> None:
+            self._kiss.register_frame(sweep.scan.points, sweep.scan.time_offsets)
+            self._poses.append(self._kiss.last_pose.copy())
+
+        return register
+
+    def finish(self) -> Poses:
+        """The poses at the ends of the sweeps."""
+        return Poses(np.array(self._instants), np.array(self._poses))
+
+
+_KISS_ICP = Peer("kiss-icp", "kiss_icp", "kiss-icp", lambda *_: KissIcpEstimator())
+
+
+class FedPeer:
+    """A peer in its process."""
+
+    def __init__(self, context: SpawnContext, name: str, every: int, log: Path) -> None:
+        self.name = name
+        self._end, other = context.Pipe()
+        self._process = context.Process(target=_estimate, args=(other, name, every, log), daemon=True)
+        self._process.start()
+        other.close()
+
+    def take(self, scan: Scan) -> None:
+        """Hand it the next scan; one that died takes no more."""
+        try:
+            self._end.send(scan)
+        except OSError:
+            self._end.close()
+
+    def result(self) -> Trajectory | None:
+        """Its trajectory; None where it failed, which its log says."""
+        try:
+            self._end.send(_END)
+            trajectory: Trajectory = self._end.recv()
+        except (OSError, EOFError):
+            return None
+        return trajectory
+
+
+def feed_peers(scans: Iterator[Scan], peers: list[FedPeer]) -> Iterator[Scan]:
+    """The same scans, each handed to all peers before; whoever is slow is waited for."""
+    for scan in scans:
+        for peer in peers:
+            peer.take(scan)
+        yield scan
+
+
+def _estimate(source: Connection, name: str, every: int, log: Path) -> None:
+    """The peer's process."""
+    started = time.process_time()
+
+    def progress(number: int) -> None:
+        nonlocal started
+        if number % every == 0:
+            cpu_ms = 1e3 * (time.process_time() - started) / every
+            add_line(log, {"scans": number, "cpu_ms": cpu_ms, "rss_mb": resident_mb()})
+            started = time.process_time()
+
+    peer = _KISS_ICP if name == _KISS_ICP.name else PEERS[name]
+    try:
+        estimated = estimate(peer, iter(source.recv, _END), progress=progress)
+    except LidarSlamError as error:
+        add_line(log, {"error": str(error)})
+        return
+    source.send(estimated.trajectory)
+
+
+def add_line(path: Path, values: Mapping[str, object]) -> None:
+    """Append a line of JSON."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{json.dumps(values)}\n")
 
 
 @dataclass(frozen=True)
@@ -101,13 +202,11 @@ class TimedCheckpoints(Checkpoints):
 
 def simulate(options: argparse.Namespace, sink: Connection) -> None:
     """The simulator's process: first the truth, then one scan after the other."""
-    simulation = make_simulation(options.world, options.motion, options.sensor, options.scans, options.seed)
+    simulation = make_simulation("town", "car-fast", "vlp-16", options.scans, 0)
     sensor = simulation.sensor
     if options.columns and isinstance(sensor.pattern, Spinning):
         sensor = replace(sensor, pattern=replace(sensor.pattern, columns=options.columns))
-    simulation = Simulation(
-        simulation.world, sensor, simulation.motion, simulation.T_body_lidar, options.scans, options.seed
-    )
+        simulation = replace(simulation, sensor=sensor)
     sink.send(simulation.ground_truth)
     with suppress(BrokenPipeError):  # the drive was ended
         for scan in simulation.scans():
@@ -127,7 +226,7 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
     """Our own pipeline over all scans, with a row now and then; what there is to report in the end."""
     config = Config(
         odometry=OdometryConfig(method=options.odometry),
-        global_map=GlobalMapConfig(most_points=options.most_points),
+        global_map=GlobalMapConfig(most_points=_MOST_POINTS),
         pose_graph=PoseGraphConfig(enabled=True),
     )
     localiser = make_localiser(config)
@@ -148,7 +247,7 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         for row in _rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished):
             print_row(row.cells_of_table())
             add_line(options.out / "rows.jsonl", asdict(row))
-        return _finish(graph, log, pipeline, truth, options.most_points)
+        return _finish(graph, log, pipeline, truth)
 
 
 def _rows(
@@ -200,7 +299,7 @@ def _size_mb(file: Path) -> float:
     return file.stat().st_size / 2**20 if file.exists() else 0.0
 
 
-def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajectory, most_points: int) -> dict[str, Any]:
+def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajectory) -> dict[str, Any]:
     """Optimise, draw the map anew, and hold the trajectory against the truth, before and after."""
     stamps, before = log.stamps, log.trajectory
     started = time.perf_counter()
@@ -208,7 +307,7 @@ def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajector
     optimise_s = time.perf_counter() - started
     assert result is not None
     assert pipeline.map.voxel_size_m is not None
-    drawn = graph.draw_map(result, pipeline.map.voxel_size_m, most=most_points)
+    drawn = graph.draw_map(result, pipeline.map.voxel_size_m, most=_MOST_POINTS)
     draw_s = time.perf_counter() - started - optimise_s
     return {
         "optimise_s": optimise_s,
@@ -253,19 +352,13 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
 
 
 def main() -> None:
-    """Parse the command line, run everything, print and draw it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of what was measured")
-    parser.add_argument("--world", default="town")
-    parser.add_argument("--motion", default="car-fast")
-    parser.add_argument("--sensor", default="vlp-16")
-    parser.add_argument("--columns", type=int, help="of a turn, to make less of a spinning sensor")
+    parser.add_argument("--columns", type=int, help="of a turn, to make less of the sensor")
     parser.add_argument("--scans", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=1_000)
-    parser.add_argument("--most-points", type=int, default=2_000_000, help="of the global map in memory")
     parser.add_argument("--odometry", default="constant-velocity", help="in front of the map")
     parser.add_argument("--peers", nargs="*", default=["kiss-icp", "kiss-slam"])
-    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     logging.disable(logging.INFO)
     options.out.mkdir(parents=True)

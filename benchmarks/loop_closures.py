@@ -1,7 +1,7 @@
 """The pose graph on simulated laps: what it does to drift, which loops are closed, how exact they are, what they cost.
 
     python benchmarks/loop_closures.py
-    python benchmarks/loop_closures.py --worlds office rooms --motions handheld --drift 2
+    python benchmarks/loop_closures.py --worlds office rooms --drift 2
 
 A sensor goes round every world a time and a third. The whole graph of `lidarslam run --pose-graph` is given its scans,
 each compensated with the true motion and thinned, at poses that drift away from the truth; there is no odometry beside
@@ -14,13 +14,12 @@ half the median range of it before, a loop's least way ago; it is found when a c
 it. Milliseconds are of the processor.
 """
 
-import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from mapping_accuracy import in_world, print_header, print_row
+from mapping_accuracy import in_world, make_parser, print_header, print_row
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
@@ -35,9 +34,7 @@ from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.edges import GraphScan
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.simulation.motion import CARRIERS, MOUNTS
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS, Boxes, Route, World, build_world
 
 ROOMS = "rooms"
@@ -45,6 +42,8 @@ FALSE_M, FALSE_DEG = 0.5, 3.0
 _FOUND_WITHIN_M = 5.0
 # Errors of the estimate stay the same for so much of the way.
 _DRIFT_CHANGES_M = 50.0
+# Rounds of a world, and scans from one that is taken to the next.
+_LAPS, _EVERY = 1.34, 3
 _MOTIONS = {"street": "car", "tunnel": "tracked", "hall": "tracked"}
 # What refinement says of a scan's pose.
 _REGISTERED = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
@@ -52,21 +51,13 @@ _REGISTERED = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
 
 @dataclass(frozen=True, eq=False)
 class Lap:
-    """A recording of which every so manieth scan is used.
+    """A recording of which every third scan is used."""
 
-    Attributes:
-        name: of world and motion.
-        simulation: where scans come from.
-        scans: (M,) which are used.
-        truth: (M, 4, 4) T_world_lidar.
-        way_m: (M,) path length.
-    """
-
-    name: str
-    simulation: Simulation
-    scans: NDArray[np.intp]
-    truth: FloatArray
-    way_m: FloatArray
+    name: str  # of world and motion
+    simulation: Simulation  # where scans come from
+    scans: NDArray[np.intp]  # (M,) which are used
+    truth: FloatArray  # (M, 4, 4) T_world_lidar
+    way_m: FloatArray  # (M,) path length
 
     def points(self) -> Iterator[FloatArray]:
         """(N, 3) of one scan after the other, compensated with the true motion."""
@@ -111,12 +102,12 @@ def build_rooms(seed: int) -> World:
     return World(ROOMS, seed, route, Boxes(centres, halves, np.tile(np.eye(3), (len(centres), 1, 1))))
 
 
-def simulate(world: str, motion: str, sensor: str, mount: str, seed: int, laps: float, every: int) -> Lap:
+def simulate(world: str, motion: str, seed: int) -> Lap:
     """A recording straight from the simulator."""
     place = build_rooms(seed) if world == ROOMS else build_world(world, seed)
-    simulation = in_world(place, motion, sensor, None, seed, mount=mount, laps=laps)
+    simulation = in_world(place, motion, "vlp-16", None, seed, _LAPS)
     truth = simulation.ground_truth
-    used = np.arange(0, len(simulation) - 1, every)
+    used = np.arange(0, len(simulation) - 1, _EVERY)
     return Lap(f"{world}, {motion}", simulation, used, truth.T_world_lidar[used], truth.distances[used])
 
 
@@ -225,30 +216,15 @@ def _squared(closure: LoopClosure, truth: FloatArray) -> float:
     return float(xi @ np.linalg.solve(closure.covariance, xi))
 
 
-def laps(arguments: argparse.Namespace) -> Iterator[Lap]:
-    """Every world, with one motion or those that were asked for."""
-    for world in arguments.worlds:
-        for motion in arguments.motions or [_MOTIONS.get(world, "handheld")]:
-            yield simulate(
-                world, motion, arguments.sensor, arguments.mount, arguments.seed, arguments.laps, arguments.every
-            )
-
-
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--worlds",
         nargs="+",
         choices=[*WORLDS, ROOMS],
         default=[*(world for world in WORLDS if world != "town"), ROOMS],
     )
-    parser.add_argument("--motions", nargs="+", choices=list(CARRIERS), help="default: one that suits the world")
-    parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--mount", choices=list(MOUNTS), default="upright")
-    parser.add_argument("--laps", type=float, default=1.34)
-    parser.add_argument("--every", type=int, default=3, help="scans are taken one in so many")
     parser.add_argument("--drift", type=float, default=1.0, help="times 1 %% of the way and 2 degrees in 100 m")
     arguments = parser.parse_args()
     # The defaults, with the drift where there is more.
@@ -259,7 +235,8 @@ def main() -> None:
     header += ["off by, median / max", "degrees", "squared over covariance", "revisits found, %"]
     header += ["ms a keyframe, median / 95 % / mean"]
     print_header(header)
-    for lap in laps(arguments):
+    for world in arguments.worlds:
+        lap = simulate(world, _MOTIONS.get(world, "handheld"), arguments.seed)
         estimates = drifting(lap.truth, lap.way_m, arguments.drift, arguments.seed)
         followed = follow(lap, estimates, config)
         print_row(row(lap, estimates, followed))

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, chain, read_tum, write_tum
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.run.summary import RunSummary
@@ -27,10 +27,7 @@ def scaled(T_world_lidar: FloatArray, factors: FloatArray) -> FloatArray:
     """Poses (N, 4, 4) whose motions (N - 1,) are so much of what they were."""
     motions = inverse(T_world_lidar[:-1]) @ T_world_lidar[1:]
     motions[:, :3, 3] *= factors[:, None]
-    poses = [T_world_lidar[0]]
-    for motion in motions:
-        poses.append(poses[-1] @ motion)
-    return np.array(poses)
+    return chain(T_world_lidar[0], motions)
 
 
 def scaled_stretch(T_world_lidar: FloatArray, factor: float) -> FloatArray:
@@ -75,7 +72,6 @@ def row(name: str, distortion: str, summary: RunSummary) -> str:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+", help="RECORDING, or RECORDING,POSES.tum")
     print("| recording | poses | contradiction | votes at the poses | lost scans | map entropy |")

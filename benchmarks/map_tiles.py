@@ -9,7 +9,6 @@ file of tiles, in megabytes; voxels in memory; and the time of a scan, without t
 time and memory of the final map, written to a temporary folder. Linux only: memory is read from /proc.
 """
 
-import argparse
 import os
 import time
 from contextlib import ExitStack
@@ -17,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 from memory import resident_mb
 
 from lidarslam.core.geometry import FloatArray
@@ -64,8 +63,7 @@ def watch(built: GlobalMap, store: TileStore, scans: int, points: int, every: in
 
 
 def main() -> None:
-    """Parse the command line, print the table and the cost of the final map."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--most-points", default="1000000", help="global_map.most_points; none: any number")
     parser.add_argument("--scans", type=int, default=6_000)
     parser.add_argument("--points", type=int, default=20_000, help="of a scan")

@@ -4,13 +4,12 @@
 
 Every row of the Markdown table is a variant: surfels and LOAM's features, with the velocity of the sweep estimated
 (continuous time) or taken from the poses (discrete); each without any odometry, with the learned one, and with one
-that is wrong by `--wrong-deg` and `--wrong-m` at every scan (see `mapping_accuracy.py`). The columns are the ATE of
+that is wrong at every scan (see `mapping_accuracy.py`). The columns are the ATE of
 each recording in metres after SE(3) alignment, lost scans in brackets, the mean, and the median time of a scan's
 registration and map update. All variants have the same scans; what each recording gives goes to standard error as it
 comes, as the table needs them all.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 
@@ -19,16 +18,15 @@ from mapping_accuracy import (
     Outcome,
     Recorded,
     add_simulation_arguments,
+    config_of,
     localise,
+    make_parser,
     print_header,
     print_row,
     simulated_recordings,
-    with_odometry,
-    without_odometry,
     wrong_odometry,
 )
 
-from lidarslam.config.settings import Config
 from lidarslam.mapping.config import MappingConfig
 
 _PARTS: dict[str, MappingConfig] = {
@@ -39,12 +37,12 @@ _PARTS: dict[str, MappingConfig] = {
 }
 
 
-def run_variants(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int) -> list[Outcome]:
+def run_variants(recorded: Recorded, seed: int) -> list[Outcome]:
     """One recording through all variants, without odometry, with the learned and with the wrong one."""
-    prior, mappings = wrong_odometry(recorded, wrong_deg, wrong_m, seed), _PARTS.values()
-    alone = [localise(recorded, without_odometry(mapping)) for mapping in mappings]
-    learned = [localise(recorded, Config(mapping=mapping)) for mapping in mappings]
-    return alone + learned + [localise(recorded, with_odometry(mapping), prior) for mapping in mappings]
+    prior, mappings = wrong_odometry(recorded, seed), _PARTS.values()
+    alone = [localise(recorded, config_of("constant-velocity", mapping)) for mapping in mappings]
+    learned = [localise(recorded, config_of("learned", mapping)) for mapping in mappings]
+    return alone + learned + [localise(recorded, config_of("external", mapping), prior) for mapping in mappings]
 
 
 def _labels() -> list[str]:
@@ -59,17 +57,14 @@ def _cells(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def main() -> None:
-    """Parse the command line, run everything, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     add_simulation_arguments(parser, ("office", "tunnel", "hall"), ("handheld", "legged", "tracked"))
-    parser.add_argument("--wrong-deg", type=float, default=2.0)
-    parser.add_argument("--wrong-m", type=float, default=0.1)
     arguments = parser.parse_args()
     names: list[str] = []
     columns: list[list[Outcome]] = []
     for recorded in simulated_recordings(arguments):
         names.append(recorded.name)
-        columns.append(run_variants(recorded, arguments.wrong_deg, arguments.wrong_m, arguments.seed))
+        columns.append(run_variants(recorded, arguments.seed))
         ates = " ".join(f"{outcome.ate_m:.3f}" for outcome in columns[-1])
         print(f"{recorded.name}: {ates}", file=sys.stderr, flush=True)
     header = ["variant", "odometry", *names, "mean", "ms a scan"]

@@ -8,8 +8,8 @@ Prints a Markdown table, a row for each recording: ATE in metres after SE(3) ali
 - KISS-ICP with its defaults;
 - KISS-ICP with the voxel size, of `--voxels`, that makes its ATE on this very recording smallest;
 - scan-to-map refinement without any odometry;
-- the same with an odometry that is wrong by `--wrong-deg` and `--wrong-m` at every scan, in random directions: the
-  truth's motions with these errors, given as an external odometry; how far it gets by itself is in a column too.
+- the same with an odometry that is wrong by 2 degrees and 0.1 m at every scan, in random directions: the truth's
+  motions with these errors, given as an external odometry; how far it gets by itself is in a column too.
 
 Ours have the scans that were lost and degraded beside them. All of them run in the pipeline of `lidarslam run` with its
 defaults. Sources are whatever `lidarslam run` reads and has ground truth for; simulated recordings go straight from the
@@ -17,9 +17,13 @@ simulator into memory.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,7 +37,7 @@ from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.metrics import TrajectoryErrors, evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.odometry.config import KissConfig, OdometryConfig
+from lidarslam.odometry.config import KissConfig, OdometryConfig, OdometryName
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
@@ -46,19 +50,11 @@ from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import SENSORS, find_sensor
 from lidarslam.simulation.world import WORLDS, World, build_world
 
+T = TypeVar("T")
 # How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
 BEYOND_TRUTH_S = 0.2
-
-METHODS = {
-    "learned+map": Config(),
-    "learned+loam": Config(mapping=MappingConfig(method="loam")),
-    "constant-velocity+map": Config(odometry=OdometryConfig(method="constant-velocity")),
-    "constant-velocity+loam": Config(
-        odometry=OdometryConfig(method="constant-velocity"), mapping=MappingConfig(method="loam")
-    ),
-    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(method="off")),
-}
-DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP")
+# Errors of the wrong odometry at every scan.
+WRONG_DEG, WRONG_M = 2.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +82,8 @@ class Outcome:
         return f"{self.ate_m:.3f} ({self.lost} lost, {self.degraded} degraded)"
 
 
-def read(source: Path, step: int = 1) -> Recorded:
-    """A recording from disk, every n-th scan of it.
+def read(source: Path) -> Recorded:
+    """A recording from disk.
 
     Raises:
         InputError: it cannot be read, or comes without ground truth.
@@ -96,30 +92,25 @@ def read(source: Path, step: int = 1) -> Recorded:
     truth = recording.ground_truth
     if truth is None:
         raise InputError(f"{source}: has no ground truth to measure against")
-    return Recorded(recording.name, list(in_order(recording.scans(step=step))), truth)
+    return Recorded(recording.name, list(in_order(recording.scans())), truth)
 
 
-def simulate(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None) -> Recorded:
+def simulate(world: str, motion: str, sensor: str, scans: int, seed: int) -> Recorded:
     """A recording straight from the simulator."""
-    simulation = make_simulation(world, motion, sensor, scans, seed, speed_mps)
+    simulation = make_simulation(world, motion, sensor, scans, seed)
     return Recorded(f"{world}, {motion}", list(simulation.scans()), simulation.ground_truth)
 
 
-def make_simulation(
-    world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None
-) -> Simulation:
-    """An upright sensor going round a world's route, at the motion's own speed or another."""
-    return in_world(build_world(world, seed), motion, sensor, scans, seed, speed_mps)
+def make_simulation(world: str, motion: str, sensor: str, scans: int, seed: int) -> Simulation:
+    """An upright sensor going round a world's route."""
+    return in_world(build_world(world, seed), motion, sensor, scans, seed)
 
 
-def in_world(
-    place: World, motion: str, sensor: str, scans: int | None, seed: int, speed_mps: float | None = None,
-    mount: str = "upright", laps: float = 1.0,
-) -> Simulation:  # fmt: skip
+def in_world(place: World, motion: str, sensor: str, scans: int | None, seed: int, laps: float = 1.0) -> Simulation:
     """The same in a world at hand; without a number of scans, so many laps."""
-    carried, model = motion_along_route(motion, place, seed, speed_mps), find_sensor(sensor)
+    carried, model = motion_along_route(motion, place, seed), find_sensor(sensor)
     scans = int(laps * carried.duration_s * model.rate_hz) if scans is None else scans
-    return Simulation(place, model, carried, mount_pose(mount, carried.sensor_height_m), scans, seed)
+    return Simulation(place, model, carried, mount_pose("upright", carried.sensor_height_m), scans, seed)
 
 
 def true_trajectory(recorded: Recorded) -> Trajectory:
@@ -128,22 +119,21 @@ def true_trajectory(recorded: Recorded) -> Trajectory:
     return Trajectory(stamps, recorded.truth.at(stamps, BEYOND_TRUTH_S))
 
 
-def wrong_odometry(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int) -> Trajectory:
+def wrong_odometry(recorded: Recorded, seed: int) -> Trajectory:
     """The truth at the scans' stamps, every motion changed by a rotation and a translation in random directions."""
     rng = np.random.default_rng(seed)
     truth = true_trajectory(recorded)
     stamps = truth.stamps
     errors = rng.normal(size=(len(stamps) - 1, 2, 3))
-    errors *= np.array([np.deg2rad(wrong_deg), wrong_m])[:, None] / np.linalg.norm(errors, axis=2, keepdims=True)
+    errors *= np.array([np.deg2rad(WRONG_DEG), WRONG_M])[:, None] / np.linalg.norm(errors, axis=2, keepdims=True)
     wrong = truth.relative_motions() @ exp(errors.reshape(-1, 6))
     return Trajectory(stamps, chain(truth.T_world_lidar[0], wrong))
 
 
 def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> Outcome:
     """Take a recording through the pipeline, and hold the trajectory against the truth."""
-    results = pipeline_results(recorded, config, prior)
-    stamps = np.array([result.stamp for result in results])
-    errors = errors_of(Trajectory(stamps, np.array([result.T_world_lidar for result in results])), recorded)
+    results = pipeline_results(recorded.scans, config, prior)
+    errors = errors_of(trajectory_of(results), recorded)
     statuses = [result.status for result in results]
     refine_ms = [result.stage_ms["refine"] for result in results if "refine" in result.stage_ms]
     return Outcome(
@@ -155,13 +145,15 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
     )
 
 
-def pipeline_results(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> list[ScanEstimate]:
-    """Take a recording through the pipeline of `lidarslam run`."""
-    odometry = where_needed(make_odometry(config.odometry, prior), config)
-    try:
-        return list(Pipeline(odometry, make_localiser(config), config.global_map).run(recorded.scans))
-    finally:
-        odometry.close()
+def pipeline_results(scans: Sequence[Scan], config: Config, prior: Trajectory | None = None) -> list[ScanEstimate]:
+    """Take scans through the pipeline of `lidarslam run`."""
+    with closing(where_needed(make_odometry(config.odometry, prior), config)) as odometry:
+        return list(Pipeline(odometry, make_localiser(config), config.global_map).run(scans))
+
+
+def trajectory_of(results: Sequence[ScanEstimate]) -> Trajectory:
+    """The poses as they came."""
+    return Trajectory(np.array([one.stamp for one in results]), np.array([one.T_world_lidar for one in results]))
 
 
 def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
@@ -169,14 +161,19 @@ def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
     return evaluate_trajectory(estimate, recorded.truth).errors
 
 
-def without_odometry(mapping: MappingConfig) -> Config:
-    """The configuration for scan-to-map refinement that goes on with the motion it saw last."""
-    return Config(odometry=OdometryConfig(method="constant-velocity"), mapping=mapping)
+def config_of(odometry: OdometryName, mapping: MappingConfig) -> Config:
+    """The configuration of an odometry in front of scan-to-map refinement."""
+    return Config(odometry=OdometryConfig(method=odometry), mapping=mapping)
 
 
-def with_odometry(mapping: MappingConfig) -> Config:
-    """The configuration for an external odometry in front of scan-to-map refinement."""
-    return Config(odometry=OdometryConfig(method="external"), mapping=mapping)
+METHODS = {
+    "learned+map": config_of("learned", MappingConfig()),
+    "learned+loam": config_of("learned", MappingConfig(method="loam")),
+    "constant-velocity+map": config_of("constant-velocity", MappingConfig()),
+    "constant-velocity+loam": config_of("constant-velocity", MappingConfig(method="loam")),
+    "KISS-ICP": config_of("kiss-icp", MappingConfig(method="off")),
+}
+DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP")
 
 
 def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
@@ -185,19 +182,14 @@ def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
     return localise(recorded, Config(odometry=odometry, mapping=MappingConfig(method="off")))
 
 
-def tune_kiss(recorded: Recorded, voxels: Sequence[float]) -> tuple[float, Outcome]:
-    """The voxel size with the smallest ATE, and what came of it."""
-    outcomes = {voxel_m: run_kiss(recorded, KissConfig(voxel_size_m=voxel_m)) for voxel_m in voxels}
-    return min(outcomes.items(), key=lambda item: item[1].ate_m)
-
-
-def row(recorded: Recorded, voxels: Sequence[float], wrong_deg: float, wrong_m: float, seed: int) -> list[str]:
+def row(recorded: Recorded, voxels: Sequence[float], seed: int) -> list[str]:
     """The cells of one recording."""
     kiss = run_kiss(recorded, KissConfig())
-    voxel_m, tuned = tune_kiss(recorded, voxels)
-    prior = wrong_odometry(recorded, wrong_deg, wrong_m, seed)
-    alone = localise(recorded, without_odometry(MappingConfig()))
-    helped = localise(recorded, with_odometry(MappingConfig()), prior)
+    outcomes = [(run_kiss(recorded, KissConfig(voxel_size_m=voxel_m)), voxel_m) for voxel_m in voxels]
+    tuned, voxel_m = min(outcomes, key=lambda one: one[0].ate_m)
+    prior = wrong_odometry(recorded, seed)
+    alone = localise(recorded, config_of("constant-velocity", MappingConfig()))
+    helped = localise(recorded, config_of("external", MappingConfig()), prior)
     percents = [100.0 * outcome.ate_m / outcome.length_m for outcome in (alone, helped)]
     return [
         recorded.name,
@@ -213,22 +205,28 @@ def row(recorded: Recorded, voxels: Sequence[float], wrong_deg: float, wrong_m: 
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser)
     parser.add_argument("--voxels", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0], help="metres, for KISS-ICP")
-    parser.add_argument("--wrong-deg", type=float, default=2.0)
-    parser.add_argument("--wrong-m", type=float, default=0.1)
     arguments = parser.parse_args()
-    if not arguments.sources and not arguments.worlds:
-        parser.error("give recordings, or worlds to simulate some in with --worlds")
-    wrong = f"{arguments.wrong_deg:g} deg, {arguments.wrong_m:g} m a scan"
+    wrong = f"{WRONG_DEG:g} deg, {WRONG_M:g} m a scan"
     header = ["recording", "scans", "path, m", "KISS-ICP", "KISS-ICP, best voxel", "ours, no odometry"]
     header += [f"odometry wrong by {wrong}", "ours with it", "ours, % of the path: without / with it"]
     print_header(header)
     for recorded in recordings(arguments):
-        print_row(row(recorded, arguments.voxels, arguments.wrong_deg, arguments.wrong_m, arguments.seed))
+        print_row(row(recorded, arguments.voxels, arguments.seed))
+
+
+def in_process(call: Callable[..., T], *arguments: object) -> T:
+    """What a call returns in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(call, *arguments).result()
+
+
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """The parser of a benchmark's command line, whose help is the text of its module."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def add_simulation_arguments(
@@ -240,18 +238,19 @@ def add_simulation_arguments(
     parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
     parser.add_argument("--scans", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--speed", type=float, help="metres a second; default: the motion's own")
 
 
 def simulated_recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
     """Every world with every motion, one in memory at a time."""
     for world in arguments.worlds:
         for motion in arguments.motions:
-            yield simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)
+            yield simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed)
 
 
 def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterator[Recorded]:
-    """All that are asked for, one in memory at a time; of those on disk at most so many scans."""
+    """All that are asked for, or of all worlds, one in memory at a time; of those on disk at most so many scans."""
+    if not arguments.sources and not arguments.worlds:
+        arguments.worlds = list(WORLDS)
     for source in arguments.sources:
         recorded = read(source)
         yield replace(recorded, scans=recorded.scans[:most])

@@ -21,7 +21,6 @@ is without the stages inside it:
 - rest: prediction and judgement, and the search when a scan is lost.
 """
 
-import argparse
 import functools
 import inspect
 import itertools
@@ -35,7 +34,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import make_parser, make_simulation, print_header, print_row
 from threadpoolctl import threadpool_limits
 
 from lidarslam.core.geometry import FloatArray
@@ -186,8 +185,7 @@ def _ratio(ours: Sequence[_Pass], kiss: Sequence[_Pass], kind: int) -> str:
 
 
 def main() -> None:
-    """Parse the command line, and compare on every recording."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
     parser.add_argument("--methods", nargs="+", choices=_METHODS, default=["surfels"])

@@ -1,8 +1,8 @@
 """Whether a long run takes more and more memory.
 
-    python benchmarks/memory.py lap --world hall --motion tracked --scans 20000 [--columns 200]
-    python benchmarks/memory.py rooms --scans 20000 [--lost-every 600] [--points 1000]
-    python benchmarks/memory.py still --scans 100000 [--graph]
+    python benchmarks/memory.py lap --world hall --motion tracked --scans 20000
+    python benchmarks/memory.py rooms --scans 20000 [--lost-every 600]
+    python benchmarks/memory.py still --scans 100000
 
 - lap: a sensor goes round and round in a simulated place;
 - rooms: it stands in a made-up room, and with `--lost-every` wakes up in another one every so many scans, where after
@@ -23,12 +23,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import make_parser, make_simulation, print_header, print_row
 
 from lidarslam.config.settings import Config, load_config
 from lidarslam.core.geometry import FloatArray, exp, inverse
@@ -43,14 +43,12 @@ from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.checkpoints import Checkpoints
-from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.motion import CARRIERS
-from lidarslam.simulation.sensors import SENSORS, Spinning
 from lidarslam.simulation.world import WORLDS
 from lidarslam.storage.directory import RunDirectory, Unfinished
 
-_NOISE_M, _STILL_POINTS = 0.005, 300
+_NOISE_M, _ROOM_POINTS, _STILL_POINTS = 0.005, 1_000, 300
 _WITHOUT_ODOMETRY = ["odometry.method=constant-velocity"]
 
 
@@ -83,13 +81,7 @@ class Case:
 
 def lap(options: argparse.Namespace) -> Case:
     """Round and round a simulated place."""
-    simulation = make_simulation(options.world, options.motion, options.sensor, options.scans, options.seed)
-    if options.columns is not None:
-        sensor = simulation.sensor
-        assert isinstance(sensor.pattern, Spinning), f"--columns: {sensor.name} does not spin"
-        simulation = replace(
-            simulation, sensor=replace(sensor, pattern=replace(sensor.pattern, columns=options.columns))
-        )
+    simulation = make_simulation(options.world, options.motion, "vlp-16", options.scans, 0)
 
     def error_m(result: ScanEstimate) -> float:
         T_world_first, T_world_lidar = simulation.T_world_lidar_at(np.array([0.0, result.stamp]))
@@ -105,17 +97,17 @@ def rooms(options: argparse.Namespace) -> Case:
         rng = np.random.default_rng(0)
         for number in range(options.scans):
             if number % (options.lost_every or options.scans) == 0:
-                walls = _room(rng, options.points)
+                walls = _room(rng)
             yield Scan(walls + _NOISE_M * rng.normal(size=walls.shape), 0.1 * number)
 
     return Case(scans(), load_config(None, [*_WITHOUT_ODOMETRY, "global_map.voxel_size_m=0.25"]))
 
 
-def _room(rng: np.random.Generator, points: int) -> FloatArray:
+def _room(rng: np.random.Generator) -> FloatArray:
     """Points (N, 3) on the walls of a room, as seen from somewhere in it."""
     half = rng.uniform([3.0, 3.0, 1.2], [6.0, 6.0, 2.0])
-    walls = rng.uniform(-1.0, 1.0, (points, 3))
-    walls[np.arange(points), rng.integers(0, 3, points)] = rng.choice([-1.0, 1.0], points)
+    walls = rng.uniform(-1.0, 1.0, (_ROOM_POINTS, 3))
+    walls[np.arange(_ROOM_POINTS), rng.integers(0, 3, _ROOM_POINTS)] = rng.choice([-1.0, 1.0], _ROOM_POINTS)
     turn = rng.uniform(-np.pi, np.pi)
     R_world_room = exp(np.array([0.0, 0.0, turn, 0.0, 0.0, 0.0]))[:3, :3]
     return np.asarray((walls - rng.uniform(-0.6, 0.6, 3)) * half @ R_world_room.T)
@@ -125,8 +117,7 @@ def still(options: argparse.Namespace) -> Case:
     """The same walls of a room for hours, without mapping."""
     global_map._MIN_PENDING = 20_000
     settings = ["odometry.method=external", "mapping.method=off", "global_map.voxel_size_m=0.1"]
-    settings += [f"pose_graph.enabled={options.graph}", f"checkpoints.every_scans={options.every // 2}"]
-    config = load_config(None, settings)
+    config = load_config(None, [*settings, f"checkpoints.every_scans={options.every // 2}"])
 
     def scans() -> Iterator[Scan]:
         rng = np.random.default_rng(0)
@@ -148,9 +139,8 @@ def watch(case: Case, every: int) -> list[Row]:
         unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
         log, localiser = ScanLog(), make_localiser(case.config)
         odometry = where_needed(make_odometry(case.config.odometry, case.prior), case.config)
-        graph = begin_graph(case.config, file=unfinished.files.submaps)
-        checkpoints = Checkpoints(unfinished, case.config.checkpoints, odometry, log, graph)
-        pipeline = Pipeline(odometry, localiser, case.config.global_map, graph, checkpoints)
+        checkpoints = Checkpoints(unfinished, case.config.checkpoints, odometry, log, None)
+        pipeline = Pipeline(odometry, localiser, case.config.global_map, None, checkpoints)
         mapper, state = localiser.mapper, unfinished.files.state
         statuses, begun, most_mb, started = Counter[Status](), 0, 0.0, time.perf_counter()
         for number, result in enumerate(pipeline.run(prefetch(iter(case.scans))), 1):
@@ -202,20 +192,14 @@ def growth(rows: list[Row]) -> str:
 
 
 def main() -> None:
-    """Parse the command line, print the table and the growth."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     cases = {"lap": lap, "rooms": rooms, "still": still}
     parser.add_argument("case", choices=cases)
     parser.add_argument("--scans", type=int, default=10_000)
     parser.add_argument("--every", type=int, default=500)
     parser.add_argument("--world", choices=list(WORLDS), default="office")
     parser.add_argument("--motion", choices=list(CARRIERS), default="handheld")
-    parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
-    parser.add_argument("--columns", type=int, help="of a turn, to make less of a spinning sensor")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--points", type=int, default=1_000, help="of a scan of a room")
     parser.add_argument("--lost-every", type=int, help="scans from one room to the next")
-    parser.add_argument("--graph", action="store_true", help="with a pose graph, standing still")
     options = parser.parse_args()
     print_header(list(Row.__dataclass_fields__))
     print(f"\n{growth(watch(cases[options.case](options), options.every))}")

@@ -8,7 +8,6 @@ Every scan and the ground truth are turned about the sensor before the program s
 with the trajectory of the same method on it as it was recorded.
 """
 
-import argparse
 import warnings
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,10 +15,10 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from mapping_accuracy import make_parser, trajectory_of
 from scipy.spatial.transform import Rotation
 
 from lidarslam.config.settings import load_config
-from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
@@ -70,8 +69,7 @@ class From:
 
 
 def main() -> None:
-    """Print a table, a row for each turn and setting."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("source", type=Path)
     parser.add_argument("--sequence")
     parser.add_argument("--starts", type=int, nargs="+", default=[0])
@@ -125,14 +123,10 @@ def tracked(recording: Recording, method: str, count: int) -> tuple[Trajectory, 
     """The trajectory of the first scans by a method, and how many were lost."""
     odometry, _, mapping = method.partition("+")
     config = load_config(settings=[f"odometry.method={odometry}", f"mapping.method={'surfels' if mapping else 'off'}"])
-    stamps, poses, lost = list[float](), list[FloatArray](), 0
     scans = islice(take_in(recording, range(count), Faults()), count)
     with closing(make_odometry(config.odometry)) as estimator:
-        for result in Pipeline(estimator, make_localiser(config), config.global_map).run(scans):
-            stamps.append(result.stamp)
-            poses.append(result.T_world_lidar)
-            lost += result.status is Status.LOST
-    return Trajectory(np.array(stamps), np.array(poses)), lost
+        results = list(Pipeline(estimator, make_localiser(config), config.global_map).run(scans))
+    return trajectory_of(results), sum(result.status is Status.LOST for result in results)
 
 
 if __name__ == "__main__":

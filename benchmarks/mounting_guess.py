@@ -1,7 +1,7 @@
 """How often the guess of the mounting finds it, warns, leaves a recording as it is, or turns it wrongly.
 
     python benchmarks/mounting_guess.py KITTI --sequence 04
-    python benchmarks/mounting_guess.py --worlds street office --sensors vlp-16 os1-64 --motions handheld
+    python benchmarks/mounting_guess.py --worlds street office --sensors vlp-16 os1-64
 
 Guesses are made from several starts in a recording. Recordings on disk are taken to be upright and are turned about the
 sensor as a whole (`axes`). In simulated ones the sensor is mounted so too, and sees what it sees then (`mounted`). Each
@@ -9,13 +9,13 @@ cell has four counts: turned upright / warned / left as recorded / turned wrongl
 Upright and tilted recordings are to be left as recorded, and the last count is to be 0.
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from mapping_accuracy import in_world, make_parser
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, make_transform
@@ -24,10 +24,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import Guess, guess_mounting, transform_of
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.mesh import Caster
-from lidarslam.simulation.motion import CARRIERS
 from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import SENSORS, find_sensor
+from lidarslam.simulation.sensors import SENSORS
 from lidarslam.simulation.world import WORLDS, build_world
 
 # Roll, pitch, yaw of the sensor, degrees.
@@ -44,38 +42,29 @@ WRONG_DEG = 30.0
 
 
 def main() -> None:
-    """Print a table, a row for each recording, or for each world, sensor and motion."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("sources", type=Path, nargs="*")
     parser.add_argument("--sequence")
     parser.add_argument("--every", type=int, default=8, help="scans from one start to the next, of recordings on disk")
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=[])
     parser.add_argument("--sensors", nargs="+", choices=list(SENSORS), default=list(SENSORS))
-    parser.add_argument("--motions", nargs="+", choices=list(CARRIERS), default=["handheld"])
     parser.add_argument("--starts", type=int, default=2, help="of simulated recordings")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cases", action="store_true", help="print those that came out wrong")
     arguments = parser.parse_args()
     print(f"| recording | turned | {' | '.join(POSES)} |\n{'|---' * (2 + len(POSES))}|")
     for source in arguments.sources:
         recorded = open_recording(source, ReaderConfig(sequence=arguments.sequence, mounting="upright"))
-        row(recorded.name, "axes", (on_disk(recorded, pose, arguments.every) for pose in POSES), arguments.cases)
+        row(recorded.name, "axes", (on_disk(recorded, pose, arguments.every) for pose in POSES))
     for world in arguments.worlds:
-        made = list(simulations(world, arguments))
+        made = list(simulations(world, arguments.sensors))
         for turned in ("axes", "mounted"):
-            row(world, turned, (simulated(made, pose, turned, arguments.starts) for pose in POSES), arguments.cases)
+            row(world, turned, (simulated(made, pose, turned, arguments.starts) for pose in POSES))
 
 
-def row(name: str, turned: str, columns: Iterator[Iterator[tuple[str, Guess, float]]], shows_cases: bool) -> None:
-    """Print a row, and cases that came out wrong above it."""
+def row(name: str, turned: str, columns: Iterator[Iterator[tuple[Guess, float]]]) -> None:
+    """Print a row, with the guesses of each pose."""
     cells = []
-    for pose, cases in zip(POSES, columns, strict=True):
-        counts = Counter[str]()
-        for case, guess, tilt_deg in cases:
-            result = outcome(guess, tilt_deg)
-            counts[result] += 1
-            if shows_cases and (result == "wrong" or (pose in ("upright", "tilted") and result != "left")):
-                print(f"{name}, {turned}, {pose}, {case}: {guess.mounting}, {tilt_deg:.0f} degrees; {guess.warning}")
+    for guesses in columns:
+        counts = Counter(outcome(*guess) for guess in guesses)
         cells.append(" / ".join(str(counts[result]) for result in OUTCOMES))
     print(f"| {name} | {turned} | {' | '.join(cells)} |", flush=True)
 
@@ -87,29 +76,25 @@ def outcome(guess: Guess, tilt_deg: float) -> str:
     return "turned" if tilt_deg < WRONG_DEG else "wrong"
 
 
-def on_disk(recorded: ScanSequence, pose: str, every: int) -> Iterator[tuple[str, Guess, float]]:
+def on_disk(recorded: ScanSequence, pose: str, every: int) -> Iterator[tuple[Guess, float]]:
     """The guesses from every start, with the tilts after them."""
     for start in range(0, max(1, len(recorded) - LOOK), every):
         scans = [scan.points for scan in recorded.scans(start, start + LOOK, STEP)]
         for angles in POSES[pose]:
-            yield f"{start} {angles}", *guessed(scans, matrix(angles), np.array([0.0, 0.0, 1.0]))
+            yield guessed(scans, matrix(angles), np.array([0.0, 0.0, 1.0]))
 
 
-def simulations(world: str, arguments: argparse.Namespace) -> Iterator[Simulation]:
-    """A world's recordings, upright, of all motions and sensors."""
-    built = build_world(world, arguments.seed)
+def simulations(world: str, sensors: Sequence[str]) -> Iterator[Simulation]:
+    """A world's recordings with each sensor, upright in a hand."""
+    built = build_world(world, 0)
     caster = Caster(built)
-    for name in arguments.motions:
-        motion = motion_along_route(name, built, arguments.seed)
-        T_body_lidar = make_transform(np.eye(3), [0.0, 0.0, motion.sensor_height_m])
-        for sensor in map(find_sensor, arguments.sensors):
-            count = int(motion.duration_s * sensor.rate_hz)
-            simulation = Simulation(built, sensor, motion, T_body_lidar, count, arguments.seed)
-            vars(simulation)["_caster"] = caster
-            yield simulation
+    for sensor in sensors:
+        simulation = in_world(built, "handheld", sensor, None, 0)
+        vars(simulation)["_caster"] = caster
+        yield simulation
 
 
-def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -> Iterator[tuple[str, Guess, float]]:
+def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -> Iterator[tuple[Guess, float]]:
     """The guesses from starts over the whole route, with the tilts after them."""
     for upright in made:
         for start in np.linspace(0, len(upright) - LOOK, starts + 1, dtype=int)[:-1].tolist():
@@ -119,10 +104,9 @@ def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -
                 R = matrix(angles)
                 if turned == "axes":
                     up = upright.ground_truth_at(upright.stamps[start : start + 1]).T_world_lidar[0, 2, :3]
-                    result = guessed(scans, R, up)
+                    yield guessed(scans, R, up)
                 else:
-                    result = guessed(*mounted(upright, R, looks))
-                yield f"{upright.name} {start} {angles}", *result
+                    yield guessed(*mounted(upright, R, looks))
 
 
 def mounted(upright: Simulation, R: FloatArray, looks: range) -> tuple[Iterator[FloatArray], FloatArray, FloatArray]:

@@ -8,13 +8,12 @@ within 4 degrees and 0.8 m, from where alignment finds its way. The reference is
 velocity finds at full rate, or with `--truth` the recording's own.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from held_out import mapped, with_truth
-from mapping_accuracy import Recorded, print_header, print_row, true_trajectory
+from mapping_accuracy import Recorded, make_parser, print_header, print_row, true_trajectory
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.odometry.images.sweep_images import Imager
@@ -24,15 +23,14 @@ from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, t
 _RIGHT_DEG, _RIGHT_M = 4.0, 0.8
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("source", type=Path)
     parser.add_argument("--weights", type=Path, nargs="+", required=True)
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 3, 5])
     parser.add_argument("--scans", type=int, default=60, help="at most, at each step")
     parser.add_argument("--truth", action="store_true", help="the reference is the recording's truth")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     recorded = with_truth(options.source) if options.truth else mapped(options.source)
     columns = ("recording", "every", "weights", "turn, deg: median", "translation, m: median", "95 %", "largest")
     print_header([*columns, "best right, %", "any right, %"])

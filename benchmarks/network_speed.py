@@ -3,15 +3,14 @@
     python benchmarks/network_speed.py --threads 1 --sensors vlp-16 hdl-64e
     python benchmarks/network_speed.py --recordings KITTI/sequences/04 vlp16_loop --sensors os1-128 --scans 50
 
-Prints a table of networks, a pair of images of 16 x 720 each: medians over `--repeats`, wall time and processor time. A
+Prints a table of networks, a pair of images of 16 x 720 each: medians of 30 repeats, wall time and processor time. A
 network is timed as it is used: what is kept of the scan before is not computed again. Then a table of stages, a column
 for each recording: processor milliseconds of the odometry's thread, without those of the stages inside, from scan to
-scan through the first `--scans` of the recording. Of `--rounds` passes the shortest time of every scan and stage is
+scan through the first `--scans` of the recording. Of five passes the shortest time of every scan and stage is
 taken, because other work on the machine only adds to it; then the mean over all scans. The sensors' recordings are
 simulated, a car in a street.
 """
 
-import argparse
 import itertools
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from mapping_accuracy import simulate
+from mapping_accuracy import make_parser, simulate
 from mapping_speed import Stopwatch
 
 from lidarslam.core.scan import Scan
@@ -36,12 +35,14 @@ from lidarslam.odometry.methods import learned
 from lidarslam.odometry.network import candidates
 from lidarslam.odometry.network.candidates import Described, Search
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
-from lidarslam.odometry.network.exported import onnx_search, read_exported
+from lidarslam.odometry.network.exported import load_exported
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.registry import default_weights, make_odometry, shipped_folder
 from lidarslam.pipeline.threads import in_order
 
 SCANS = 12
+# Of the comparison of a pair, and passes through a recording.
+_REPEATS, _ROUNDS = 30, 5
 # The first scan is not compared with any, and the second without a motion before.
 _WARM_UP = 2
 
@@ -67,16 +68,13 @@ _GRAPHS = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--sensors", nargs="+", default=["vlp-16", "hdl-64e"], help="simulated")
     parser.add_argument("--recordings", nargs="+", type=Path, default=[])
     parser.add_argument("--scans", type=int, default=SCANS)
-    parser.add_argument("--rounds", type=int, default=5)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     torch.set_num_threads(options.threads)
     recordings = {sensor: list(simulate("street", "car", sensor, options.scans, 0).scans) for sensor in options.sensors}
     imager = Imager(ImageConfig())
@@ -86,13 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     slowest = None
     for label, search, parameters in _networks(options.threads):
         before = search.describe(pair[0].points, pair[0].normals)
-        wall, cpu = _timed(_comparison(search, before, pair[1]), options.repeats)
+        wall, cpu = _timed(_comparison(search, before, pair[1]))
         slowest = slowest or wall
         print(f"| {label} | {parameters:,} | {wall:.1f} | {cpu:.1f} | {slowest / wall:.1f} |", flush=True)
     for source in options.recordings:
         recorded = open_recording(source)
         recordings[recorded.name] = list(itertools.islice(in_order(recorded.scans()), options.scans))
-    _print_stages(recordings, options.threads, options.rounds)
+    _print_stages(recordings, options.threads)
 
 
 def _networks(threads: int) -> list[tuple[str, Search, int]]:
@@ -103,7 +101,7 @@ def _networks(threads: int) -> list[tuple[str, Search, int]]:
     return [
         ("delora, torch", torch_search(delora, threads=threads), sizes[0]),
         ("correlation, torch", torch_search(shipped, threads=threads), sizes[1]),
-        ("correlation, ONNX Runtime", onnx_search(read_exported(shipped_folder()), threads), sizes[1]),
+        ("correlation, ONNX Runtime", load_exported(shipped_folder(), threads)[0], sizes[1]),
     ]
 
 
@@ -111,18 +109,18 @@ def _comparison(search: Search, before: Described, images: SweepImages) -> Calla
     return lambda: search.compare(before, images.points, images.normals)
 
 
-def _print_stages(recordings: dict[str, list[Scan]], threads: int, rounds: int) -> None:
-    found = {name: _stage_times(scans, threads, rounds) for name, scans in recordings.items()}
+def _print_stages(recordings: dict[str, list[Scan]], threads: int) -> None:
+    found = {name: _stage_times(scans, threads) for name, scans in recordings.items()}
     print(f"\n| stage, ms | {' | '.join(recordings)} |\n| --- |{' ---: |' * len(recordings)}")
     for stage in (*_STAGES, "rest"):
         print(f"| {stage} | {' | '.join(f'{times.get(stage, 0.0):.2f}' for times in found.values())} |")
     print(f"| all of the odometry | {' | '.join(f'{sum(times.values()):.2f}' for times in found.values())} |")
 
 
-def _stage_times(scans: Sequence[Scan], threads: int, rounds: int) -> dict[str, float]:
+def _stage_times(scans: Sequence[Scan], threads: int) -> dict[str, float]:
     """Milliseconds a scan of each stage."""
     passes = []
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         odometry = make_odometry(OdometryConfig(method="learned", learned=LearnedConfig(threads=threads)))
         watch = Stopwatch()
         with ExitStack() as stack:
@@ -144,10 +142,10 @@ def _stage_times(scans: Sequence[Scan], threads: int, rounds: int) -> dict[str, 
     }
 
 
-def _timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+def _timed(work: Callable[[], object]) -> tuple[float, float]:
     """Median wall and processor milliseconds, after two rounds that do not count."""
     walls, cpus = [], []
-    for _ in range(repeats + 2):
+    for _ in range(_REPEATS + 2):
         wall, cpu = time.perf_counter(), time.process_time()
         work()
         walls.append(1e3 * (time.perf_counter() - wall))

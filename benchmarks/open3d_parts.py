@@ -20,7 +20,6 @@ later keyframe of a pair revisits the place of the earlier. Milliseconds are of 
 - neighbours: one half of that map's points in the other: distances to the nearest, and all within 0.3 m.
 """
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,9 +27,19 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import open3d_methods as theirs
-from keyframe_pairs import Keyframes, recorded, simulated
-from mapping_accuracy import make_simulation, print_row
-from open3d_poses import Calls, Rows, alignment_rows, refinement_rows, registration_rows, relocalisation_rows, timed
+from mapping_accuracy import make_parser, make_simulation, print_row
+from open3d_poses import (
+    Calls,
+    Keyframes,
+    Rows,
+    alignment_rows,
+    recorded,
+    refinement_rows,
+    registration_rows,
+    relocalisation_rows,
+    simulated,
+    timed,
+)
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
@@ -112,31 +121,28 @@ _PARTS = {
 _THINNING = ["points", "cells with a point, %", "ms"]
 
 
-def scans(paths: list[Path], seed: int) -> list[tuple[str, FloatArray]]:
+def scans(paths: list[Path]) -> list[tuple[str, FloatArray]]:
     """Names and points (N, 3) of the first scan of recordings, of a simulated street without any."""
     found = [(path.name, next(iter(open_recording(path).scans())).points) for path in paths]
     sensors = () if paths else ("hdl-64e", "vlp-16")
-    made = [(sensor, make_simulation("street", "car", sensor, 1, seed).scan(0).scan.points) for sensor in sensors]
+    made = [(sensor, make_simulation("street", "car", sensor, 1, 1).scan(0).scan.points) for sensor in sensors]
     return found + made
 
 
 def main() -> None:
-    """Parse the command line and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--parts", nargs="+", choices=[*_PARTS, "thinning"], default=[*_PARTS, "thinning"])
     parser.add_argument("--worlds", nargs="*", choices=list(WORLDS), default=["street", "office"])
     parser.add_argument("--recordings", nargs="*", type=Path, default=[])
     parser.add_argument("--scans", nargs="*", type=Path, default=[], help="recordings whose first scan is thinned")
-    parser.add_argument("--pairs", type=int, default=20, help="of keyframes in a recording, at most")
-    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     o3d.utility.random.seed(0)
     rows: dict[str, list[list[str]]] = {part: [] for part in options.parts}
     if "thinning" in rows:
-        rows["thinning"] = [row for scan in scans(options.scans, options.seed) for row in thinning_rows(*scan)]
-    made = [partial(simulated, world, options.pairs, options.seed) for world in options.worlds]
-    for make in [*made, *(partial(recorded, path, options.pairs) for path in options.recordings)]:
+        rows["thinning"] = [row for scan in scans(options.scans) for row in thinning_rows(*scan)]
+    made = [partial(simulated, world) for world in options.worlds]
+    for make in [*made, *(partial(recorded, path) for path in options.recordings)]:
         keyframes = make()
         for part in (part for part in rows if part != "thinning"):
             rows[part] += _PARTS[part][0](keyframes)

@@ -7,14 +7,11 @@ column says by how many milliseconds the stamps are shifted before the compariso
 instants are right, the least error stands at zero.
 """
 
-import argparse
-import multiprocessing
 import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import in_process, make_parser, make_simulation, print_row
 
 from lidarslam.compare.peers.estimation import PEERS, estimate
 from lidarslam.compare.peers.interface import PeerError
@@ -35,26 +32,24 @@ def run_peer(name: str, scans: Iterable[Scan], imu: ImuSamples | None = None) ->
         PeerError: it is not installed, its process ended early, or it has no usable poses.
     """
     PEERS[name].require(lambda: imu is not None)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(_estimate, name, list(scans), imu).result()
-        except BrokenProcessPool:
-            raise PeerError("its process ended before the last scan") from None
+    try:
+        return in_process(_estimate, name, list(scans), imu)
+    except BrokenProcessPool:
+        raise PeerError("its process ended before the last scan") from None
 
 
 def _estimate(name: str, scans: Sequence[Scan], imu: ImuSamples | None) -> Trajectory:
     return estimate(PEERS[name], scans, imu).trajectory
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS))
     parser.add_argument("--world", default="street")
     parser.add_argument("--motion", default="car")
     parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--scans", type=int, default=100)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     simulation = make_simulation(options.world, options.motion, options.sensor, options.scans, seed=0)
     scans = list(simulation.scans())
     print_row(["peer", *(f"{shift:+d} ms" for shift in SHIFTS_MS)])

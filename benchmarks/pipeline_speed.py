@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_header, print_row
+from mapping_accuracy import in_process, make_parser, make_simulation, print_header, print_row
 from numpy.typing import NDArray
 
 from lidarslam.compare.peers.estimation import PEERS, estimate
@@ -59,9 +59,8 @@ class Times:
     stage_ms: dict[str, list[float]] = field(default_factory=dict)  # of the stages of ours, of single scans
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a table for every recording."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
     parser.add_argument("--methods", nargs="+", default=["learned+map", "constant-velocity+map", "learned+map+graph"])
@@ -69,10 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scans", type=int, default=100)
     parser.add_argument("--warm-up", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--only", nargs=2, metavar=("PEER", "FILE"), help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
-    if options.only is not None:
-        print(json.dumps(_run_peer(options.only[0], Path(options.only[1]), options.warm_up)))
+    options = parser.parse_args()
     for source in options.sources:
         recording = open_recording(source)
         scans = list(in_order(recording.scans(0, options.scans)))
@@ -92,12 +88,11 @@ def _measure(name: str, scans: Sequence[Scan], source: Scans, options: argparse.
     for method in options.methods:  # loops are compiled when they are first called on a machine
         _run_ours(method, scans[:_FEW], 1)
     with tempfile.TemporaryDirectory() as folder:
-        file, warm_up = str(_saved(scans, Path(folder))), str(options.warm_up)
-        kiss_loop = [str(Path(__file__).with_name("kiss_loop.py")), file, warm_up]
-        runs: dict[str, Callable[[], Times]] = {_KISS: partial(_in_process, kiss_loop)}
+        file = _saved(scans, Path(folder))
+        runs: dict[str, Callable[[], Times]] = {_KISS: partial(_run_kiss, file, options.warm_up)}
         runs |= {method: partial(_run_source, method, source, options.warm_up) for method in options.methods}
         for peer in options.peers:
-            runs[peer] = partial(_in_process, [__file__, "--only", peer, file, "--warm-up", warm_up])
+            runs[peer] = partial(in_process, _run_peer, peer, file, options.warm_up)
         rounds = [{method: run() for method, run in runs.items()} for _ in range(options.rounds)]
     points = int(np.mean([len(scan) for scan in scans]))
     print(f"\n{name}: {len(scans)} scans of {points:,} points, {options.rounds} rounds\n")
@@ -160,16 +155,17 @@ def _saved(scans: Sequence[Scan], folder: Path) -> Path:
     return folder / "scans.npz"
 
 
-def _in_process(command: list[str]) -> Times:
-    """A loop in a process of its own, where it has all the cores."""
-    printed = subprocess.run([sys.executable, *command], check=True, capture_output=True, text=True).stdout
+def _run_kiss(file: Path, warm_up: int) -> Times:
+    """KISS-ICP's loop in a process of its own, where it has all the cores."""
+    command = [sys.executable, str(Path(__file__).with_name("kiss_loop.py")), str(file), str(warm_up)]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return Times(**json.loads(printed.splitlines()[-1]))
 
 
-def _run_peer(name: str, file: Path, warm_up: int) -> dict[str, Any]:
+def _run_peer(name: str, file: Path, warm_up: int) -> Times:
     """A peer's registration; its conversion of scans is not timed, and so its processor time is not known."""
     scan_ms = list(estimate(PEERS[name], saved_scans(file)).register_ms.values())[warm_up:]
-    return {"wall": sum(scan_ms) / 1e3, "processor": float("nan"), "scan_ms": scan_ms}
+    return Times(sum(scan_ms) / 1e3, float("nan"), scan_ms)
 
 
 def _clock() -> Timer:

@@ -14,14 +14,13 @@ Prints a Markdown table for each:
 Seconds and milliseconds are of the processor.
 """
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -38,20 +37,17 @@ DRIFT_M, DRIFT_DEG = 0.05, 0.033  # for the root of a metre
 # How the drift of two thousand learned pairs compares with that of registration to the map.
 LOOSER = 5.0
 LOOP_M, LOOP_DEG = 0.1, 0.5
+# Between keyframes on KITTI 00, and false loops there, of the true ones.
+STEP_M, FALSE_PERCENTS = 2.0, (0.0, 10.0, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Keyframes as an odometry saw them, and where they were.
+    """Keyframes as an odometry saw them, and where they were."""
 
-    Attributes:
-        poses, truth: (N, 4, 4).
-        covariances: (N - 1, 6, 6) of the motions from each keyframe to the next.
-    """
-
-    poses: FloatArray
-    truth: FloatArray
-    covariances: FloatArray
+    poses: FloatArray  # (N, 4, 4)
+    truth: FloatArray  # (N, 4, 4)
+    covariances: FloatArray  # (N - 1, 6, 6) of the motions from each keyframe to the next
 
     def chain_edges(self, looser: float | None = None) -> list[RelativePose]:
         """The motions between neighbours; with `looser`, those of a worse odometry beside them."""
@@ -111,17 +107,17 @@ def timed_optimise(
     return optimised, time.process_time() - start
 
 
-def close_kitti(folder: Path, step_m: float, seed: int, false_percents: Sequence[float]) -> None:
+def close_kitti(folder: Path) -> None:
     """KITTI 00 with loops from the truth."""
     estimate, truth = (read_kitti_poses(folder / f"{name}_kitti.txt") for name in ("estimate", "ground_truth"))
-    scans = every(estimate, step_m)
+    scans = every(estimate, STEP_M)
     poses = estimate[scans]
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     scene = Scene(poses, truth[scans], lengths[:, None, None] * covariance(DRIFT_DEG, DRIFT_M))
     pairs = revisits(scene.truth, scans, within_m=4.0, apart_s=30.0)
     print_header(["loops", "false ones", "ATE before", "online", "optimised", "s", "true kept", "false kept"])
-    for percent in false_percents:
-        rng = np.random.default_rng(seed)
+    for percent in FALSE_PERCENTS:
+        rng = np.random.default_rng(0)
         loops = true_loops(scene, pairs, rng)
         lies = false_loops(len(scans), round(percent / 100.0 * len(loops)), rng)
         every_loop = sorted([(e, True) for e in loops] + [(e, False) for e in lies], key=lambda pair: pair[0].second)
@@ -190,9 +186,9 @@ def _ahead(heading: int) -> FloatArray:
     return np.array([np.cos(heading * np.pi / 2), np.sin(heading * np.pi / 2)]).round()
 
 
-def measure_time(keyframes: int, loops: int, seed: int) -> None:
+def measure_time(keyframes: int, loops: int) -> None:
     """The time of a simulated graph's parts."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     scene = drive_round_town(keyframes, rng)
     pairs = revisits(scene.truth, 20 * np.arange(keyframes), within_m=3.0, apart_s=30.0)
     pairs = pairs[np.sort(rng.choice(len(pairs), min(loops, len(pairs)), replace=False))]
@@ -224,19 +220,15 @@ def rms(poses: FloatArray, truth: FloatArray) -> float:
 
 
 def main() -> None:
-    """Parse the command line and print what was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--kitti-00", type=Path, metavar="DIR", help="KISS-ICP's trajectory and the truth")
-    parser.add_argument("--step-m", type=float, default=2.0, help="between keyframes on KITTI 00")
-    parser.add_argument("--false-percent", type=float, nargs="+", default=[0.0, 10.0, 30.0], help="of the true loops")
     parser.add_argument("--keyframes", type=int, default=0, help="of the simulated drive")
     parser.add_argument("--loops", type=int, default=500, help="likewise")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.kitti_00:
-        close_kitti(arguments.kitti_00, arguments.step_m, arguments.seed, arguments.false_percent)
+        close_kitti(arguments.kitti_00)
     if arguments.keyframes:
-        measure_time(arguments.keyframes, arguments.loops, arguments.seed)
+        measure_time(arguments.keyframes, arguments.loops)
 
 
 if __name__ == "__main__":

@@ -108,7 +108,6 @@ def describe(paced: Paced, truth: lidarslam.Trajectory | None, period_s: float) 
 
 
 def main() -> None:
-    """Print a row a method."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--sequence")

@@ -11,11 +11,11 @@ With `--yaws`, our methods start again with the axes turned by each angle: the s
 - worst, median ATE: metres, after SE(3) alignment, over the starts; with ground truth only;
 - worst start: the scan that the worst run starts at, by ATE, or by length where there is no truth;
 - worst length error: of the path's length against the truth's, without truth against KISS-ICP's, in % of the latter or
-  of `--shortest` metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
+  of 10 metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
   whose truth is satellite navigation with errors of several percent over such short runs;
 - lost, degraded: scans, of all runs;
 - ok: runs that end with exit status 0;
-- ok but wrong: of these, the runs whose length is wrong by more than `--wrong-percent`.
+- ok but wrong: of these, the runs whose length is wrong by more than 3 %.
 
 Our methods and KISS-ICP run as `lidarslam run` does, with its exit status; for KISS-ICP that is `--no-mapping`, where
 each scan is held against the one before. Other peers know no status, and are ok when their process comes to its end.
@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from mapping_accuracy import print_header, print_row
+from mapping_accuracy import make_parser, print_header, print_row
 from peers import run_peer
 
 from lidarslam.cli import main as lidarslam
@@ -57,24 +57,20 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 METHODS = (*OPTIONS, *PEERS)
 DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "ct-icp")
 REFERENCE = "KISS-ICP"
+# The least length that errors of it are in % of; a run whose length is wrong by more is wrong.
+SHORTEST_M, WRONG_PERCENT = 10.0, 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Ended:
-    """A run that has ended.
-
-    Attributes:
-        trajectory: None when there is none.
-        lost, degraded: scans; None for a method that knows no status.
-        status: exit status.
-        message: why there is no trajectory.
-    """
+    """A run that has ended."""
 
     trajectory: Trajectory | None
+    # lost, degraded: scans; None for a method that knows no status
     lost: int | None
     degraded: int | None
-    status: int
-    message: str = ""
+    status: int  # exit status
+    message: str = ""  # why there is no trajectory
 
 
 @dataclass(frozen=True)
@@ -127,24 +123,22 @@ def run_other(method: str, recording: Recording, scans: range) -> Ended:
     return Ended(trajectory, None, None, 0)
 
 
-def judge(
-    ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None, shortest_m: float
-) -> Judged:
+def judge(ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None) -> Judged:
     """Hold a run against the truth, and the length of its path against that of another trajectory."""
     trajectory = ended.trajectory
     ate_m = length_error_percent = None
     if trajectory is not None and of_length is not None:
-        length_error_percent = length_error(trajectory, of_length, shortest_m)
+        length_error_percent = length_error(trajectory, of_length)
     if trajectory is not None and truth is not None:
         ate_m = evaluate_trajectory(trajectory, truth).errors.ate_rmse_m
     return Judged(scans.start, len(scans), ate_m, length_error_percent, ended.lost, ended.degraded, ended.status)
 
 
-def length_error(trajectory: Trajectory, reference: Trajectory, shortest_m: float) -> float:
+def length_error(trajectory: Trajectory, reference: Trajectory) -> float:
     """How much longer a path is than the reference's at the same instants, in percent."""
     matched = associate(trajectory, reference)
     true_m = matched.reference.length_m
-    return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, shortest_m)
+    return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, SHORTEST_M)
 
 
 def judged_runs(
@@ -164,7 +158,7 @@ def judged_runs(
             ended = run_ours(method, source, scans, yaw_deg) if is_ours else run_other(method, recording, scans)
             if method == REFERENCE and of_length is None:
                 of_length = ended.trajectory
-            judged = judge(ended, scans, truth, of_length, arguments.shortest)
+            judged = judge(ended, scans, truth, of_length)
             _report(f"{recording.name} step {step} start {scans.start} {method}: {_line(judged)} {ended.message}")
             yield method, judged
 
@@ -177,13 +171,13 @@ def _report(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def row(name: str, method: str, step: int, runs: Sequence[Judged], wrong_percent: float) -> list[str]:
+def row(name: str, method: str, step: int, runs: Sequence[Judged]) -> list[str]:
     """The cells of one method."""
     worst = max(runs, key=lambda run: run.badness)
     ates = [run.ate_m for run in runs if run.ate_m is not None]
     errors = [run.length_error_percent for run in runs if run.length_error_percent is not None]
     ok = [run for run in runs if run.status == 0]
-    wrong = [run for run in ok if run.length_error_percent is None or abs(run.length_error_percent) > wrong_percent]
+    wrong = [run for run in ok if run.length_error_percent is None or abs(run.length_error_percent) > WRONG_PERCENT]
     return [
         name,
         str(step),
@@ -224,26 +218,21 @@ def print_starts(name: str, step: int, runs: dict[str, list[Judged]]) -> None:
     print(flush=True)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the command line, run, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=DEFAULT_METHODS)
     parser.add_argument("--steps", nargs="+", type=int, default=[1], help="take every n-th scan")
     parser.add_argument("--every", type=int, default=10, help="scans from one start to the next")
     parser.add_argument("--scans", type=int, default=50, help="of a run")
     parser.add_argument(
-        "--shortest", type=float, default=10.0, help="metres that an error of length is in %% of at least"
-    )
-    parser.add_argument(
         "--lengths-of", choices=["truth", REFERENCE], default="truth", help="what lengths are held against"
     )
     parser.add_argument(
         "--yaws", nargs="+", type=float, default=[0.0], help="angles by which the axes are turned, degrees"
     )
-    parser.add_argument("--wrong-percent", type=float, default=3.0)
     parser.add_argument("--all", action="store_true", help="every run too")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     rows = []
     logging.basicConfig(stream=sys.stderr, level=logging.ERROR)  # not to the streams of a run, which end with it
     for source in options.sources:
@@ -254,9 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 runs.setdefault(method, []).append(judged)
             if options.all:
                 print_starts(recording.name, step, runs)
-            rows += [
-                row(recording.name, method, step, judged, options.wrong_percent) for method, judged in runs.items()
-            ]
+            rows += [row(recording.name, method, step, judged) for method, judged in runs.items()]
     header = ["recording", "step", "method", "starts", "worst ATE, m", "median ATE, m", "worst start"]
     header += ["worst length error, %", "lost", "degraded", "ok", "ok but wrong"]
     print_header(header)

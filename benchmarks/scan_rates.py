@@ -13,7 +13,6 @@ times the scan interval every n-th scan is taken, each with all its points. `--s
 recordings on disk it is the most that are taken.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,6 +26,7 @@ from mapping_accuracy import (
     add_simulation_arguments,
     errors_of,
     localise,
+    make_parser,
     print_header,
     print_row,
     recordings,
@@ -36,7 +36,6 @@ from peers import NAMES, run_peer
 
 from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.geometry import rotation_angle
-from lidarslam.simulation.world import WORLDS
 
 
 def every_nth(recorded: Recorded, step: int) -> Recorded:
@@ -68,16 +67,13 @@ def row(recorded: Recorded, step: int, methods: Sequence[str]) -> list[str]:
     return cells
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--steps", nargs="+", type=int, default=[1, 2, 3, 5], help="times the scan interval")
     parser.add_argument("--methods", nargs="+", choices=[*METHODS, *NAMES], default=[*DEFAULT_METHODS, "ct-icp"])
-    options = parser.parse_args(arguments)
-    if not options.sources and not options.worlds:
-        options.worlds = list(WORLDS)
+    options = parser.parse_args()
     print_header(["recording", "step", "scans", "moved, m", "turned, deg", *options.methods])
     for recorded in recordings(options, options.scans):
         for step in options.steps:

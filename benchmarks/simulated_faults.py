@@ -32,19 +32,12 @@ _BEYOND_M = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Faulty:
-    """A recording with a fault in it.
+    """A recording with a fault in it."""
 
-    Attributes:
-        scans: N of them, stamps increasing.
-        truth: T_world_lidar at their stamps.
-        concerned: (N,) the scans that the fault shows in; none where it lies between two scans.
-        after: the first scan for which all is well again.
-    """
-
-    scans: tuple[Scan, ...]
-    truth: Trajectory
-    concerned: NDArray[np.bool_]
-    after: int
+    scans: tuple[Scan, ...]  # N of them, stamps increasing
+    truth: Trajectory  # T_world_lidar at their stamps
+    concerned: NDArray[np.bool_]  # (N,) the scans that the fault shows in; none where it lies between two scans
+    after: int  # the first scan for which all is well again
 
 
 def covered(simulation: Simulation, start: int, stop: int, cover: Cover, seed: int = 0) -> Faulty:

@@ -6,27 +6,21 @@ Prints a Markdown table: ATE in metres after SE(3) alignment, and the length of 
 the scans go from the simulator through memory into the pipeline of `lidarslam run`.
 """
 
-import argparse
-
-from mapping_accuracy import add_simulation_arguments, print_header, print_row, run_kiss, simulate
+from mapping_accuracy import add_simulation_arguments, make_parser, print_header, print_row, run_kiss, simulate
 
 from lidarslam.odometry.config import KissConfig
 from lidarslam.simulation.world import WORLDS
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     add_simulation_arguments(parser, worlds=list(WORLDS))
     arguments = parser.parse_args()
     print_header(["world", *arguments.motions])
     for world in arguments.worlds:
-        cells = []
-        for motion in arguments.motions:
-            simulation = simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)
-            outcome = run_kiss(simulation, KissConfig())
-            cells.append(f"{outcome.ate_m:.2f} ({outcome.length_m:.0f} m)")
-        print_row([world, *cells])
+        chosen = [(world, motion, arguments.sensor, arguments.scans, arguments.seed) for motion in arguments.motions]
+        outcomes = [run_kiss(simulate(*one), KissConfig()) for one in chosen]
+        print_row([world, *(f"{outcome.ate_m:.2f} ({outcome.length_m:.0f} m)" for outcome in outcomes)])
 
 
 if __name__ == "__main__":

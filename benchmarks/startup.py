@@ -90,7 +90,6 @@ def measure(program: str, source: Path, sequence: str | None, compiled: str) -> 
 
 
 def main() -> None:
-    """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path)
     parser.add_argument("--sequence")

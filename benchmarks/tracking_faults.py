@@ -9,7 +9,7 @@ that errors are those of the poses as they come, without any alignment:
 
 - concerned: of the scans that the fault shows in, how many are reported lost and degraded;
 - elsewhere: of all others, the same;
-- believed and wrong: scans with status ok whose position is off by more than `--wrong-m`;
+- believed and wrong: scans with status ok whose position is off by more than 0.2 m;
 - worst, after: the largest error of the scans from ten after the end of the fault, whatever their status;
 - shape, after: RMS error of the same scans, after SE(3) alignment of them alone;
 - polluted: share of the points of the map farther than 0.2 m from every true surface, when the map is laid on the truth
@@ -19,10 +19,11 @@ that errors are those of the poses as they come, without any alignment:
 
 import argparse
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mapping_accuracy import DEFAULT_METHODS, METHODS, make_simulation, print_header, print_row
+from mapping_accuracy import DEFAULT_METHODS, METHODS, make_parser, make_simulation, print_header, print_row
 from simulated_faults import (
     Cover,
     Faulty,
@@ -53,7 +54,7 @@ from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 
-_POLLUTED_M = 0.2
+_POLLUTED_M, _WRONG_M = 0.2, 0.2
 # The first scans after a fault may still be on their way back.
 _BACK_AFTER = 10
 
@@ -76,10 +77,10 @@ class Case:
     distances: Callable[[FloatArray], FloatArray]
 
 
-def on_the_way(place: str, kind: str, seed: int) -> Iterator[Case]:
+def on_the_way(place: str, kind: str) -> Iterator[Case]:
     """Faults of a kind that befall a sensor on its way through a world."""
     world, sensor, carrier, scans, at = _PLACES[place]
-    simulation = make_simulation(world, carrier, sensor, scans, seed)
+    simulation = make_simulation(world, carrier, sensor, scans, 0)
     name = f"{world}, {sensor}, {carrier}"
     for fault, recorded in _FAULTS[kind](simulation, at):
         yield Case(fault, name, recorded, simulation.distance_to_surfaces)
@@ -115,13 +116,13 @@ _FAULTS: dict[str, Callable[[Simulation, int], Iterator[tuple[str, Faulty]]]] = 
 }
 
 
-def _still(place: str, seed: int, scans: int, crowded: bool) -> Case:
+def _still(place: str, scans: int, crowded: bool) -> Case:
     """Standing where the carrier begins; crowded by vehicles outdoors and by people indoors."""
     world_name, sensor, carrier, _, _ = _PLACES[place]
-    moving = make_simulation(world_name, carrier, sensor, 1, seed)
+    moving = make_simulation(world_name, carrier, sensor, 1, 0)
     T_world_body = moving.motion.pose_at(np.zeros(1))[0]
     yaw = float(np.arctan2(T_world_body[1, 0], T_world_body[0, 0]))
-    world = build_world(world_name, seed)
+    world = build_world(world_name, 0)
     if crowded:
         outdoors = world_name in ("street", "park")
         size = np.array([9.0, 2.5, 3.4] if outdoors else [0.4, 0.6, 1.8])
@@ -130,23 +131,23 @@ def _still(place: str, seed: int, scans: int, crowded: bool) -> Case:
         world = replace(world, movers=(*world.movers, *movers))
     motion = standing_still(T_world_body[:3, 3], yaw, moving.motion.sensor_height_m)
     mount = mount_pose("upright", motion.sensor_height_m)
-    simulation = Simulation(world, find_sensor(sensor), motion, mount, scans, seed)
+    simulation = Simulation(world, find_sensor(sensor), motion, mount, scans, 0)
     shown = np.full(scans, crowded)
     recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, shown, 0)
     fault = f"standing still for {scans} scans" + (" amid traffic" if crowded else "")
     return Case(fault, f"{world_name}, {sensor}", recorded, simulation.distance_to_surfaces)
 
 
-def _featureless(kind: str, seed: int) -> Case:
+def _featureless(kind: str) -> Case:
     """From structure through nothing to structure."""
     begin_m, end_m, length_m = 20.0, 95.0, 120.0
-    world = (even_tunnel if kind == "tunnel" else open_plain)(begin_m, end_m, length_m, seed)
+    world = (even_tunnel if kind == "tunnel" else open_plain)(begin_m, end_m, length_m)
     motion = motion_along(straight_drive(length_m, 5.0, 1.5))
     sensor = find_sensor("vlp-16")
     reach_m = 25.0  # dust, or dark walls: no end in view
     sensor = replace(sensor, ranging=replace(sensor.ranging, max_range_m=reach_m))
     scans = int((motion.duration_s - 0.2) * sensor.rate_hz)
-    simulation = Simulation(world, sensor, motion, mount_pose("upright", 0.0), scans, seed)
+    simulation = Simulation(world, sensor, motion, mount_pose("upright", 0.0), scans, 0)
     x = simulation.ground_truth.positions[:, 0]
     nothing = (x > begin_m + reach_m) & (x < end_m - reach_m)
     after = int(np.flatnonzero(x > end_m)[0])
@@ -156,12 +157,9 @@ def _featureless(kind: str, seed: int) -> Case:
 
 def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
     """A recording through the pipeline: the results, and the points (M, 3) of the map."""
-    odometry = open_odometry(config, None)
-    try:
+    with closing(open_odometry(config, None)) as odometry:
         pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
         results = list(pipeline.run(case.recorded.scans))
-    finally:
-        odometry.close()
     if pipeline.map.global_map is None:
         return results, np.empty((0, 3))
     points = pipeline.map.global_map.points()
@@ -169,7 +167,7 @@ def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
     return results, points[~seen_through(points, views, pipeline.map.global_map.voxel_size_m)]
 
 
-def row(case: Case, name: str, wrong_m: float, keep_moved: bool) -> list[str]:
+def row(case: Case, name: str, keep_moved: bool) -> list[str]:
     """The cells of one method on one recording."""
     kept = GlobalMapConfig(leave_out_moved=not keep_moved)
     results, points = run(case, METHODS[name].model_copy(update={"global_map": kept}))
@@ -184,7 +182,7 @@ def row(case: Case, name: str, wrong_m: float, keep_moved: bool) -> list[str]:
     shape = evaluate_trajectory(estimate, Trajectory(truth_stamps, truth[after])).errors.ate_rmse_m
     polluted = case.distances(transform_points(truth[0], points)) > _POLLUTED_M
     there, elsewhere = status[recorded.concerned], status[~recorded.concerned]
-    believed = (status == Status.OK.value) & (distance > wrong_m)
+    believed = (status == Status.OK.value) & (distance > _WRONG_M)
     return [
         case.fault,
         case.place,
@@ -207,24 +205,21 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
     """What is asked for, one recording in memory at a time."""
     for kind in arguments.faults:
         if kind == "featureless":
-            yield from (_featureless(place, arguments.seed) for place in ("tunnel", "plain"))
+            yield from map(_featureless, ("tunnel", "plain"))
             continue
         for place in arguments.places:
             if kind in ("traffic", "still"):
-                yield _still(place, arguments.seed, 200, kind == "traffic")
+                yield _still(place, 200, kind == "traffic")
             else:
-                yield from on_the_way(place, kind, arguments.seed)
+                yield from on_the_way(place, kind)
 
 
 def main() -> None:
-    """Parse the command line and print the table, row by row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     kinds = [*_FAULTS, "traffic", "still", "featureless"]
     parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=["office", "tunnel", "street"])
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=DEFAULT_METHODS)
-    parser.add_argument("--wrong-m", type=float, default=0.2)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep-moved", action="store_true", help="what was seen through stays in the map")
     arguments = parser.parse_args()
     header = ["fault", "place", "method", "concerned", "elsewhere", "believed and wrong", "worst, after"]
@@ -232,7 +227,7 @@ def main() -> None:
     print_header(header)
     for case in cases(arguments):
         for method in arguments.methods:
-            print_row(row(case, method, arguments.wrong_m, arguments.keep_moved))
+            print_row(row(case, method, arguments.keep_moved))
 
 
 if __name__ == "__main__":

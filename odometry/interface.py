@@ -62,12 +62,16 @@ class SkippingOdometry(Odometry, Protocol):
         """Take a scan with points whose motion is not asked for; the next motion is relative to this scan."""
 
 
-class ConstantVelocity(Stateful):
+class StatefulOdometry(Stateful):
+    """The part of an `Odometry` that saves its state and holds no resources."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class ConstantVelocity(StatefulOdometry):
     """Measures nothing; implements `Odometry`."""
 
     def estimate(self, scan: Scan) -> Motion:  # noqa: ARG002
         """No motion, not measured."""
         return Motion(np.eye(4), points_used=0, failure="constant velocity measures nothing")
-
-    def close(self) -> None:
-        """Nothing is held."""

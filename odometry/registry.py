@@ -85,10 +85,10 @@ def _make_learned(config: LearnedConfig) -> Odometry:
     from lidarslam.odometry.methods.learned import LearnedOdometry
 
     if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
-        from lidarslam.odometry.network.exported import onnx_search, read_exported
+        from lidarslam.odometry.network.exported import load_exported
 
-        exported = read_exported(config.weights or shipped_folder())
-        return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config.alignment)
+        search, images = load_exported(config.weights or shipped_folder(), config.threads)
+        return LearnedOdometry(search, images, config.alignment)
     require_train_extra(f"odometry.learned.device={config.device}" if config.device != "cpu" else "a file of weights")
     from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 

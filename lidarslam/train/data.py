@@ -188,9 +188,7 @@ def prepared(
 ) -> list[PreparedRecording]:
     """The stretches prepared for training, from the cache where they are in it already.
 
-    Raises:
-        InputError: a recording is unreadable.
-        OutputError: the cache cannot be written.
+    InputError where a recording is unreadable, OutputError where the cache cannot be written.
     """
     return [prepared_piece(piece, config, cache, count) for stretch in stretches for piece in stretch.pieces()]
 
@@ -251,10 +249,8 @@ def _digest(value: Any) -> str:
 def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, where: Where) -> None:
     """Prepare the stretches into the cache, where they are not in it already.
 
-    Raises:
-        InputError: a recording is unreadable.
-        OutputError: the cache cannot be written, or is another folder on the nodes of a cluster.
-        KeyboardInterrupt: Ctrl-C; finished recordings stay in the cache.
+    InputError where a recording is unreadable, OutputError where the cache cannot be written, or is another folder on
+    the nodes of a cluster. After Ctrl-C, finished recordings stay in the cache.
     """
     pieces = [piece for stretch in stretches for piece in stretch.pieces()]
     wanted = [piece for piece in pieces if not file_of(piece, config, cache).is_file()]

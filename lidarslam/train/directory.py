@@ -37,9 +37,8 @@ RESULTS = (CONFIG, WEIGHTS, LAST_WEIGHTS, STATE, LOSSES, VALIDATION, CURVES)
 def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
     """The files of a training in the directory, if it may be resumed or replaced.
 
-    Raises:
-        OutputError: it holds a training and neither is asked for, holds other files of these names, or there is none
-            to resume.
+    OutputError where it holds a training and neither is asked for, holds other files of these names, or there is none
+    to resume.
     """
     present = [name for name in RESULTS if (path / name).exists()]
     listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"

@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, load_model
+from lidarslam.config.settings import load_model
 from lidarslam.core.settings import Settings
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.odometry.config import SimulatedConfig, TrainingConfig
@@ -33,8 +32,3 @@ def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) ->
     ConfigError where the file is not readable YAML, a key does not exist, or a value does not fit.
     """
     return load_model(TrainConfig, path, settings, "training.batch=8")
-
-
-def dump_train_yaml(config: TrainConfig, trained_on: dict[str, Any]) -> str:
-    """The configuration as YAML, after the section that names the recordings."""
-    return dump_yaml(config, trained_on, SOURCES_SECTION)

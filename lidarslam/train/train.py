@@ -15,7 +15,7 @@ import torch
 from torch import Generator, Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from lidarslam.config.settings import SOURCES_SECTION, read_yaml, reader_settings
+from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, read_yaml, reader_settings
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer, remove_partial_files, require_no_link
 from lidarslam.core.tasks import SERIAL, Where
@@ -38,7 +38,7 @@ from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import data
 from lidarslam.train import directory as files
-from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
+from lidarslam.train.settings import LOSSES, TrainConfig, load_train_config
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
@@ -288,7 +288,7 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
             if devices.is_first:
                 remove_partial_files(request.out)  # of a training that was killed
                 files.remove_results(request.out, [] if request.resume else earlier)
-                RunDirectory(request.out).write_text(files.CONFIG, dump_train_yaml(config, about))
+                RunDirectory(request.out).write_text(files.CONFIG, dump_yaml(config, about, SOURCES_SECTION))
                 say(_summary(recordings, stretches, devices))
             loop, progress = _loop(request, config.training, start, devices, about, say)
             if progress.step and devices.is_first:

@@ -93,14 +93,12 @@ class Alignment:
     # independently by 1 m about their planes; the change of velocity is marginalised
     information: FloatArray
     prior_information: FloatArray  # (6, 6) of the initial estimate, along the directions in which it counts
-    inlier_share: float  # of the points with a normal
     # ratio of the information of inliers to that of all points in view, along the direction of translation where it is
     # least. Most of a street looks the same a metre on, and a wrong motion has many inliers; the points that constrain
     # the motion are not among them. 1 where no point constrains it.
     explained: float
     weakest: FloatArray  # (3,) that direction, unit, in the previous frame
-    residual_m: float  # root mean square of the inliers
-    inliers: int  # their number
+    inliers: int  # number of points
 
 
 def align(start: InitialEstimate, sweeps: SweepPair, effort: Effort = NORMAL) -> Alignment:
@@ -138,11 +136,9 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
         velocity_change=0.5 * (motion.late - motion.early),
         information=_marginal(fit.H, 1.0),
         prior_information=information,
-        inlier_share=fit.inlier_share,
         # Points that leave the other image's view do not count, unless they are most of the scan.
         explained=explained * min(fit.share_in_view / _MOSTLY_IN_VIEW, 1.0),
         weakest=weakest,
-        residual_m=float(np.sqrt(fit.squared_residuals / max(fit.inliers, 1))),
         inliers=fit.inliers,
     )
 

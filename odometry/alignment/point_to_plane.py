@@ -190,7 +190,6 @@ def _sum_up(
     change of velocity (t + t') times as it does with the motion.
 
     Args:
-        points, count, planes, motion: see above.
         scale_m: of the residuals.
         is_robust: all inliers, with Geman and McClure's weights; else those within twice the scale, unweighted.
         total: (13, 13), zero, written: H (12, 12) and, in the last column, g (12,) and the sum of squared residuals.
@@ -293,11 +292,8 @@ class InlierSums:
     # in_view, inlier: (3, 3) of the squares of normals in the previous frame: of all points in view, and of inliers
     in_view: FloatArray
     inlier: FloatArray
-    # share_in_view, inlier_share: of the points with a normal
-    share_in_view: float
-    inlier_share: float
+    share_in_view: float  # of the points with a normal
     inliers: int  # their number
-    squared_residuals: float  # their sum
 
 
 class PointToPlane:
@@ -320,8 +316,7 @@ class PointToPlane:
         """The inliers of a motion."""
         total, in_view, inlier = np.zeros((13, 13)), np.zeros((3, 3)), np.zeros((3, 3))
         seen, count = _sum_up(self._points, self._count, self._planes, motion, FINE_M, False, total, in_view, inlier)
-        points = max(self._count, 1)
-        return InlierSums(total[:12, :12], in_view, inlier, seen / points, count / points, count, float(total[12, 12]))
+        return InlierSums(total[:12, :12], in_view, inlier, seen / max(self._count, 1), count)
 
 
 def _points(images: SweepImages, column_step: int) -> tuple[Floats, int]:

@@ -25,7 +25,6 @@ def take_step(
     """Move T_prev_curr (4, 4), from the left, and the innovation (6,) by one Gauss-Newton step, in place.
 
     Args:
-        T, innovation: see above.
         H, g: (12, 12) and (12,) normal equations of the images, as information; overwritten.
         T_curr_prev, information: (4, 4) inverse of the prior's motion and (6, 6) of a change from it.
         expected: (6, 6) information of the innovation being zero.

@@ -7,9 +7,9 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import TRANSFORM, Stateful
+from lidarslam.core.state import TRANSFORM
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.interface import Motion, StatefulOdometry
 
 # A gap is never shorter than this, nor than this many of the trajectory's usual steps.
 _LEAST_GAP_S = 1.0
@@ -18,7 +18,7 @@ _LEAST_GAP_STEPS = 5.0
 _SAME_INSTANT_S = 1e-3
 
 
-class ExternalOdometry(Stateful):
+class ExternalOdometry(StatefulOdometry):
     """Motions of a given trajectory T_odom_lidar, interpolated at the scans' stamps.
 
     A scan is extrapolated over `tolerance_s` at most, and not covered in a gap between two poses of more than a second,
@@ -79,6 +79,3 @@ class ExternalOdometry(Stateful):
                 f"it has no pose from {start:.6f} to {end:.6f},"
                 f" and at most {self._largest_interval_s:.3g} s are bridged"
             )
-
-    def close(self) -> None:
-        """Nothing is held."""

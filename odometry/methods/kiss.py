@@ -86,7 +86,8 @@ class KissOdometry:
 
     def estimate(self, scan: Scan) -> Motion:
         """Register one scan; one that KISS-ICP cannot take gives a prediction by the last velocity, and the reason."""
-        count = self._points_in_range(scan)
+        ranges = np.linalg.norm(scan.points, axis=1)
+        count = int(((ranges > self._config.min_range_m) & (ranges < self._config.max_range_m)).sum())
         if count < _MIN_POINTS:
             return self._predict(scan.stamp, f"{count} points from min_range_m to max_range_m are too few to register")
         offsets = self._usable_offsets(scan)
@@ -115,10 +116,6 @@ class KissOdometry:
         if self._worker is not None:
             self._worker.close()
             self._worker = None
-
-    def _points_in_range(self, scan: Scan) -> int:
-        ranges = np.linalg.norm(scan.points, axis=1)
-        return int(((ranges > self._config.min_range_m) & (ranges < self._config.max_range_m)).sum())
 
     def _usable_offsets(self, scan: Scan) -> FloatArray:
         """The scan's times if the library can divide by their span, else none (it then does not deskew)."""

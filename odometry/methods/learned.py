@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state import Shape
 from lidarslam.odometry.alignment.alignment import (
     INFORMATION_PER_M2,
     InitialEstimate,
@@ -26,7 +26,7 @@ from lidarslam.odometry.alignment.alignment import (
 from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepPair
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.sweep_images import Imager, ScanImages
-from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.interface import Motion, StatefulOdometry
 from lidarslam.odometry.network.candidates import Candidate, Described, Search
 
 # Below this the scan does not fit the last one: see `Alignment.explained`, and inliers.
@@ -58,7 +58,7 @@ class _Sweep:
     middle: float
 
 
-class LearnedOdometry(Stateful):
+class LearnedOdometry(StatefulOdometry):
     """Motions between consecutive scans by the candidates of a trained network, whose images have the size `images`.
 
     Not aligned, the first candidate is the motion as it is.
@@ -130,9 +130,6 @@ class LearnedOdometry(Stateful):
         first, used = candidates[0], shown.with_normal()
         return self._motion(first.T_prev_curr, first.covariance, np.zeros(6), last, sweep, used)
 
-    def close(self) -> None:
-        """Nothing is held."""
-
     def _refined(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep) -> Motion:
         """The candidates, or the motion before, refined by alignment."""
         interval_s = sweep.middle - last.middle
@@ -140,19 +137,18 @@ class LearnedOdometry(Stateful):
         sweeps = SweepPair(sweep.images.alignment, last.images.alignment, interval_s, previous)
         starts = [_initial_estimate(candidate, candidates[0]) for candidate in candidates]
         if previous is not None:
-            starts.append(InitialEstimate(exp(previous.velocity * interval_s), sigmas=_SIGMAS_OF_GOING_ON))
+            expected = exp(previous.velocity * interval_s)
+            starts.append(InitialEstimate(expected, sigmas=_SIGMAS_OF_GOING_ON))
         best = align_best(starts, sweeps)
         degeneracy = find_degeneracy(best.information, best.inliers, sweep.images.alignment)
-        if len(degeneracy) and previous is not None and self._last_covariance is not None:
-            expected = exp(previous.velocity * interval_s)
-            scale = (interval_s / previous.interval_s) ** 2
-            covariance = scale * self._last_covariance + np.diag((_ACCELERATION * interval_s**2) ** 2)
-            held = _HELD * degeneracy.projector()
-            start = replaced_along(best.T_prev_curr, expected, degeneracy)
-            best = align(InitialEstimate(start, held, held), sweeps)
-            information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
-        elif len(degeneracy):
+        if len(degeneracy):
             covariance = candidates[0].covariance
+            if previous is not None and self._last_covariance is not None:
+                scale = (interval_s / previous.interval_s) ** 2
+                covariance = scale * self._last_covariance + np.diag((_ACCELERATION * interval_s**2) ** 2)
+                held = _HELD * degeneracy.projector()
+                start = replaced_along(best.T_prev_curr, expected, degeneracy)
+                best = align(InitialEstimate(start, held, held), sweeps)
             information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
         else:
             information = INFORMATION_PER_M2 * best.information + best.prior_information

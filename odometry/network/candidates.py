@@ -134,13 +134,10 @@ class CorrelationSearch:
 
 
 class WholePairs:
-    """The search with a network without parts, whose one motion is the only candidate; implements `Search`.
-
-    Args:
-        network: points and normals (1, 6, H, W) of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
-    """
+    """The search with a network without parts, whose one motion is the only candidate; implements `Search`."""
 
     def __init__(self, network: Graph) -> None:
+        # Points and normals (1, 6, H, W) of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
         self._network = network
 
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:

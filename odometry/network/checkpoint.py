@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.json_text import ANY_OBJECT, parse_json
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
@@ -58,8 +58,7 @@ def write_tensor_file(path: Path, kind: Kind, tensors: Mapping[str, Tensor], con
         with replacing(path) as partial:
             save_file(plain, partial, metadata=header)
     except (OSError, SafetensorError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise OutputError(f"{path}: cannot be written ({reason})") from error
+        raise cannot_write(path, error) from error
 
 
 def read_tensor_file(path: Path, kind: Kind) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +22,6 @@ _HEADER = {"kind": "a network exported by lidarslam", "version": 2}
 _FATAL_ERRORS_ONLY = 4
 
 
-@dataclass(frozen=True)
-class Exported:
-    """A folder that `lidarslam export` wrote, the network in it, and the size of its images."""
-
-    folder: Path
-    network: NetworkConfig
-    images: ImageConfig
-
-
 def describe(network: NetworkConfig, images: ImageConfig) -> dict[str, Any]:
     """The description stored with weights or graphs; values that JSON can hold."""
     return _HEADER | {"network": network.model_dump(mode="json"), "images": images.model_dump(mode="json")}
@@ -46,8 +36,11 @@ def read_description(content: dict[str, Any]) -> tuple[NetworkConfig, ImageConfi
         raise ValueError("its description of the network is damaged, or of another version") from error
 
 
-def read_exported(folder: Path) -> Exported:
-    """The network in a folder; InputError where it holds no exported network, or one of another version."""
+def load_exported(folder: Path, threads: int) -> tuple[Search, ImageConfig]:
+    """The search with a network that `lidarslam export` wrote, on `threads` for each graph, and the size of its images.
+
+    InputError where the folder holds no exported network, or one of another version, or a graph cannot be used.
+    """
     try:
         content = read_json(folder / DESCRIPTION, ANY_OBJECT)
         if {key: content[key] for key in _HEADER} != _HEADER:
@@ -58,18 +51,10 @@ def read_exported(folder: Path) -> Exported:
             f"{folder}: {DESCRIPTION} is missing or damaged ({error}); name a file of weights, or make the folder with"
             " `lidarslam export`"
         ) from error
-    return Exported(folder, network, images)
-
-
-def onnx_search(exported: Exported, threads: int) -> Search:
-    """The search for candidates with an exported network, with `threads` threads for each graph.
-
-    InputError where a graph is missing or cannot be used.
-    """
-    if exported.network.name != "correlation":
-        return WholePairs(_graph(exported.folder / PAIR, threads))
-    parts = (_graph(exported.folder / name, threads) for name in (COLUMNS, TURNS, BIRD, PEAKS))
-    return CorrelationSearch(CorrelationParts(*parts))
+    if network.name != "correlation":
+        return WholePairs(_graph(folder / PAIR, threads)), images
+    parts = (_graph(folder / name, threads) for name in (COLUMNS, TURNS, BIRD, PEAKS))
+    return CorrelationSearch(CorrelationParts(*parts)), images
 
 
 def _graph(path: Path, threads: int) -> Graph:

@@ -8,9 +8,8 @@ whatever their size. A small head estimates standard deviations from the shape o
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -328,9 +327,13 @@ class DeloraNetwork(nn.Module):
         self.stages = nn.Sequential(*stages)
         self.pool = nn.AdaptiveAvgPool2d(1)
         self.trunk = nn.Sequential(nn.Linear(channels_in, _FEATURES), nn.Tanh())
-        self.rotation = _head(4)
-        self.translation = _head(3)
-        _initialise(self)
+        self.rotation = _head([1.0, 0.0, 0.0, 0.0])
+        self.translation = _head([0.0, 0.0, 0.0])
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                # The gain of relu for tanh as well, as ResNets have it: without normalisation a smaller one makes
+                # signals vanish.
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, pairs: PairImages) -> PairEstimate:
         """The motions of B pairs, with constant standard deviations."""
@@ -370,23 +373,10 @@ def _convolution(channels_in: int, channels_out: int, stride: tuple[int, int] = 
     return _around(nn.Conv2d(channels_in, channels_out, 3, stride, padding=(1, 0), bias=False))
 
 
-def _head(outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(_FEATURES, _HEAD_FEATURES), nn.Tanh(), nn.Linear(_HEAD_FEATURES, outputs))
-
-
 @torch.no_grad()
-def _initialise(network: DeloraNetwork) -> None:
-    """Kaiming's normal weights by fan-out for the convolutions, and a first answer close to the identity."""
-    # The gain of relu for tanh as well, as ResNets have it: without normalisation a smaller one makes signals vanish.
-    draw = partial(nn.init.kaiming_normal_, mode="fan_out", nonlinearity="relu")
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            draw(module.weight)
-    for head in (network.rotation, network.translation):
-        last = head[-1]
-        assert isinstance(last, nn.Linear)
-        last.weight.mul_(_LAST_LAYER_GAIN)
-        nn.init.zeros_(last.bias)
-    quaternion = network.rotation[-1]
-    assert isinstance(quaternion, nn.Linear)
-    quaternion.bias[0] = 1.0
+def _head(answer: Sequence[float]) -> nn.Sequential:
+    """Two layers whose first answers are close to the given one."""
+    hidden, last = nn.Linear(_FEATURES, _HEAD_FEATURES), nn.Linear(_HEAD_FEATURES, len(answer))
+    last.weight.mul_(_LAST_LAYER_GAIN)
+    last.bias.copy_(torch.tensor(answer))
+    return nn.Sequential(hidden, nn.Tanh(), last)

@@ -281,18 +281,11 @@ def validate(
                 T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
                 errors.append(motion_error(T_prev_curr[None], label[None]))
                 sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
-    return summarise(torch.cat(errors), torch.cat(sigmas))
-
-
-def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
-    """Statistics of errors (N, 6) with standard deviations (N, 6)."""
-    if not len(errors):
-        return Validation(math.nan, math.nan, math.nan, math.nan, (math.nan, math.nan, math.nan), 0)
-    rotation = torch.rad2deg(errors[:, :3].norm(dim=1))
-    translation = errors[:, 3:].norm(dim=1)
-    covered = [100.0 * float((errors.abs() <= k * sigmas).float().mean()) for k in (1, 2, 3)]
+    error, sigma = torch.cat(errors), torch.cat(sigmas)  # (N, 6)
+    rotation, translation = torch.rad2deg(error[:, :3].norm(dim=1)), error[:, 3:].norm(dim=1)
+    covered = [100.0 * float((error.abs() <= k * sigma).float().mean()) for k in (1, 2, 3)]
     return Validation(
         float(rotation.square().mean().sqrt()), float(translation.square().mean().sqrt()),
         float(rotation.median()), float(translation.median()),
-        (covered[0], covered[1], covered[2]), len(errors),
+        (covered[0], covered[1], covered[2]), len(error),
     )  # fmt: skip

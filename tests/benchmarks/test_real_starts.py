@@ -40,27 +40,27 @@ def test_a_short_recording_has_one_run() -> None:
 
 
 def test_a_path_that_is_too_long_is_so_in_percent_of_the_true_one() -> None:
-    assert length_error(_straight(5.5), _straight(5.0), shortest_m=1.0) == pytest.approx(10.0)
+    assert length_error(_straight(55.0), _straight(50.0)) == pytest.approx(10.0)
 
 
 def test_a_sensor_that_stands_is_judged_by_the_shortest_length() -> None:
-    assert length_error(_straight(0.5), _straight(0.0), shortest_m=10.0) == pytest.approx(10.0)
+    assert length_error(_straight(0.5), _straight(0.0)) == pytest.approx(10.0)
 
 
 def test_without_truth_there_is_no_ate_but_a_length() -> None:
-    judged = judge(Ended(_straight(4.5), 0, 0, 0), range(21), None, _straight(5.0), 1.0)
+    judged = judge(Ended(_straight(4.5), 0, 0, 0), range(21), None, _straight(5.0))
     assert judged.ate_m is None
     assert judged.length_error_percent == pytest.approx(-10.0)
 
 
 def test_a_run_without_a_trajectory_is_the_worst_one() -> None:
-    judged = judge(Ended(None, None, None, 1, "it died"), range(40, 60), _straight(5.0), _straight(5.0), 1.0)
-    cells = row("drive", "CT-ICP", 1, [_judged(0, 0.5, 1.0), judged], 3.0)
+    judged = judge(Ended(None, None, None, 1, "it died"), range(40, 60), _straight(5.0), _straight(5.0))
+    cells = row("drive", "CT-ICP", 1, [_judged(0, 0.5, 1.0), judged])
     assert cells[3:7] == ["2", "0.500", "0.500", "40"]
 
 
 def test_only_runs_that_end_ok_can_be_ok_but_wrong() -> None:
     runs = [_judged(0, 0.1, -3.5), _judged(10, 0.2, 50.0, status=3), _judged(20, 0.1, 2.0)]
-    cells = row("drive", "learned+map", 1, runs, 3.0)
+    cells = row("drive", "learned+map", 1, runs)
     assert cells[-2:] == ["2", "1"]
     assert cells[6:8] == ["10", "+50.0"]

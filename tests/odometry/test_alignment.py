@@ -42,17 +42,18 @@ def one_on_the_other(sweeps: list[SweepImages], T: FloatArray, effort: Effort = 
     return align(InitialEstimate(T), second_on_first(sweeps), effort)
 
 
-@pytest.mark.parametrize("rolling", [False, True])
-def test_a_known_motion_is_found_from_a_wrong_guess(box_room, rolling):
-    found = one_on_the_other(box_room.sweeps(2, TWIST, rolling=rolling), moved(TWIST, WRONG))
-    assert_close(found.T_prev_curr, moved(TWIST), 0.01, 5e-4)
-    assert found.inlier_share > 0.97
-    assert found.residual_m < 1e-3
+@pytest.mark.parametrize(("twist", "wrong", "rolling", "rotation_deg", "translation_m"), [
+    (TWIST, WRONG, False, 0.01, 5e-4), (TWIST, WRONG, True, 0.01, 5e-4), (TURNING, WRONG, True, 0.03, 0.002),
+    # Pitched by 20 degrees a third of the points fall above or below the other image, and take no part.
+    ((0.0, math.radians(200.0), 0.0, 0.0, 0.0, 0.0), (0.0, 0.01, 0.0, 0.01, 0.0, 0.0), False, 0.01, 1e-3),
+])  # fmt: skip
+def test_a_known_motion_is_found_from_a_wrong_guess(box_room, twist, wrong, rolling, rotation_deg, translation_m):
+    found = one_on_the_other(box_room.sweeps(2, twist, rolling=rolling), moved(twist, wrong))
+    assert_close(found.T_prev_curr, moved(twist), rotation_deg, translation_m)
 
 
 def test_turning_sweeps_are_compensated(box_room):
     sweeps, start = box_room.sweeps(2, TURNING), moved(TURNING, WRONG)
-    assert_close(one_on_the_other(sweeps, start).T_prev_curr, moved(TURNING), 0.03, 0.002)
     as_if_at_once = [replace(sweep, offsets=np.zeros_like(sweep.offsets)) for sweep in sweeps]
     assert errors(one_on_the_other(as_if_at_once, start).T_prev_curr, moved(TURNING))[0] > 0.1
 
@@ -90,7 +91,6 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
     assert kept.T_prev_curr[0, 3] == pytest.approx(T[0, 3], abs=1e-3)
     np.testing.assert_allclose(error[:3], 0.0, atol=1e-5)
     np.testing.assert_allclose(error[4:], 0.0, atol=1e-4)
-    assert kept.inlier_share > 0.95
     information = one_on_the_other(sweeps, moved(twist)).information
     assert information[3, 3] < 1e-6 * information[4, 4]
     # Every matched point says one metre of information along its normal: they sum up to their number.
@@ -99,13 +99,14 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
 
 def test_little_is_explained_along_the_way_that_a_scan_is_off(box_room):
     sweeps = box_room.sweeps(2, TWIST)
+    right = one_on_the_other(sweeps, moved(TWIST), NO_STEP)
     for axis in range(3):
         wrong = [0.0] * 6
         wrong[3 + axis] = 0.4
         shifted = one_on_the_other(sweeps, moved(TWIST, tuple(wrong)), NO_STEP)
         assert shifted.explained < 0.3
         assert abs(shifted.weakest[axis]) > 0.9
-        assert shifted.inlier_share > 0.35  # the other walls go along
+        assert shifted.inliers > 0.35 * right.inliers  # the other walls go along
 
 
 @pytest.mark.parametrize("empty", ["current", "previous", "both"])
@@ -115,18 +116,8 @@ def test_empty_images_move_nothing(box_room, empty):
     sweeps = [full if empty == "current" else nothing, full if empty == "previous" else nothing]
     found = one_on_the_other(sweeps, moved(TWIST, WRONG))
     np.testing.assert_allclose(found.T_prev_curr, moved(TWIST, WRONG))
-    assert (found.inlier_share, found.residual_m, found.inliers) == (0.0, 0.0, 0)
+    assert found.inliers == 0
     assert not found.information.any()
-
-
-def test_what_leaves_the_elevations_takes_no_part(box_room):
-    """Pitched by 20 degrees a third of the points fall above or below the other image; the rest are right."""
-    twist = (0.0, math.radians(200.0), 0.0, 0.0, 0.0, 0.0)
-    sweeps = box_room.sweeps(2, twist, rolling=False)
-    found = one_on_the_other(sweeps, moved(twist, (0.0, 0.01, 0.0, 0.01, 0.0, 0.0)))
-    assert_close(found.T_prev_curr, moved(twist), 0.01, 1e-3)
-    assert 0.5 < found.inlier_share < 0.85
-    assert found.residual_m < 2e-3
 
 
 def speeding_up(times: FloatArray) -> FloatArray:

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
-from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, _peaks, _shift_scores
+from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, _peaks
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, torch_search
 from lidarslam.odometry.network.networks import CorrelationNetwork
 from lidarslam.odometry.registry import default_weights
@@ -35,14 +34,6 @@ def seen(box_room):
         return sweep.points, sweep.normals
 
     return look
-
-
-def test_the_shift_scores_are_those_of_training(network, rng):
-    features = rng.normal(size=(2, 1, 8, 96, 96)).astype(np.float32)
-    spectra = np.fft.rfft2(features[:, 0]).astype(np.complex64)
-    given = _shift_scores(spectra[0], spectra[1])
-    expected = network.shift_scores(*torch.from_numpy(features)).numpy()
-    np.testing.assert_allclose(given, expected, atol=2e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.9, -2.4])

@@ -1,7 +1,5 @@
 """Networks as ONNX answer as they do in torch."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -18,7 +16,7 @@ from lidarslam.odometry.network.checkpoint import (
     network_of,
     torch_search,
 )
-from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, onnx_search, read_exported
+from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, load_exported
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.registry import default_weights, shipped_folder
 
@@ -45,9 +43,9 @@ def a_scan(seed: int, shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.nd
 
 def test_the_shipped_graphs_are_the_shipped_weights():
     """Else they were exported from others: `lidarslam export --out odometry/weights/correlation` makes them again."""
-    checkpoint, exported = load_checkpoint(default_weights()), read_exported(shipped_folder())
-    assert (exported.network, exported.images) == (checkpoint.network, checkpoint.images)
-    searches = onnx_search(exported, 1), torch_search(network_of(checkpoint))
+    checkpoint, (exported, images) = load_checkpoint(default_weights()), load_exported(shipped_folder(), 1)
+    assert images == checkpoint.images
+    searches = exported, torch_search(network_of(checkpoint))
     assert all(isinstance(search, CorrelationSearch) for search in searches)
     given, expected = (search._parts for search in searches)  # type: ignore[attr-defined]
     points, normals = a_scan(0, (checkpoint.images.rows, checkpoint.images.columns))
@@ -69,17 +67,13 @@ def test_onnx_gives_what_torch_gives(name, tmp_path):
     checkpoint = untrained(name)
     written = export_onnx(checkpoint, tmp_path)
     assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
-    given, expected = onnx_search(read_exported(tmp_path), 1), torch_search(network_of(checkpoint))
+    (given, _), expected = load_exported(tmp_path, 1), torch_search(network_of(checkpoint))
     found, _ = given.compare(given.describe(*a_scan(1)), *a_scan(2))
     wanted, _ = expected.compare(expected.describe(*a_scan(1)), *a_scan(2))
     assert len(found) == len(wanted)
     np.testing.assert_allclose(found[0].T_prev_curr, wanted[0].T_prev_curr, atol=1e-3)
     np.testing.assert_allclose(found[0].covariance, wanted[0].covariance, rtol=1e-2, atol=1e-6)
     assert found[0].log_probability == pytest.approx(wanted[0].log_probability, abs=1e-2)
-
-
-def described(folder: Path) -> None:
-    (folder / DESCRIPTION).write_bytes((shipped_folder() / DESCRIPTION).read_bytes())
 
 
 @pytest.mark.parametrize("content", [None, "{", "[]", '{"kind": "something else"}', "version 1"])
@@ -89,17 +83,13 @@ def test_damaged_descriptions_and_graphs_of_another_cell_size_are_refused(tmp_pa
     if content is not None:
         (tmp_path / DESCRIPTION).write_text(content)
     with pytest.raises(InputError, match="lidarslam export"):
-        read_exported(tmp_path)
-
-
-def assert_unusable(folder: Path) -> None:
-    with pytest.raises(InputError, match=r"columns\.onnx: cannot be used"):
-        onnx_search(read_exported(folder), 1).describe(*a_scan(1))
+        load_exported(tmp_path, 1)
 
 
 @pytest.mark.parametrize("are_there", [False, True])
 def test_damaged_graphs_are_refused(tmp_path, are_there):
-    described(tmp_path)
+    (tmp_path / DESCRIPTION).write_bytes((shipped_folder() / DESCRIPTION).read_bytes())
     for name in (COLUMNS, TURNS, BIRD, PEAKS) if are_there else ():
         (tmp_path / name).write_bytes(b"no graph")
-    assert_unusable(tmp_path)
+    with pytest.raises(InputError, match=r"columns\.onnx: cannot be used"):
+        load_exported(tmp_path, 1)

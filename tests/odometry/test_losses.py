@@ -234,30 +234,25 @@ def test_confidence_is_best_at_the_standard_deviation_of_a_laplace_distribution(
     assert float(gradient) == pytest.approx(5.0, abs=0.02)
 
 
-@pytest.mark.parametrize(("columns", "shares"), [
-    (3.0, {3: 1.0}), (3.25, {3: 0.75, 4: 0.25}), (-0.25, {WIDTH - 1: 0.25, 0: 0.75}), (-11.5, {12: 0.5, 13: 0.5}),
+def shift(x: float, y: float) -> Tensor:
+    """(1, 4, 4) translations."""
+    return exp(torch.tensor([[0.0, 0.0, 0.0, x, y, 0.3]]))
+
+
+@pytest.mark.parametrize(("part", "size", "target", "shares"), [
+    ("turn", (WIDTH,), yaw(3.0), {3: 1.0}), ("turn", (WIDTH,), yaw(3.25), {3: 0.75, 4: 0.25}),
+    ("turn", (WIDTH,), yaw(-0.25), {WIDTH - 1: 0.25, 0: 0.75}), ("turn", (WIDTH,), yaw(-11.5), {12: 0.5, 13: 0.5}),
+    ("shift", (37, 37), shift(2.0, -1.0), {(17, 20): 1.0}),
+    ("shift", (37, 37), shift(0.25, 0.5), {(18, 18): 0.375, (18, 19): 0.125, (19, 18): 0.375, (19, 19): 0.125}),
 ])  # fmt: skip
-def test_the_turn_is_shared_by_the_columns_around_it(columns, shares):
-    scores = torch.zeros(1, WIDTH, requires_grad=True)
-    turn = loss(estimate_of(torch.eye(4)[None], scores=scores), batch_of(yaw(columns))).turn
-    assert_shared(turn, scores, shares)
-
-
-@pytest.mark.parametrize(("x", "y", "shares"), [
-    (2.0, -1.0, {(17, 20): 1.0}), (0.25, 0.5, {(18, 18): 0.375, (18, 19): 0.125, (19, 18): 0.375, (19, 19): 0.125}),
-])  # fmt: skip
-def test_the_translation_is_shared_by_the_cells_around_it(x, y, shares):
-    scores = torch.zeros(1, 37, 37, requires_grad=True)
-    target = exp(torch.tensor([[0.0, 0.0, 0.0, x, y, 0.3]]))
-    shift = loss(replace(estimate_of(torch.eye(4)[None]), shift_scores=scores), batch_of(target)).shift
-    assert_shared(shift, scores, shares)
-
-
-def assert_shared(part: Tensor, scores: Tensor, shares: dict) -> None:
+def test_turn_and_translation_are_shared_by_the_columns_and_cells_around_them(part, size, target, shares):
     """The loss of even scores, whose gradient pulls at those of the target."""
-    assert float(part.detach()) == pytest.approx(math.log(scores.numel()), rel=1e-5)
-    (gradient,) = torch.autograd.grad(part, scores)
-    expected = torch.zeros(scores.shape[1:])
+    scores = torch.zeros(1, *size, requires_grad=True)
+    estimate = replace(estimate_of(torch.eye(4)[None]), **{f"{part}_scores": scores})
+    found = getattr(loss(estimate, batch_of(target)), part)
+    assert float(found.detach()) == pytest.approx(math.log(scores.numel()), rel=1e-5)
+    (gradient,) = torch.autograd.grad(found, scores)
+    expected = torch.zeros(size)
     for index, share in shares.items():
         expected[index] = share
     torch.testing.assert_close(1.0 / scores.numel() - gradient[0], expected, rtol=0, atol=1e-5)

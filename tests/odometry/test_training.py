@@ -7,12 +7,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lidarslam.core import geometry
 from lidarslam.odometry.config import TrainingConfig
 from lidarslam.odometry.network.networks import CorrelationNetwork, PairEstimate, PairImages
 from lidarslam.odometry.training.losses import learning_rate, make_optimizer, objective, validate
 from lidarslam.odometry.training.pairs import birds, pair_of
 from lidarslam.odometry.training.preparation import PreparedRecording
+
+from .motions import torch_exp as exp
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 
@@ -40,10 +41,6 @@ def test_a_few_steps_bring_the_loss_down(small_room):
         optimizer.step()
     assert losses[-1].turn < 0.8 * losses[0].turn
     assert losses[-1].shift < 0.8 * losses[0].shift
-
-
-def exp(xi: Tensor) -> Tensor:
-    return torch.from_numpy(geometry.exp(xi.numpy())).float()
 
 
 class Stub(nn.Module):
