@@ -44,15 +44,6 @@ def test_every_command_has_a_whole_summary_and_help_with_an_example() -> None:
         assert f"lidarslam {name}" in result.output.split("Example:")[-1], name
 
 
-@pytest.mark.long
-def test_run_exits_with_3_when_tracking_was_lost(recording: Path, tmp_path: Path) -> None:
-    np.save(recording / "000003.npy", np.full((100, 3), np.nan))
-    result = lidarslam("run", recording, "--out", tmp_path / "run", "--no-report")
-    assert result.exit_code == 3
-    assert "LOST on scan 3: no points within range" in result.output
-    assert (tmp_path / "run" / "map.ply").exists()
-
-
 def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Path) -> None:
     network = NetworkConfig()
     weights = tmp_path / "weights of mine: 1.safetensors"
@@ -85,6 +76,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         ([*RUN, "--loop", "1", "4", "--no-pose-graph"], 2, "leave --no-pose-graph out"),
         ([*RUN, "--start", "9"], 1, "none of its 5 scans is left"),
         ([*RUN, "--odometry", "constant-velocity", "--no-mapping"], 1, "needs scan-to-map registration"),
+        ([*RUN, "--odometry", "imu", "--no-mapping"], 1, "odometry.method=imu needs scan-to-map registration"),
         ([*RUN, "--no-mapping", "--mapping", "loam"], 2, "--no-mapping is --mapping off, not --mapping loam"),
         (["run", "{recording}", "--out", "{recording}/000000.npy"], 1, "a file is in the way"),
         ([*RUN, "--prior", "{recording}/ground_truth.tum", "--odometry", "kiss-icp"], 2, "--prior replaces"),

@@ -82,6 +82,7 @@ def test_a_run_writes_what_the_contract_names(
     assert set(summary["ms_per_scan"]) == {"total", *STAGES}
     assert summary["ms_per_scan"]["total"]["p95"] >= summary["ms_per_scan"]["total"]["median"] > 0.0
     assert summary["peak_rss_mb"] > 50.0
+    assert all(summary[f"elevation_{key}_deg"] is None for key in ("bias", "sigma", "correction")), "without a mapping"
 
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["association"]["matched"] == 20

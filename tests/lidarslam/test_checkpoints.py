@@ -93,51 +93,6 @@ def test_a_disk_that_is_full_does_not_end_the_run(unfinished: Unfinished, monkey
     assert "No space left" in log.warnings[0]
 
 
-@dataclass
-class Counting:
-    """Keeps every second scan's state in memory."""
-
-    states: list[tuple[int, State]] = field(default_factory=list)
-    out: int = 0
-    asked: int = 0
-
-    def is_due(self) -> bool:
-        self.asked += 1
-        return self.asked % 2 == 0
-
-    def save(self, pipeline: Pipeline) -> None:
-        assert pipeline.held is not None
-        self.states.append((self.out, pipeline.state()))
-
-
-def make_pipeline(odometry: ExternalOdometry, keeper: Counting | None = None) -> Pipeline:
-    localiser = OdometryAlone(ConsistencyCheck())
-    return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), checkpointer=keeper)
-
-
-def test_nothing_is_at_work_while_a_state_is_kept(
-    room_scans: list[Scan], room_truth: Trajectory, through_disk: Any
-) -> None:
-    """All results but that of the scan that is held are out, and the rest follows from the state."""
-    keeper = Counting()
-    whole = []
-    for result in make_pipeline(ExternalOdometry(room_truth), keeper).run(room_scans[:9]):
-        whole.append(result)
-        keeper.out = len(whole)
-    assert [out for out, _ in keeper.states] == [2, 4, 6, 8]
-    odometry = ExternalOdometry(room_truth)
-    pipeline = make_pipeline(odometry)
-    pipeline.restore(through_disk(keeper.states[1][1]))
-    assert pipeline.held.scan.stamp == room_scans[4].stamp
-    odometry.estimate(room_scans[4])
-    rest = list(pipeline.run(room_scans[5:9]))
-    assert len(rest) == 5
-    for found, expected in zip(rest, whole[4:], strict=True):
-        np.testing.assert_array_equal(found.T_world_lidar, expected.T_world_lidar)
-        np.testing.assert_array_equal(found.points, expected.points)
-        assert (found.status, found.residual_m) == (expected.status, expected.residual_m)
-
-
 class Deaf:
     """An odometry without a state, and the stamps that it was given."""
 
@@ -172,15 +127,6 @@ def test_another_scan_than_the_one_that_was_read_is_noticed(held: Scan) -> None:
     odometry: Any = Deaf()
     with pytest.raises(InputError, match="the recording has changed"):
         scans_left(map(scan_at, STAMPS), held, odometry, Saved({"odometry": {}}))
-
-
-def test_two_are_not_at_work_on_one_run(tmp_path: Path) -> None:
-    with claim(tmp_path, {"a": 1}) as first:
-        first.begin(0)
-        for resume in (False, True):
-            with pytest.raises(OutputError, match="another lidarslam"), claim(tmp_path, {"a": 1}, resume):
-                pass
-        assert About.read(tmp_path) is not None
 
 
 def refuse_as_unfinished(path: Path) -> None:

@@ -205,17 +205,6 @@ def test_a_clock_that_jumps_a_year_ahead_for_good_is_followed_and_told(tmp_path,
     assert any("1 gap in the stamps" in w and "31536000.1 s after scan 3" in w for w in summary["warnings"])
 
 
-@pytest.mark.long
-def test_a_clock_set_back_for_good_ends_the_run_with_a_line_and_what_there_is(tmp_path, tables):
-    messages = messages_at([tables[i % 8] for i in range(20)], lambda i: -YEAR_NS if i > 5 else 0)
-    bag = write_bag(tmp_path / "drive", messages)
-    code, summary, said = run(bag)
-    assert (code, summary["scans"]) == (1, 6)
-    assert "the stamps run backwards from scan number 6 on" in said
-    code, summary, _ = run(bag, "--start", "6", asked=14)
-    assert summary["scans"] == 14
-
-
 def write_folder(folder: Path, tables: list[np.ndarray], times: str = "") -> Path:
     """Scans as .npy files; times in a file of theirs."""
     folder.mkdir(exist_ok=True)

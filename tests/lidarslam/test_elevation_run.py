@@ -60,13 +60,6 @@ def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
     succeeds(*command, "--resume")
 
 
-@pytest.mark.long
-def test_without_a_map_there_is_no_estimate(small_recording: Path, tmp_path: Path) -> None:
-    succeeds("run", small_recording, "--out", tmp_path / "run", "--odometry", "kiss-icp", "--no-mapping")
-    found = summary_of(tmp_path / "run")
-    assert [found[key] for key in KEYS] == [None] * 3
-
-
 @pytest.mark.parametrize("mounting", ["upright", "upside-down"])
 def test_any_reader_raises_points_above_the_recorded_plane(low: Path, mounting: str) -> None:
     config = ReaderConfig(mounting=mounting, elevation_correction_deg=0.0)  # type: ignore[arg-type]

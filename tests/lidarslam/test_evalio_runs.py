@@ -81,21 +81,6 @@ def sequence(
     return folder
 
 
-@pytest.mark.long
-def test_run_and_what_follows_it(sequence: Path, tmp_path: Path) -> None:
-    succeeds("run", SOURCE, "--odometry", "kiss-icp", "--no-report")
-    (run,) = (tmp_path / "runs").iterdir()
-    assert run.name.startswith("hilti_2022_basement_2_")
-    description = yaml.safe_load((run / "config.yaml").read_text())["run"]
-    assert description["source"] == str(sequence)
-    succeeds("evaluate", run)
-    metrics = json.loads((run / "metrics.json").read_text())
-    assert metrics["association"]["matched"] == SCANS
-    assert metrics["trajectory"]["ate_rmse_m"] < 0.03
-    succeeds("view", run, "--picture", "map.png")
-    assert not (tmp_path / "evalio:hilti_2022").exists()
-
-
 def test_info_and_python_know_the_name(sequence: Path) -> None:
     known = json.loads(succeeds("info", SOURCE, "--json"))
     assert (known["reader"], known["scans"], known["source"]) == ("evalio", SCANS, str(sequence))

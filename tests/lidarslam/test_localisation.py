@@ -69,20 +69,6 @@ def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> N
     assert open_.degenerate == ("x", "yaw")
 
 
-def test_a_sweep_that_was_compensated_already_is_left_alone() -> None:
-    scan = Scan(np.ones((5, 3)), 0.0)
-    np.testing.assert_array_equal(SweepMotion(BEFORE, AFTER).compensate(scan), scan.points)
-
-
-def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> None:
-    scan = sweep(-0.05, 0.05)
-    expected = [
-        transform_points(exp(t * (BEFORE if t < 0.0 else AFTER)), p[None])[0]
-        for t, p in zip(scan.time_offsets, scan.points, strict=True)
-    ]
-    np.testing.assert_allclose(SweepMotion(BEFORE, AFTER).compensate(scan), expected, atol=1e-12)
-
-
 def localise_all(
     scans: list[Scan], motions: list[Motion], interval_s: float = 0.1, start: dict[float, Prior] | None = None
 ) -> list[ScanEstimate]:
@@ -195,20 +181,6 @@ def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list
     poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
     results, pipeline = run(ExternalOdometry(Trajectory(room_truth.stamps, poses)), room_scans)
     check_poses_and_map(results, pipeline, room, room_truth)
-
-
-def test_without_any_odometry_a_sensor_that_begins_at_rest_has_true_poses_and_a_true_map(
-    room: Any, room_truth: Trajectory, drive: Callable[[FloatArray], FloatArray]
-) -> None:
-    """The first sweep is taken for one at rest: it is one here."""
-
-    def from_rest(time: FloatArray) -> FloatArray:
-        return drive(np.maximum(0.15, np.asarray(time)))
-
-    stamps = room_truth.stamps
-    scans = [room.sweep(from_rest, float(stamp)) for stamp in stamps]
-    results, pipeline = run(ConstantVelocity(), scans)
-    check_poses_and_map(results, pipeline, room, Trajectory(stamps, from_rest(stamps)))
 
 
 def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:

@@ -130,6 +130,7 @@ def test_a_map_that_waits_is_in_the_state(
     assert resumed.held is not None
     odometry.estimate(resumed.held.scan)
     done = len(keeper.scans)
+    assert resumed.held.scan.stamp == room_scans[done].stamp
     np.testing.assert_array_equal(poses(resumed.run(room_scans[done + 1 :])), corrected[done:])
 
 

@@ -109,18 +109,6 @@ def test_rings_and_times_are_those_of_the_first_point(
 
 
 @pytest.mark.long
-def test_geometry_does_not_depend_on_the_fields(source: Path, tmp_path: Path) -> None:
-    for name, fields in (("none", "[]"), ("all", "[intensity, rgb, ring, time]")):
-        run(source, tmp_path / name, *WAYS["pose graph"], "--set", f"global_map.fields={fields}")
-    none, every = load_map(tmp_path / "none"), load_map(tmp_path / "all")
-    np.testing.assert_array_equal(none.points, every.points)
-    np.testing.assert_array_equal(none.normals, every.normals)
-    assert not list(none.attributes.present())
-    for name in ("trajectory.tum", "pose_graph.g2o"):
-        assert (tmp_path / "none" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
-
-
-@pytest.mark.long
 def test_further_formats(source: Path, tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     out = tmp_path / "run"
