@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.shell_completion import BashComplete
 
@@ -32,7 +31,7 @@ def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) ->
     return write_recording(tmp_path / "room", room_scans[:5], room_truth)
 
 
-RUN = ("run", "{recording}", "--out", "{out}")
+RUN, COMPARE, TRAIN = ("run", "{recording}", "--out", "{out}"), ("compare", "--out", "{out}"), ("train", "--out", "{out}")
 
 
 def test_every_command_has_a_whole_summary_and_help_with_an_example() -> None:
@@ -76,7 +75,6 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         ([*RUN, "--loop", "1", "4", "--no-pose-graph"], 2, "leave --no-pose-graph out"),
         ([*RUN, "--start", "9"], 1, "none of its 5 scans is left"),
         ([*RUN, "--odometry", "constant-velocity", "--no-mapping"], 1, "needs scan-to-map registration"),
-        ([*RUN, "--odometry", "imu", "--no-mapping"], 1, "odometry.method=imu needs scan-to-map registration"),
         ([*RUN, "--no-mapping", "--mapping", "loam"], 2, "--no-mapping is --mapping off, not --mapping loam"),
         (["run", "{recording}", "--out", "{recording}/000000.npy"], 1, "a file is in the way"),
         ([*RUN, "--prior", "{recording}/ground_truth.tum", "--odometry", "kiss-icp"], 2, "--prior replaces"),
@@ -84,6 +82,22 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         (["run", "{recording}", "--foo"], 2, "lidarslam: no such option '--foo'"),
         (["merge", "{recording}", "--out", "{out}"], 1, "expected two recordings or more"),
         (["merge", "{recording}", "{recording}/../room", "--out", "{out}"], 1, "is named twice"),
+        ([*COMPARE], 2, "name a SOURCE"),
+        ([*COMPARE, "{recording}", "--data", "x"], 2, "--data goes with --benchmark"),
+        ([*COMPARE, "{recording}", "{recording}", "--prior", "{recording}"], 2, "--prior belongs to one SOURCE"),
+        ([*COMPARE, "{recording}", "--max", "aet=0.1"], 2, "no figure is called 'aet'; there are: ate, "),
+        ([*COMPARE, "{recording}", "--min", "loam:ate=0.1"], 1, "'loam'; there are: learned+map, kiss-icp"),
+        ([*COMPARE, "{recording}", "--reuse", "--overwrite"], 1, "choose one"),
+        ([*COMPARE, "--benchmark", "indoor"], 2, "the name of a benchmark; there are: ablation, anymal, kitti, "),
+        (["config", "-c", "indor"], 2, "neither a file nor the name of a configuration; there are: indoor, "),
+        (["config", "-c", ""], 2, "'' is neither a file nor"),
+        (["config", "-c", "."], 2, "'.' is neither a file nor"),
+        ([*TRAIN], 1, "there is nothing to train on; name a SOURCE"),
+        ([*TRAIN, "--set", "training.geometric.robus=1"], 1, "no training.geometric.robus; did you mean robust?"),
+        ([*TRAIN, "--resume"], 1, "holds no training to go on with"),
+        ([*TRAIN, "--resume", "--overwrite"], 1, "choose one"),
+        ([*TRAIN, "--resume", "--from", "shipped"], 1, "leave --from out"),
+        ([*TRAIN, "--from", "nowhere.safetensors"], 1, "nowhere.safetensors: no such file"),
     ],
 )
 def test_mistakes_get_one_line(
@@ -96,6 +110,7 @@ def test_mistakes_get_one_line(
     assert "Traceback" not in result.output
     assert result.stderr.count("\n") == 1
     assert result.stdout == ""
+    assert not places["out"].exists()
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
+from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam, succeeds, write_recording
 
@@ -77,6 +78,12 @@ def scan_estimate(stamp: float, T_world_lidar: FloatArray, status: Status = Stat
     return ScanEstimate(stamp=stamp, T_world_lidar=T_world_lidar, status=status, **given | values)
 
 
+@contextmanager
+def quiet(_name: str) -> Iterator[Progress]:
+    """No progress bar."""
+    yield lambda _number, _total, _result: None
+
+
 class Told:
     """Keeps what a comparison tells: a line for each method, and how many scans of which were counted."""
 
@@ -99,11 +106,13 @@ def told() -> Told:
 
 
 @pytest.fixture(scope="session")
-def timeless() -> Callable[[Path], dict[str, Any]]:
-    """What every file of a merge holds, large ones as a digest; without times, memory, and how often it was resumed."""
+def timeless() -> Callable[..., dict[str, Any]]:
+    """What every file of a run, merge or comparison holds, but for those of some names, large ones as a digest; without
+    times, memory, and how often it was resumed.
+    """
 
     def read(path: Path) -> Any:
-        if path.name == "summary.json":
+        if path.name in ("summary.json", "comparison.json"):
             return _timeless(json.loads(path.read_text()))
         if path.name == "scans.csv":
             rows = [row.split(",") for row in path.read_text().splitlines()]
@@ -111,12 +120,16 @@ def timeless() -> Callable[[Path], dict[str, Any]]:
             return [[cell for column, cell in enumerate(row) if column not in timed] for row in rows]
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
-    return lambda out: {str(path.relative_to(out)): read(path) for path in out.rglob("*") if path.is_file()}
+    return lambda out, *left_out: {
+        str(path.relative_to(out)): read(path)
+        for path in out.rglob("*")
+        if path.is_file() and path.name not in left_out
+    }
 
 
 def _timeless(tree: Any) -> Any:
     if isinstance(tree, dict):
-        timed = re.compile(r"_ms|ms_|elapsed_s|realtime|peak_rss|slowest|machine")
+        timed = re.compile(r"_ms|ms_|elapsed_s|wall_s|realtime|peak_rss|slowest|machine")
         return {name: _timeless(value) for name, value in tree.items() if not timed.search(name)}
     if isinstance(tree, list):
         return [_timeless(value) for value in tree if "the run was resumed" not in str(value)]

@@ -4,7 +4,7 @@ import contextlib
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,19 +15,14 @@ from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State, read_state
-from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.interface import ConstantVelocity
-from lidarslam.odometry.methods.consistency import ConsistencyCheck
-from lidarslam.odometry.methods.external import ExternalOdometry
-from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run import checkpoints
 from lidarslam.run.checkpoints import Checkpoints, scans_left
 from lidarslam.run.results import TileWriter
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import CONFIG, RunDirectory
-from lidarslam.storage.unfinished import About, Unfinished, require_whole
+from lidarslam.storage.unfinished import Unfinished, require_whole
 
 
 @dataclass

@@ -271,23 +271,3 @@ def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, t
     assert none.exit_code == 1
     assert "out of memory" in none.stdout
     assert "no method came to a result" in none.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "status", "message"),
-    [
-        ([], 2, "name a SOURCE"),
-        (["{recording}", "--data", "x"], 2, "--data goes with --benchmark"),
-        (["{recording}", "{recording}", "--prior", "{recording}/ground_truth.tum"], 2, "--prior belongs to one SOURCE"),
-        (["{recording}", "--max", "aet=0.1"], 2, "no figure is called 'aet'; there are: ate, "),
-        (["{recording}", "--min", "loam:ate=0.1"], 1, "no method is called 'loam'; there are: learned+map, kiss-icp"),
-        (["{recording}", "--reuse", "--overwrite"], 1, "choose one"),
-    ],
-)
-def test_mistakes_get_one_line(
-    recording: Path, tmp_path: Path, arguments: list[str], status: int, message: str
-) -> None:
-    result = lidarslam("compare", *(a.format(recording=recording) for a in arguments), "--out", tmp_path / "out")
-    assert result.exit_code == status
-    assert message in result.stderr
-    assert status == 2 or result.stderr.count("\n") == 1

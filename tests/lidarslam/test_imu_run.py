@@ -102,6 +102,11 @@ def test_a_recording_without_an_imu_is_refused_in_one_line(method: str, small_re
     assert not (tmp_path / "run").exists()
 
 
+def test_an_imu_needs_a_map(recording: Path, tmp_path: Path) -> None:
+    said = refused(*run(recording, tmp_path / "run", "--no-mapping"))
+    assert "odometry.method=imu needs scan-to-map registration" in said
+
+
 @pytest.mark.long
 def test_the_mounting_is_found_where_the_recording_has_none(room: Any, tmp_path: Path) -> None:
     source = record(tmp_path / "room", room, scans=115, mounting=False)

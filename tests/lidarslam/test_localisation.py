@@ -1,7 +1,6 @@
 """From odometry to a pose: what the motion during a sweep is taken for, and the way through the whole pipeline."""
 
 import copy
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import accumulate, pairwise
 from typing import Any
@@ -22,7 +21,7 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.odometry.interface import ConstantVelocity, Motion, Odometry
+from lidarslam.odometry.interface import Motion, Odometry
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, SweepMotion

@@ -30,15 +30,10 @@ from lidarslam.storage.directory import FILES
 from lidarslam.storage.finished_run import load_map, load_run
 
 from ..conftest import write_recording
+from .conftest import quiet
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 PARTS = ("01_first", "02_foreign", "03_second")
-
-
-@contextmanager
-def quiet(_name: str) -> Iterator[Progress]:
-    """No progress bar."""
-    yield lambda _number, _total, _result: None
 
 
 @dataclass(frozen=True, eq=False)

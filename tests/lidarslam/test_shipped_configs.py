@@ -41,21 +41,6 @@ def test_a_path_is_a_file_of_the_user(empty_folder: Path) -> None:
     assert "voxel_size_m: 0.77" not in lidarslam("config", "-c", "indoor").stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["config", "-c", "indor"], "'indor' is neither a file nor the name of a configuration; there are: indoor, "),
-        (["config", "-c", ""], "'' is neither a file nor"),
-        (["config", "-c", "."], "'.' is neither a file nor"),
-        (["compare", "--benchmark", "indoor"], "the name of a benchmark; there are: ablation, anymal, kitti, "),
-    ],
-)
-def test_an_unknown_name_gets_the_list(arguments: list[str], message: str) -> None:
-    refused = lidarslam(*arguments)
-    assert refused.exit_code == 2
-    assert message in refused.stderr
-
-
 def test_config_lists_them_with_what_they_are_and_what_they_need() -> None:
     listed = lidarslam("config", "--list").stdout
     for path in FILES:

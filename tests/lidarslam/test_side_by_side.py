@@ -3,9 +3,7 @@ a cluster that loses a node.
 """
 
 import contextlib
-import json
 import os
-import re
 import signal
 import sys
 import threading
@@ -28,16 +26,16 @@ from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.merge import parts as tracking
 from lidarslam.merge.merge import merge
 from lidarslam.merge.parts import MergeOutcome, MergeRequest
-from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam
-from .conftest import Told
+from .conftest import Told, quiet
 
 pytest.importorskip("ray")
 
+Files = Callable[..., dict[str, Any]]
 METHODS = "constant-velocity+map,learned+map,prior"
-# The files of a run that hold times, or the memory that was taken.
-TIMED = {"summary.json", "scans.csv", "process.json", "process.log"}
+# The files of a comparison that hold times, or the memory that was taken, throughout.
+TIMED = ("process.json", "process.log", "report.html", "report.md")
 
 
 def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str, **changes: Any) -> CompareOutcome:
@@ -46,29 +44,12 @@ def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str
     return compare(request, told.narrator, *((command,) if command else ()))
 
 
-def _contents(out: Path) -> dict[str, Any]:
-    """Every file of a comparison, times apart."""
-    files: dict[str, Any] = {}
-    for path in (path for path in sorted(out.rglob("*")) if path.is_file()):
-        name = str(path.relative_to(out))
-        files[name] = None if path.name in TIMED or path.name.startswith("report") else path.read_bytes()
-    content = json.loads((out / "comparison.json").read_text())
-    for method in content["methods"].values():
-        for key in [key for key in method if "ms" in key.split("_") or key in ("peak_rss_mb", "wall_s")]:
-            method.pop(key)
-    files["comparison.json"] = content
-    rows = [row.split(",") for row in (out / "room" / "learned+map" / "scans.csv").read_text().splitlines()]
-    timed = [column for column, title in enumerate(rows[0]) if re.search(r"(^|_)ms($|_)", title)]
-    files["rows"] = [[cell for column, cell in enumerate(row) if column not in timed] for row in rows]
-    return files
-
-
 @pytest.fixture(scope="module")
-def serial(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def serial(small_recording: Path, tmp_path_factory: pytest.TempPathFactory, timeless: Files) -> dict[str, Any]:
     """The comparison of one method after another."""
     out = tmp_path_factory.mktemp("compared") / "serial"
     _compare(small_recording, out, SERIAL, Told())
-    return _contents(out)
+    return timeless(out, *TIMED)
 
 
 def _wait_for(condition: Any, seconds: float = 60.0) -> None:
@@ -95,17 +76,17 @@ def _two_nodes(doomed: Callable[[list[Any]], Any]) -> Iterator[Where]:
 
 @pytest.mark.slow
 def test_side_by_side_is_the_same_as_one_after_another(
-    small_recording: Path, tmp_path: Path, serial: dict[str, Any], told: Told
+    small_recording: Path, tmp_path: Path, serial: dict[str, Any], timeless: Files, told: Told
 ) -> None:
     _compare(small_recording, tmp_path / "out", Where(2), told)
-    assert _contents(tmp_path / "out") == serial
+    assert timeless(tmp_path / "out", *TIMED) == serial
     assert told.counts[-1][1:] == (18, 18)
     assert len(told.lines) == 3
     again = Told()
     none = (sys.executable, "-c", "raise SystemExit('was run again')")
     _compare(small_recording, tmp_path / "out", Where(2), again, *none, reuse=True)
     assert all("in an earlier comparison" in line for line in again.lines)
-    assert _contents(tmp_path / "out") == serial
+    assert timeless(tmp_path / "out", *TIMED) == serial
 
 
 @pytest.mark.slow
@@ -125,13 +106,6 @@ def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
 
 MERGED = ["global_map.voxel_size_m=0.2", "odometry.method=constant-velocity", "checkpoints.every_scans=1"]
 TIMES = 4  # that the room is crossed, so that a recording takes some seconds
-Files = Callable[[Path], dict[str, Any]]
-
-
-@contextmanager
-def quiet(_name: str) -> Iterator[Progress]:
-    """No progress bar."""
-    yield lambda _number, _total, _result: None
 
 
 def _merge(sources: list[Path], out: Path, where: Where, resume: bool = False) -> MergeOutcome:

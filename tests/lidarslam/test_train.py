@@ -288,25 +288,6 @@ def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     assert load_checkpoint(out / "weights.safetensors").images.columns == 96
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ((), "there is nothing to train on; name a SOURCE"),
-        (("--set", "training.geometric.robus=1"), "there is no training.geometric.robus; did you mean robust?"),
-        (("--resume",), "holds no training to go on with"),
-        (("--resume", "--overwrite"), "choose one"),
-        (("--resume", "--from", "shipped"), "leave --from out"),
-        (("--from", "nowhere.safetensors"), "nowhere.safetensors: no such file"),
-    ],
-)
-def test_mistakes_are_told_in_one_line(arguments, told, tmp_path):
-    result = lidarslam("train", *arguments, "--out", tmp_path / "out")
-    assert result.exit_code == 1
-    assert told in result.output
-    assert len(result.output.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_other_recordings_or_files_are_not_gone_on_with(room_folder, tmp_path, ready):
     out = tmp_path / "out"
     execute(request(room_folder, out, ready, "training.steps=1"), print)

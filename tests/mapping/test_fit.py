@@ -75,27 +75,29 @@ def test_a_scan_far_from_everything_does_not_meet_the_map(box_map, scan_points):
     assert "0 % of the scan overlaps the map" in fit.explain(CONFIG)
 
 
-@pytest.mark.parametrize(
-    ("inlier_ratio", "status"),
-    [(1.0, Status.OK), (0.6, Status.OK), (0.59, Status.DEGRADED), (0.45, Status.DEGRADED), (0.44, Status.LOST)],
-)
-def test_the_share_of_inliers_decides_on_the_status(inlier_ratio, status):
+HELD_IN_YOUNG_MAP = {"is_young": True, "is_held": True}
+
+
+@pytest.mark.parametrize(("fit", "circumstances", "status", "told"), [
+    (Fit(1_000, 0.9, 0.01, 1.0), {}, Status.OK, ""),
+    (Fit(1_000, 0.9, 0.01, 0.6), {}, Status.OK, ""),
+    (Fit(1_000, 0.9, 0.01, 0.59), {}, Status.DEGRADED, "fits the map"),
+    (Fit(1_000, 0.9, 0.01, 0.45), {}, Status.DEGRADED, "fits the map"),
+    (Fit(1_000, 0.9, 0.01, 0.44), {}, Status.LOST, "fits the map"),
+    (Fit(1_000, 0.9, 0.01, 0.95, 0.7), {}, Status.OK, ""),
+    (Fit(1_000, 0.9, 0.01, 0.95, 0.45), {}, Status.DEGRADED, "slide"),
+    (Fit(1_000, 0.9, 0.01, 0.95, 0.2), {}, Status.LOST, "slide"),
+    (Fit(50, 0.05, 0.001, 1.0), {}, Status.LOST, "5 %"),
+    (Fit(50, 0.05, 0.001, 1.0), HELD_IN_YOUNG_MAP, Status.LOST, "5 %"),
+    (Fit(1_000, 0.9, 0.01, 0.3, 0.2), HELD_IN_YOUNG_MAP, Status.DEGRADED, ""),
+    (Fit(1_000, 0.9, 0.01, 0.3, 0.2), {"is_young": True}, Status.LOST, ""),
+    (Fit(1_000, 0.9, 0.01, 0.3, 0.2), {"is_held": True}, Status.LOST, ""),
+])  # fmt: skip
+def test_overlap_inliers_and_support_decide_on_the_status(fit, circumstances, status, told):
     config = TrackingConfig(degraded_below=0.6, lost_below=0.45)
-    assert Fit(1_000, 0.9, 0.01, inlier_ratio).status(config) is status
-
-
-def test_in_a_young_map_a_scan_that_is_held_is_degraded_at_worst():
-    poor = Fit(1_000, 0.9, 0.01, 0.3, support=0.2)
-    assert poor.status(CONFIG, is_young=True, is_held=True) is Status.DEGRADED
-    assert poor.status(CONFIG, is_young=True) is Status.LOST
-    assert poor.status(CONFIG, is_held=True) is Status.LOST
-
-
-@pytest.mark.parametrize("is_young", [False, True])
-def test_a_scan_that_hardly_meets_the_map_is_lost_however_it_fits(is_young):
-    hardly = Fit(50, 0.05, 0.001, 1.0)
-    assert hardly.status(CONFIG, is_young=is_young, is_held=is_young) is Status.LOST
-    assert "5 %" in hardly.explain(CONFIG)
+    assert fit.status(config, **circumstances) is status
+    assert told in fit.explain(config)
+    assert (fit.explain(config) == "") == (fit.status(config) is Status.OK)
 
 
 def test_far_points_may_lie_farther_from_their_surface(rng):
@@ -132,10 +134,3 @@ def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supporte
     assert abs(direction[0]) > 0.99
     tunnel = street_normals(rng, along=0)
     assert support_of(tunnel, np.full(len(tunnel), 0.1)) > 0.98
-
-
-@pytest.mark.parametrize(("support", "status"), [(0.7, Status.OK), (0.45, Status.DEGRADED), (0.2, Status.LOST)])
-def test_a_scan_that_may_slide_is_not_ok_however_much_of_it_lies_on_the_map(support, status):
-    fit = Fit(1_000, 0.9, 0.01, 0.95, support)
-    assert fit.status(CONFIG) is status
-    assert ("slide" in fit.explain(CONFIG)) == (status is not Status.OK)
