@@ -45,13 +45,6 @@ def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     assert names(tmp_path) == ["file"]
 
 
-def test_a_directory_has_one_writer(tmp_path: Path) -> None:
-    with only_writer(tmp_path), pytest.raises(OutputError, match="another lidarslam is writing"), only_writer(tmp_path):
-        pass
-    with only_writer(tmp_path):
-        pass
-
-
 def test_a_patient_writer_waits_for_the_other(tmp_path: Path) -> None:
     other = only_writer(tmp_path)
     other.__enter__()

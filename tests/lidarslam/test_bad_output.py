@@ -1,15 +1,13 @@
 """Places that cannot be written, disks that fill up, two writers, requests to end: a line, and no half file."""
 
-import contextlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +20,7 @@ from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.directory import FILES, RunDirectory
 
 from ..conftest import lidarslam, succeeds
-from .conftest import FAST, refused, summary_of
+from .conftest import FAST, files_no_longer_than, refused, summary_of
 
 COMMAND = f"'{sys.executable}' -m lidarslam"
 
@@ -37,19 +35,6 @@ def in_shell(script: str, folder: Path, **changed: str | None) -> "subprocess.Co
 
 def left_in(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) if folder.exists() else []
-
-
-@contextlib.contextmanager
-def files_no_longer_than(size: int) -> Iterator[None]:
-    """A disk that is full after so many bytes of a file, as far as this process sees."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
 
 
 @pytest.mark.parametrize(
@@ -161,23 +146,20 @@ def test_other_outputs_on_a_full_disk(tmp_path: Path, finished_run: Path, comman
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that not even root may write to")
-@pytest.mark.parametrize("command", ["run", "compare", "simulate", "train", "merge", "evaluate", "view", "picture"])
+@pytest.mark.parametrize("command", [
+    "run {recording} --odometry constant-velocity --out {place}/run",
+    "compare {recording} --methods constant-velocity+map --out {place}/c",
+    "simulate --scans 2 --out {place}/s",
+    "train {recording} --out {place}/t --steps 1",
+    "merge {recording} {run}/.. --reader scan-folder --out {place}/m",
+    "evaluate {run} --out {place}/metrics.json",
+    "view {run} --save {place}/run.rrd",
+    "view {run} --picture {place}/run.png",
+])  # fmt: skip
 def test_a_folder_that_cannot_be_written(small_recording: Path, finished_run: Path, command: str) -> None:
-    place = Path("/proc/self/task")
-    commands: dict[str, Sequence[object]] = {
-        "run": ["run", small_recording, *FAST, "--out", place / "run"],
-        "compare": ["compare", small_recording, "--methods", "constant-velocity+map", "--out", place / "c"],
-        "simulate": ["simulate", "--scans", 2, "--out", place / "s"],
-        "train": ["train", small_recording, "--out", place / "t", "--steps", 1],
-        "merge": ["merge", small_recording, finished_run.parent, "--reader", "scan-folder", "--out", place / "m"],
-        "evaluate": ["evaluate", finished_run, "--out", place / "metrics.json"],
-        "view": ["view", finished_run, "--save", place / "run.rrd"],
-        "picture": ["view", finished_run, "--picture", place / "run.png"],
-    }
-    if command == "merge":
-        for name in ("000000.npy", "000001.npy"):
-            shutil.copy(small_recording / name, finished_run.parent)
-    said = refused(*commands[command])
+    for name in ("000000.npy", "000001.npy"):
+        shutil.copy(small_recording / name, finished_run.parent)
+    said = refused(*command.format(recording=small_recording, run=finished_run, place="/proc/self/task").split())
     assert "/task" in said
     assert "cannot be written" in said
 

@@ -33,9 +33,6 @@ from pathlib import Path
 name = Path(json.loads(sys.argv[-1])["request"]["out"]).name
 print("1 5", flush=True)
 if name == "kiss-icp@1": os.abort()
-if name == "kiss-icp@2":
-    held = []
-    while True: held.append(b"x" * 10_000_000); time.sleep(0.01)
 if name == "kiss-icp@3": time.sleep(60)
 if name == "kiss-icp@4": raise RuntimeError("no such thing")
 if name == "kiss-icp@5": raise MemoryError
@@ -122,12 +119,11 @@ def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(
 def test_whatever_a_method_dies_of_is_its_row(
     recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
 ) -> None:
-    names = "".join(f"kiss-icp@{number}," for number in (1, 2, 4, 5, 6, 7))
+    names = "".join(f"kiss-icp@{number}," for number in (1, 4, 5, 6, 7))
     request = _request(recording, tmp_path, names + "prior", limits=Limits(memory_mb=1000.0))
     outcome = compare(request, told.narrator, faults)
     assert [(row.status, row.message) for row in outcome.comparison.sequences[0].methods] == [
         ("failed", "Aborted (signal 6)"),
-        ("out of memory", "took more than 1,000 MB"),
         ("failed", "RuntimeError: no such thing"),
         ("out of memory", "MemoryError"),
         ("out of memory", "killed by the system (signal 9), as it does when memory runs out"),

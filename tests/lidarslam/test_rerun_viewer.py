@@ -4,7 +4,6 @@ import ast
 import http.client
 import os
 import re
-import resource
 import signal
 import socket
 import time
@@ -31,6 +30,8 @@ from lidarslam.viewer.rerun_recording import (
     show_in_window,
 )
 from lidarslam.viewer.rerun_scenes import show_runs
+
+from .conftest import files_no_longer_than
 
 LISTENER = """#!/usr/bin/env python3
 import os, socket, sys, time
@@ -61,20 +62,14 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
 ) -> None:
     """Rerun's own writer is never told, because it may wait without end then; the room it took is given back."""
     monkeypatch.setattr(rerun_environment, "abandoned", False)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     begun = time.monotonic()
-    try:
-        with (
-            pytest.raises(IncompleteRecordingError, match="is the disk full"),
-            rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
-        ):
-            for seed in range(20):
-                viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
+    with (
+        files_no_longer_than(size),
+        pytest.raises(IncompleteRecordingError, match="is the disk full"),
+        rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
+    ):
+        for seed in range(20):
+            viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
     assert time.monotonic() - begun < 10
     assert (tmp_path / "recording.rrd").stat().st_size == 0
     assert not rerun_environment.abandoned

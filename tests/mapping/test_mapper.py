@@ -86,15 +86,6 @@ def settled(rest_scans: list[Scan]) -> Mapper:
     return mapper
 
 
-@pytest.mark.parametrize("config", [SURFELS, LOAM], ids=["surfels", "loam"])
-def test_the_first_scan_is_the_world(config, ring_scans):
-    mapper = Mapper(config)
-    (first,) = process(mapper, ring_scans[:1])
-    np.testing.assert_array_equal(first.state.T_world_lidar, np.eye(4))
-    assert (first.status, first.registered, first.added, first.fit) == (Status.OK, False, True, None)
-    assert min(len(grid) for grid in mapper.local_map.grids) > 10
-
-
 @pytest.mark.parametrize(("sensor", "kind"), [("vlp-16", SurfelMap), ("mid-360", FeatureMap)])
 def test_without_rings_planes_pass_through_neighbouring_voxels(scan_room, sensor, kind):
     mapper = Mapper(SURFELS)
@@ -217,16 +208,6 @@ def test_a_place_that_no_motion_leads_to_is_not_taken_until_driving_decides(sett
     assert [one.status for one in found[:4]] == [Status.LOST] * 4
     assert found[-1].status is Status.OK
     assert_near(found[-1].state.T_world_lidar, inverse(rest_truth.T_world_lidar[0]) @ T_turned, 0.05, 0.1)
-
-
-def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans, monkeypatch):
-    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 3)
-    mapper = Mapper(MappingConfig())
-    process(mapper, rest_scans[:10])
-    stamps = rest_scans[9].stamp + 0.1 * np.arange(1, 4)
-    lost = process(mapper, [garbage(float(stamp), seed) for seed, stamp in enumerate(stamps)])
-    assert [result.status for result in lost] == [Status.LOST] * 3
-    assert ["a new map begins here" in result.message for result in lost] == [False, False, True]
 
 
 def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(rest_scans, rest_truth, monkeypatch):

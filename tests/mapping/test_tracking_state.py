@@ -11,7 +11,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.tracking.fit import NO_FIT
 from lidarslam.mapping.tracking.mapped_scan import Attempt
-from lidarslam.mapping.tracking.tracking_state import TrackingState
+from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER, TrackingState
 
 FOUND = TrackingState().registered(Status.OK, True, 0.8, 5.0)
 
@@ -31,7 +31,12 @@ def test_the_pose_is_uncertain_after_a_gap_and_after_a_lost_scan_until_one_is_re
     assert not registered(lost, 1, Status.OK).is_uncertain(0.1)
 
 
-def test_scans_that_saw_nothing_are_no_reason_to_give_the_map_up():
+def test_the_map_is_given_up_after_so_many_lost_scans_unless_they_saw_nothing():
+    state = TrackingState()
+    for _ in range(GIVE_UP_AFTER):
+        assert not state.gives_up
+        state = state.lost(has_points=True)
+    assert state.gives_up
     state = TrackingState()
     for _ in range(50):
         state = state.lost(has_points=False)
