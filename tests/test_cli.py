@@ -31,11 +31,8 @@ def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) ->
     return write_recording(tmp_path / "room", room_scans[:5], room_truth)
 
 
-RUN, COMPARE, TRAIN = (
-    ("run", "{recording}", "--out", "{out}"),
-    ("compare", "--out", "{out}"),
-    ("train", "--out", "{out}"),
-)
+OUT = ("--out", "{out}")
+RUN, COMPARE, TRAIN = ("run", "{recording}", *OUT), ("compare", *OUT), ("train", *OUT)
 
 
 def test_every_command_has_a_whole_summary_and_help_with_an_example() -> None:

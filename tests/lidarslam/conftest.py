@@ -25,6 +25,7 @@ from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
 from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam, succeeds, write_recording
+from .killable import Ended, serving
 
 FAST = ("--odometry", "constant-velocity", "--no-report")
 
@@ -118,6 +119,13 @@ class Told:
 @pytest.fixture
 def told() -> Told:
     return Told()
+
+
+@pytest.fixture(scope="module")
+def killable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Ended]]:
+    """Carries out commands in processes of their own."""
+    with serving(tmp_path_factory.mktemp("log") / "log") as carry_out:
+        yield carry_out
 
 
 @pytest.fixture(scope="session")

@@ -10,23 +10,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lidarslam.config.settings import Config
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.odometry.interface import Motion, Odometry
+from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, SweepMotion
 from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
+
+from ..mapping.runs import errors
 
 BEFORE, AFTER = np.arange(6.0), np.arange(6.0) ** 2 - 3.0
 
@@ -83,9 +85,8 @@ def true_motions(truth: FloatArray, variance: float) -> list[Motion]:
 
 
 def errors_of(localised: list[ScanEstimate], truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances in metres and angles in degrees."""
-    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
-    return np.linalg.norm(errors[:, :3, 3], axis=1), np.rad2deg(rotation_angle(errors))
+    """Metres (N,) and degrees (N,), in the world of the first scan."""
+    return errors(np.array([result.T_world_lidar for result in localised]), inverse(truth[0]) @ truth)
 
 
 def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
@@ -158,12 +159,12 @@ def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> N
     assert distances_m[settled].max() < 0.01
 
 
-def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanEstimate], Pipeline]:
+def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
+    motions = room_truth.relative_motions() @ exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
+    odometry = ExternalOdometry(Trajectory(room_truth.stamps, chain(np.eye(4), motions)))
     pipeline = Pipeline(odometry, ScanToMap(Mapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
-    return list(pipeline.run(scans)), pipeline
-
-
-def check_poses_and_map(results: list[ScanEstimate], pipeline: Pipeline, room: Any, room_truth: Trajectory) -> None:
+    results = list(pipeline.run(room_scans))
     distances_m, angles_deg = errors_of(results, room_truth.T_world_lidar)
     assert distances_m.max() < 0.01
     assert angles_deg.max() < 0.1
@@ -172,14 +173,6 @@ def check_poses_and_map(results: list[ScanEstimate], pipeline: Pipeline, room: A
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 0.005
     assert np.percentile(distance, 99) < 0.06
-
-
-def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
-    """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
-    motions = room_truth.relative_motions() @ exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
-    poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
-    results, pipeline = run(ExternalOdometry(Trajectory(room_truth.stamps, poses)), room_scans)
-    check_poses_and_map(results, pipeline, room, room_truth)
 
 
 def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:

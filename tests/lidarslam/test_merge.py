@@ -1,10 +1,8 @@
 """Several recordings of one simulated office become one map; one of another office does not."""
 
 import json
-import os
 import re
-import subprocess
-import sys
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -31,6 +29,7 @@ from lidarslam.storage.finished_run import load_map, load_run
 
 from ..conftest import write_recording
 from .conftest import quiet
+from .killable import Ended
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 PARTS = ("01_first", "02_foreign", "03_second")
@@ -262,58 +261,20 @@ def test_an_interrupted_merge_goes_on_where_it_was(
         merge(request(out, *rooms, settings=FAST, resume=True), quiet)
 
 
-KILLED_MERGE = """
-import os, signal, sys
-import lidarslam.merge.merge, mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
-from lidarslam.cli import main
-
-count = 0
-
-def see(event, args):
-    global count
-    if event in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") and str(args[0]).startswith(sys.argv[1]):
-        count += 1
-        if count == kill_at:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-pids, kills = [], [int(number) for number in sys.argv[2].split(",")]
-for kill_at in kills:
-    pid = os.fork()
-    if pid == 0:
-        sys.argv[1] = f"{sys.argv[1]}/{kill_at}"
-        sys.addaudithook(see)
-        try:
-            main(["merge", *sys.argv[3:], "--out", sys.argv[1]])
-        finally:
-            print(count)
-            sys.stdout.flush()
-            os._exit(0)
-    os.waitpid(pid, 0)
-"""
-
-
-def killed_merges(root: Path, kills: list[int], rooms: list[Path], *more: str) -> str:
-    """Merge into root/K for every K, each killed as it is about to do the Kth thing there; what was said."""
-    arguments = [argument for setting in (*SETTINGS, *FAST) for argument in ("--set", setting)]
-    kill = ",".join(map(str, kills))
-    command = [sys.executable, "-c", KILLED_MERGE, str(root), kill, *map(str, rooms), *arguments, *more]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
-
-
 @pytest.mark.slow
 def test_a_killed_merge_is_refused_and_resumed_or_made_again(
-    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
+    rooms: list[Path], tmp_path: Path, killable: Callable[..., Ended], timeless: Callable[[Path], dict[str, Any]]
 ) -> None:
     """Killed as it begins, halfway and among its results, it leaves no run and no map."""
     rooms = rooms[:2]
-    whole = tmp_path / "whole" / "1000000"
-    things = int(killed_merges(whole.parent, [1_000_000], rooms).splitlines()[-1])
+    whole, command = tmp_path / "whole", ["merge", *rooms]
+    command += [argument for setting in (*SETTINGS, *FAST) for argument in ("--set", setting)]
+    things = killable(*command, out=whole).events
     assert (whole / "map.ply").is_file(), "the merge that was not killed ended before its results"
     kills = [round(share * things) for share in (0.2, 0.5, 0.75)]
-    killed_merges(tmp_path / "killed", kills, rooms)
     for kill_at in kills:
         out = tmp_path / "killed" / str(kill_at)
+        assert killable(*command, out=out, kill_at=kill_at).status == -signal.SIGKILL
         again = f"this merge did not finish; resume it with lidarslam merge {rooms[0]} {rooms[1]} --out {out} --resume"
         with pytest.raises(InputError, match=re.escape(again)):
             load_map(out)

@@ -2,14 +2,10 @@
 
 import hashlib
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,124 +21,18 @@ from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 from lidarslam.storage.finished_run import load_run
 
 from ..conftest import lidarslam
+from .killable import Ended
 
-ROOT = Path(__file__).parents[2]
-KILL = signal.SIGKILL
-KILLED = -KILL
-
-# Loads the program once, and for every line forks a run of it; told to, that kills itself without further notice as it
-# is about to do something to its directory, or at some time. It counts what it does there, and may keep what lies there
-# before each of these things, which is what a run that is killed then leaves.
-SERVER = """
-import json, os, shutil, signal, sys, threading
-from pathlib import Path
-import lidarslam.viewer.rerun_recording, lidarslam.run.run
-import mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
-import lidarslam.odometry.methods.learned
-from lidarslam.cli import main
-
-EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fsync"}
-
-def run(order):
-    log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
-    count, busy = 0, threading.local()
-
-    def see(event, args):
-        nonlocal count
-        if event not in EVENTS or not (event == "fsync" or str(args[0]).startswith(order["out"])):
-            return
-        if hasattr(busy, "copying"):
-            return
-        count += 1
-        if order["keep_in"] is not None and os.path.isdir(order["out"]):
-            busy.copying = True
-            shutil.copytree(order["out"], os.path.join(order["keep_in"], str(count)))
-            del busy.copying
-        if count == order["kill_at"]:
-            os.kill(os.getpid(), order["signal"])
-
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.addaudithook(see)
-    fsync = os.fsync
-    os.fsync = lambda handle: (see("fsync", ()), fsync(handle))[1]
-    if order["kill_after_s"] is not None:
-        threading.Timer(order["kill_after_s"], lambda: os.kill(os.getpid(), signal.SIGKILL)).start()
-    status = 0
-    try:
-        main(order["arguments"])
-    except SystemExit as end:
-        status = end.code or 0
-    Path(order["log"] + ".count").write_text(str(count))
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
-
-print("ready", flush=True)
-for line in sys.stdin:
-    pid = os.fork()
-    if pid == 0:
-        run(json.loads(line))
-    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
-"""
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How a command ended."""
-
-    status: int
-    said: str
-    events: int
-    seconds: float
-
+KILLED = -signal.SIGKILL
 
 Run = Callable[..., Ended]
 Timeless = Callable[[Path], dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(killable: Run) -> Run:
     """Runs `lidarslam run SOURCE --out OUT ...`."""
-    log = tmp_path_factory.mktemp("log") / "log"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command, pipe = [sys.executable, "-c", SERVER], subprocess.PIPE
-    server = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=ROOT)
-    assert server.stdin is not None
-    assert server.stdout is not None
-    assert server.stdout.readline() == "ready\n"
-
-    def run(
-        source: Path,
-        out: Path,
-        *arguments: str,
-        kill_at: int | None = None,
-        kill_after_s: float | None = None,
-        signal: int = KILL,
-        keep_in: Path | None = None,
-    ) -> Ended:
-        order = {
-            "arguments": ["run", str(source), "--out", str(out), *arguments],
-            "out": str(out),
-            "log": str(log),
-            "kill_at": kill_at,
-            "kill_after_s": kill_after_s,
-            "signal": int(signal),
-            "keep_in": None if keep_in is None else str(keep_in),
-        }
-        count = Path(f"{log}.count")
-        count.unlink(missing_ok=True)
-        server.stdin.write(json.dumps(order) + "\n")
-        server.stdin.flush()
-        started = time.monotonic()
-        status = int(server.stdout.readline())
-        events = int(count.read_text()) if count.is_file() else -1
-        return Ended(status, log.read_text(), events, time.monotonic() - started)
-
-    yield run
-    server.stdin.close()
-    server.wait()
+    return lambda source, out, *arguments, **kill: killable("run", source, *arguments, out=out, **kill)
 
 
 SCANS = 34

@@ -125,6 +125,8 @@ def test_poses_are_true_from_wrong_priors(mapper, rng, rest_scans, rest_truth):
 def test_poses_are_true_with_the_true_motion(config, recording, metres, degrees, room_truth, request):
     results = process(Mapper(config), request.getfixturevalue(recording), true_priors(room_truth))
     assert_true(results, room_truth.T_world_lidar, metres, degrees)
+    np.testing.assert_array_equal(results[0].state.T_world_lidar, np.eye(4))
+    assert (results[0].registered, results[0].added, results[0].fit) == (False, True, None)
     assert all(result.registered and result.added and result.is_connected for result in results[1:])
 
 

@@ -5,11 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
+from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.edges import Attitude, first_connected
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, RelaxSchedule, bounded, optimise, relax
+
+from .runs import assert_near
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2
 TIGHT = np.diag([0.002, 0.001, 0.003, 0.03, 0.02, 0.01]) ** 2
@@ -55,13 +57,6 @@ def drifted(edges: Sequence[RelativePose], count: int) -> FloatArray:
     """Poses from the chain alone."""
     steps = {e.first: e.T_first_second for e in edges if e.second == e.first + 1}
     return chain(np.eye(4), np.stack([steps[key] for key in range(count - 1)]))
-
-
-def assert_near(actual: FloatArray, expected: FloatArray, tolerance: float) -> None:
-    assert actual.shape == expected.shape
-    apart = inverse(actual) @ expected
-    assert float(np.linalg.norm(apart[:, :3, 3], axis=1).max()) < tolerance
-    assert float(rotation_angle(apart).max()) < tolerance
 
 
 def test_a_drifted_square_with_one_exact_closure_becomes_exact():
