@@ -6,6 +6,8 @@ import re
 import resource
 import shutil
 import struct
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -259,3 +261,16 @@ def test_settings_of_any_value(chosen: list[tuple[str, object]]) -> None:
 def test_a_damaged_configuration(tmp_path: Path, made: list[Change]) -> None:
     (tmp_path / "config.yaml").write_bytes(changed(dump_yaml(Config()).encode(), made))
     ends_well("config", "--config", tmp_path / "config.yaml")
+
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "fuzz_decoders.py"
+DECODERS = ("ply", "pcd", "npy", "mcap", "bag", "db3", "message", "tum", "yaml", "summary", "about")
+
+
+@pytest.mark.parametrize("decoder", DECODERS)
+def test_no_input_of_a_decoder_ends_otherwise(decoder: str) -> None:
+    pytest.importorskip("atheris", reason="needs the extra fuzz")
+    command = [sys.executable, str(SCRIPT), decoder, "--runs", "2000", "--seconds", "60"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert "DONE" in ended.stderr

@@ -1,5 +1,8 @@
-"""The log of a run: its table, its trajectories, its state, and its summary."""
+"""What is kept and said of a run: its log, its summary, what it was made with, and its progress bar."""
 
+import io
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +12,9 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
+from lidarslam.run import machine as described
+from lidarslam.run.machine import versions
+from lidarslam.run.progress import show_progress
 from lidarslam.run.results import format_times
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import Milliseconds, SlowestScan, WrittenMap, summarise
@@ -122,3 +128,43 @@ def test_a_first_motion_counts_as_unknown_where_no_vehicle_accelerates_to_the_se
     for scan, x_m in enumerate(np.cumsum([0.0, 2.0, second_m, 0.1, 0.1, 0.1])):
         log.add(result(0.3 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])))
     assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
+
+
+def test_the_programs_that_results_depend_on_are_named() -> None:
+    found = versions()
+    assert {"lidarslam", "kiss-icp", "numpy", "onnxruntime", "python"} <= set(found)
+    assert {"open3d", "open3d-cpu"} & set(found)
+    assert all(found.values())
+
+
+def _git(folder: Path, *arguments: str) -> None:
+    names = ("-c", "user.name=n", "-c", "user.email=e@example.org")
+    subprocess.run(["git", "-C", str(folder), *names, *arguments], check=True, capture_output=True)
+
+
+def test_a_checkout_has_a_commit_and_says_that_files_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(described, "__file__", str(tmp_path / "lidarslam" / "run" / "machine.py"))
+    assert "commit" not in versions()
+    _git(tmp_path, "init")
+    (tmp_path / "a").write_text("1")
+    _git(tmp_path, "add", "a")
+    _git(tmp_path, "commit", "-m", "first", "--no-verify")
+    commit = versions()["commit"]
+    assert len(commit) == 12
+    (tmp_path / "a").write_text("2")
+    assert versions()["commit"] == f"{commit}-dirty"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_before_the_first_scan_the_bar_says_what_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with show_progress("a[red]b[/nothing]") as progress:
+        progress.phase("compiling loops")
+    assert "compiling loops" in terminal.getvalue()
+    assert "a[red]b[/nothing]" in terminal.getvalue()
