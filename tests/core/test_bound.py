@@ -64,7 +64,6 @@ def test_who_is_killed_leaves_no_process_behind(
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
     ) as parent:
-        assert parent.stdout is not None
         children = [int(word) for word in parent.stdout.readline().split()]
         assert children
         time.sleep(0.2)  # until it is watched
@@ -76,7 +75,6 @@ def test_a_process_and_its_children_end_with_the_context(still_runs: Callable[[i
     with subprocess.Popen(
         [sys.executable, "-c", FAMILY], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
-        assert process.stdout is not None
         with bound(process):
             family = [int(word) for word in process.stdout.readline().split()]
     assert not [one for one in family if still_runs(one)]

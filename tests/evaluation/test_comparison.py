@@ -76,7 +76,7 @@ def test_a_method_without_anything_is_null_and_never_0() -> None:
 def test_one_recording_has_its_own_keys_and_several_a_list(result: MethodResult) -> None:
     one = Comparison("t", "c", [_sequence("04", result)], notes=["n"]).to_json()
     assert one["sequence"] == "04"
-    assert set(one["methods"]) == {"kiss-icp"}  # type: ignore[call-overload]
+    assert set(one["methods"]) == {"kiss-icp"}
     assert one["notes"] == ["n"]
     missing = [MissingRecording("06", "data/06", "not there")]
     several = Comparison("t", "c", [_sequence("04", result), _sequence("05", result)], missing=missing)

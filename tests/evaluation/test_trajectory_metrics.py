@@ -173,7 +173,6 @@ def test_of_two_drives(bend: FloatArray, rng: np.random.Generator) -> None:
     elsewhere, lost = bend[:, [1, 2, 0]] * [3, 1, -2] + 9 * np.sin(bend), rng.normal(0, 50, bend.shape)
     for estimate in (elsewhere, lost, 0.001 * bend[::-1], 1_000.0 * bend):
         said = disagreement(evaluate_trajectory(along(estimate), along(bend)))
-        assert said is not None
         assert "does not follow its reference" in said
 
 
@@ -184,6 +183,5 @@ def test_quaternions_in_another_order_and_orientations_of_a_camera(random_drive)
     for R in (Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix(), other[:, :3, :3] @ forward.T):
         other[:, :3, :3] = R
         said = disagreement(evaluate_trajectory(reference, Trajectory(reference.stamps, other)))
-        assert said is not None
         assert "begin with qw" in said
     assert disagreement(evaluate_trajectory(reference, reference)) is None

@@ -83,8 +83,6 @@ def serving(log: Path) -> Iterator[Callable[..., Ended]]:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     command, pipe = [sys.executable, "-c", SERVER], subprocess.PIPE
     server = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=ROOT)
-    assert server.stdin is not None
-    assert server.stdout is not None
     assert server.stdout.readline() == "ready\n"
 
     def carry_out(

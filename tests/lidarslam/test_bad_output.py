@@ -242,7 +242,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     """The recording is a minute long; the request comes in its first seconds."""
     source, out = tmp_path / "room", tmp_path / "run"
     source.mkdir()
-    points: FloatArray = room_scans[0].points  # type: ignore[attr-defined]
+    points: FloatArray = room_scans[0].points
     for index in range(2):  # a scan with the points of the one before would be left out
         np.save(source / f"{index:06d}.npy", points[index:])
     for index in range(2, 3_000):

@@ -298,7 +298,6 @@ def test_time_and_the_memory_of_all_processes_are_measured(run: Run) -> None:
     child = "import time; held = bytearray(100_000_000); held[::4096] = b'x' * len(held[::4096]); time.sleep(0.8)"
     ending = run(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])")
     assert 0.8 < ending.wall_s < 10.0
-    assert ending.peak_rss_mb is not None
     assert 100.0 < ending.peak_rss_mb < 300.0
 
 
@@ -316,7 +315,6 @@ def test_one_that_eats_memory_is_ended(run: Run) -> None:
     code = "import time; held = []\nwhile True: held.append(b'x' * 10_000_000); time.sleep(0.02)"
     ending = run(code, memory_mb=150.0, timeout_s=30.0)
     assert ending.cause == "memory"
-    assert ending.peak_rss_mb is not None
     assert 150.0 < ending.peak_rss_mb < 2000.0
 
 

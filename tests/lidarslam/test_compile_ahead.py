@@ -90,7 +90,7 @@ class Popen(subprocess.Popen[bytes]):
     code = "import time; time.sleep(60)"
 
     def __init__(self, command: list[str], **options: object) -> None:
-        super().__init__([command[0], "-c", self.code], **options)  # type: ignore[call-overload]
+        super().__init__([command[0], "-c", self.code], **options)
 
 
 @pytest.fixture

@@ -62,7 +62,7 @@ def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     add = ScanLog.add
 
     def pressing(self: ScanLog, *given: object) -> None:
-        add(self, *given)  # type: ignore[arg-type]
+        add(self, *given)
         if len(self) == number:
             press()
 

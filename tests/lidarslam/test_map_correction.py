@@ -122,12 +122,10 @@ def test_a_map_that_waits_is_in_the_state(
     graph, rest = Graph(), Graph()
     keeper = Keeper(at, graph, through_disk)
     poses_with(graph, keeper)
-    assert keeper.saved is not None
     rest.scans = keeper.scans
     odometry = ExternalOdometry(room_truth)
     resumed = pipeline_of(odometry, rest)
     resumed.restore(keeper.saved)
-    assert resumed.held is not None
     odometry.estimate(resumed.held.scan)
     done = len(keeper.scans)
     assert resumed.held.scan.stamp == room_scans[done].stamp
@@ -144,7 +142,6 @@ def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
     for scan in room_scans[:6]:  # the map begins anew with the second one, when the first one's velocity is known
         mapper.process(mapper.sample(scan), Prior())
     begun, cell_m = mapper.local_map, mapper.local_map.cell_m
-    assert cell_m is not None
     assert not mapper.redraw(SurfelMap(cell_m, CONFIG.radius_m), 5)
     assert mapper.local_map is begun
     drawn = SurfelMap(cell_m, CONFIG.radius_m)
@@ -163,5 +160,4 @@ def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
 )
 def test_runs_with_a_graph_correct_their_map_unless_told_otherwise(settings: list[str], kept_scans: int) -> None:
     mapper = make_localiser(load_config(None, settings)).mapper
-    assert mapper is not None
     assert mapper.kept_scans == kept_scans

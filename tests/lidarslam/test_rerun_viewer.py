@@ -241,7 +241,6 @@ def serve() -> "Iterator[Serve]":
         command = [sys.executable, "-m", "lidarslam", *map(str, arguments)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         started.append(process)
-        assert process.stdout is not None
         address = process.stdout.readline().strip()
         assert address.startswith("http://127.0.0.1:"), address
         return process, address
@@ -273,7 +272,6 @@ def test_a_run_is_served_while_it_goes_on_and_afterwards(serve: Serve, small_rec
     process, address = serve("run", small_recording, "--out", out, "--odometry", "constant-velocity", "--rerun", "web")
     with urlopen(f"{address}/recording.rrd", timeout=300) as recording:
         seen = recording.read()
-    assert process.stdout is not None
     lines = []
     while "until Ctrl-C; later" not in (line := process.stdout.readline()):
         assert line or process.poll() is None, "ended early"

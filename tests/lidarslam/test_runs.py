@@ -112,7 +112,6 @@ def turning(rates: FloatArray, interval_s: float = 0.1) -> Trajectory:
 def test_the_ratio_of_the_turn_rates_is_that_of_the_times(ratio: float, fault: str | None) -> None:
     rates = 0.5 * np.sin(STAMPS)
     found = time_scale(turning(rates), ratio * np.outer(rates, [0.0, 0.0, 1.0]), np.full(60, True))
-    assert found is not None
     assert found[0] == pytest.approx(ratio, rel=0.01)
     warning = time_scale_warning(found)
     assert (warning is None) == (fault is None)
@@ -153,7 +152,6 @@ def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: 
 def test_the_scale_holds_for_any_mounting(walk: Path, mounting: str) -> None:
     configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))
     (recorded,), (scaled,) = (list(open_recording(walk, config).scans(stop=1)) for config in configs)
-    assert recorded.time_offsets is not None
     np.testing.assert_array_equal(scaled.time_offsets, -0.5 * recorded.time_offsets)
 
 
@@ -170,7 +168,7 @@ def low(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
     street = replace(room, half_size=(60.0, 9.0, 3.0), pillars=pillars, points=20_000)
     for number in range(STREET_SCANS):
         T = exp(np.array([0.0, 0.0, 0.0, -20.0 + 1.2 * number, 0.0, -1.0]))
-        points = street.sweep(lambda times, T=T: np.tile(T, (len(times), 1, 1)), 0.1 * number).points  # type: ignore[misc]
+        points = street.sweep(lambda times, T=T: np.tile(T, (len(times), 1, 1)), 0.1 * number).points
         np.save(folder / f"{number:06d}.npy", correct_elevation(points, -LOW_DEG))
     return folder
 
@@ -203,7 +201,7 @@ def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mounting", ["upright", "upside-down"])
 def test_any_reader_raises_points_above_the_recorded_plane(low: Path, mounting: str) -> None:
-    config = ReaderConfig(mounting=mounting, elevation_correction_deg=0.0)  # type: ignore[arg-type]
+    config = ReaderConfig(mounting=mounting, elevation_correction_deg=0.0)
     plain = next(open_recording(low, config).scans()).points
     raised = next(open_recording(low, config.model_copy(update={"elevation_correction_deg": 0.3})).scans()).points
     elevations = [np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) for p in (plain, raised)]
@@ -255,10 +253,8 @@ def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path,
 def test_a_large_map_is_sampled_by_blocks_and_no_map_has_no_entropy(rng: np.random.Generator) -> None:
     ground = rng.uniform(-60.0, 60.0, (400_000, 3)) * [1.0, 1.0, 0.0005]
     part = sampled_map_entropy(ground, 100_000)
-    assert part is not None
     assert 2_000 < part.points <= 10_000
     one, other = sampled_map_entropy(ground), map_entropy(ground, most_samples=10_000)
-    assert one is not None
     assert one == other
     assert part.mean == pytest.approx(one.mean, abs=0.1)
     assert sampled_map_entropy(np.empty((0, 3))) is None

@@ -85,7 +85,6 @@ def test_evalio_runs_it_and_saves_the_imus_poses_at_the_starts_of_the_sweeps(
     np.save(tmp_path / "imu_T_lidar.npy", T_imu_lidar)
     starts = []
     for index, scan in enumerate(room_scans[:6]):
-        assert scan.time_offsets is not None
         first = float(scan.time_offsets.min())
         starts.append(scan.stamp + first)
         times = scan.time_offsets - first

@@ -84,7 +84,7 @@ def test_scans_in_a_gap_or_far_outside_the_poses_have_none() -> None:
 
 def test_poses_that_are_none_are_an_error() -> None:
     exact = _Exact()
-    exact.finish = lambda: Poses(np.arange(2.0), np.full((2, 4, 4), np.nan))  # type: ignore[method-assign]
+    exact.finish = lambda: Poses(np.arange(2.0), np.full((2, 4, 4), np.nan))
     with pytest.raises(PeerError, match="not finite"):
         estimate(_peer(exact), _scans(3))
 
