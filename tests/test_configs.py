@@ -17,14 +17,14 @@ CONFIGS = Path(__file__).parent.parent / "configs"
 @pytest.mark.parametrize(
     "path", sorted(set(CONFIGS.glob("**/*.yaml")) - set(CONFIGS.glob("benchmarks/*"))), ids=lambda path: path.name
 )
-def test_every_shipped_file_loads_and_differs_from_the_defaults(path: Path) -> None:
+def test_every_shipped_file_loads_and_differs_from_the_defaults(path):
     if path.name.startswith("train_"):
         assert load_train_config(path) != TrainConfig()
     else:
         assert load_config(path) != Config()
 
 
-def test_settings_win_over_the_file(tmp_path: Path) -> None:
+def test_settings_win_over_the_file(tmp_path):
     file = tmp_path / "config.yaml"
     file.write_text("odometry: {kiss_icp: {voxel_size_m: 0.5, max_range_m: 40}}\n")
     config = load_config(file, ["odometry.kiss_icp.voxel_size_m=0.25"])
@@ -33,9 +33,7 @@ def test_settings_win_over_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", get_args(MappingName))
-def test_every_mapping_is_a_word_also_off_and_is_dumped_so_that_it_loads_again(
-    tmp_path: Path, method: MappingName
-) -> None:
+def test_every_mapping_is_a_word_also_off_and_is_dumped_so_that_it_loads_again(tmp_path, method):
     file = tmp_path / "config.yaml"
     for text in (f"mapping: {{method: {method}}}", dump_yaml(Config(mapping=MappingConfig(method=method)))):
         file.write_text(text)
@@ -45,7 +43,7 @@ def test_every_mapping_is_a_word_also_off_and_is_dumped_so_that_it_loads_again(
 
 
 @pytest.mark.parametrize("text", ["04", "it's", "'", "null", "a: b"])
-def test_the_readers_options_stay_text(text: str) -> None:
+def test_the_readers_options_stay_text(text):
     config = load_config(None, reader_settings(name=None, topic=text, sequence=text))
     assert (config.reader.name, config.reader.topic, config.reader.sequence) == (None, text, text)
 
@@ -66,7 +64,7 @@ def test_the_readers_options_stay_text(text: str) -> None:
         (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),
     ],
 )
-def test_mistakes_are_named(settings: list[str], message: str) -> None:
+def test_mistakes_are_named(settings, message):
     with pytest.raises(ConfigError, match=message):
         load_config(None, settings)
 
@@ -80,7 +78,7 @@ def test_mistakes_are_named(settings: list[str], message: str) -> None:
         (b"#" * (5 << 20), "longer than 4 MB"),
     ],
 )
-def test_broken_files_are_named(tmp_path: Path, text: str | bytes, message: str) -> None:
+def test_broken_files_are_named(tmp_path, text, message):
     file = tmp_path / "broken.yaml"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigError, match=message) as error:
@@ -88,7 +86,7 @@ def test_broken_files_are_named(tmp_path: Path, text: str | bytes, message: str)
     assert "broken.yaml" in str(error.value)
 
 
-def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
+def test_the_origin_is_the_one_that_was_given(tmp_path):
     file = tmp_path / "wrong.yaml"
     file.write_text("global_map: {voxel_size_m: -1}\n")
     for settings, origin in (([], file), (["viewer.map_every=3"], f"{file} or --set")):
@@ -96,7 +94,7 @@ def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
             load_config(file, settings)
 
 
-def test_what_is_dumped_has_comments_and_loads_again_with_the_section_on_the_run(tmp_path: Path) -> None:
+def test_what_is_dumped_has_comments_and_loads_again_with_the_section_on_the_run(tmp_path):
     file, printed = tmp_path / "config.yaml", dump_yaml(Config())
     for config in (Config(), load_config(None, ["reader.sequence='04'", "global_map.voxel_size_m=0.3"])):
         file.write_text(dump_yaml(config, {"version": "0.1.0", "source": "somewhere"}))
@@ -104,13 +102,13 @@ def test_what_is_dumped_has_comments_and_loads_again_with_the_section_on_the_run
     assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed
 
 
-def test_plain_values() -> None:
+def test_plain_values():
     text = "a: {b: [1, 2.5, null, yes]}\nbase: &base {x: 1}\nc:\n  <<: *base\n  x: 2\n"
     assert parse_yaml(text) == {"a": {"b": [1, 2.5, None, True]}, "base": {"x": 1}, "c": {"x": 2}}
 
 
 @pytest.mark.parametrize("text", ["010", "0x10", "0o10", "0b11", "1:30", "1:30.5", "1_000", "1.", "7e3", "-0"])
-def test_a_number_is_decimal_or_a_text(text: str) -> None:
+def test_a_number_is_decimal_or_a_text(text):
     """In YAML 1.1, 010 is eight and 1:30 ninety."""
     numbers = {"1.": 1.0, "-0": 0}
     assert parse_yaml(text) == numbers.get(text, text)
@@ -128,7 +126,7 @@ def test_a_number_is_decimal_or_a_text(text: str) -> None:
         ("? [a]\n: 1", "unhashable key"),
     ],
 )
-def test_anything_else_is_an_error_in_one_line(text: str, message: str) -> None:
+def test_anything_else_is_an_error_in_one_line(text, message):
     with pytest.raises(YamlError, match=message) as raised:
         parse_yaml(text)
     assert "\n" not in str(raised.value)

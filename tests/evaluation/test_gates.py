@@ -52,19 +52,19 @@ def run(tmp_path: Path) -> Path:
         ("a = b: c:lost=0", Gate("max", "lost", 0.0, "a = b: c")),
     ],
 )
-def test_the_grammar(text: str, gate: Gate) -> None:
+def test_the_grammar(text, gate):
     assert parse_gate("max", text, with_method=True) == gate
 
 
 @pytest.mark.parametrize("text", ["ate", "ate=", "=0.1", "ate=nan", "ate=low", ":ate=1", "lost", ""])
-def test_other_forms_are_refused(text: str) -> None:
+def test_other_forms_are_refused(text):
     with pytest.raises(ConfigError, match=r"expected \[METHOD:\]NAME=VALUE"):
         parse_gate("min", text, with_method=True)
     with pytest.raises(ConfigError, match=r"expected NAME=VALUE"):
         parse_gate("min", "learned:ate=0.1")
 
 
-def test_the_names_are_keys_of_the_written_files(run: Path) -> None:
+def test_the_names_are_keys_of_the_written_files(run):
     """Each figure is found in files as the program writes them."""
     written = evaluate(EvaluateRequest(run, reference=run.parent / "truth.tum")).to_json()
     found = {name for name in (*FIGURES, *PATHS) if Gate("max", name, 0.0).of({"metrics": written}) is not None}
@@ -78,7 +78,7 @@ def test_the_names_are_keys_of_the_written_files(run: Path) -> None:
     assert found == expected
 
 
-def test_bounds_are_included_and_null_fails() -> None:
+def test_bounds_are_included_and_null_fails():
     figures = {"metrics": {"trajectory": {"ate_rmse_m": 0.1}, "kitti": None}, "summary": {}}
     bounds = [Gate("max", "ate", 0.1), Gate("min", "ate", 0.1), Gate("max", "ate", 0.09), Gate("min", "ate", 0.11)]
     judged = judge([*bounds, Gate("max", "kitti", 9.0), Gate("max", "lost", 9.0)], figures)
@@ -89,7 +89,7 @@ def test_bounds_are_included_and_null_fails() -> None:
     assert format_gates(judged[:2]).endswith("all 2 passed")
 
 
-def test_a_comparison_is_judged_by_method() -> None:
+def test_a_comparison_is_judged_by_method():
     """The reference has no errors of its own, which is no failure; a method that failed is one."""
     results = [
         MethodResult("reference", "ok", lost=np.zeros(3, np.bool_), run="a"),
@@ -107,7 +107,7 @@ def test_a_comparison_is_judged_by_method() -> None:
     ]
 
 
-def test_the_exit_status_of_evaluate(run: Path) -> None:
+def test_the_exit_status_of_evaluate(run):
     command = ["evaluate", run, "--reference", run.parent / "truth.tum"]
     passed = lidarslam(*command, "--max", "ate=0.04", "--max", f"lost={LOST}", "--min", "matched=240")
     assert passed.exit_code == 0

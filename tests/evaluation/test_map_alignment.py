@@ -50,9 +50,7 @@ def _error(T_a: FloatArray, T_b: FloatArray, points: FloatArray) -> float:
     ],
     ids=["without a guess", "far away, with a wrong one"],
 )
-def test_a_turned_map_is_found(
-    building: FloatArray, rng: np.random.Generator, xi: list[float], origin: FloatArray, guesses: dict[str, FloatArray]
-) -> None:
+def test_a_turned_map_is_found(building, rng, xi, origin, guesses):
     part = building[building[:, 0] < 16.0]
     T_reference_map = exp(xi)
     T_reference_map[:3, 3] += origin
@@ -66,7 +64,7 @@ def test_a_turned_map_is_found(
     assert _error(found.T_reference_map, T_reference_map, seen) < 0.03
 
 
-def test_a_guess_is_refined_and_the_correction_told(building: FloatArray) -> None:
+def test_a_guess_is_refined_and_the_correction_told(building):
     T_off = exp([0.0, 0.0, 0.02, 0.2, -0.1, 0.05])
     seen = transform_points(inverse(T_off), building[::2])
     found = align_map(seen, building, {"file": np.eye(4)})
@@ -77,21 +75,21 @@ def test_a_guess_is_refined_and_the_correction_told(building: FloatArray) -> Non
     assert found.refined
 
 
-def test_without_refinement_the_guess_stands(building: FloatArray) -> None:
+def test_without_refinement_the_guess_stands(building):
     T_off = exp([0.0, 0.0, 0.0, 0.15, 0.0, 0.0])
     found = align_map(building, building, {"none": T_off}, refine=False)
     np.testing.assert_allclose(found.T_reference_map, T_off, atol=1e-12)
     assert (found.moved_m, found.refined, found.method) == (0.0, False, "none")
 
 
-def test_a_guess_that_fits_needs_no_search(building: FloatArray) -> None:
+def test_a_guess_that_fits_needs_no_search(building):
     T_true = exp([0.0, 0.0, 2.0, 30.0, 0.0, 0.0])
     seen = transform_points(inverse(T_true), building[::2])
     assert align_map(seen, building, {"trajectory": T_true}, search=True).method == "trajectory"
 
 
 @pytest.mark.long
-def test_another_place_is_refused(building: FloatArray) -> None:
+def test_another_place_is_refused(building):
     rng = np.random.default_rng(3)
     elsewhere = rng.uniform(0.0, 12.0, (4_000, 3))
     with pytest.raises(InputError, match=r"cannot be aligned with its reference .* --map-alignment FILE"):
@@ -102,7 +100,7 @@ def test_another_place_is_refused(building: FloatArray) -> None:
     assert taken.inlier_rmse_m is None
 
 
-def test_a_place_with_two_fitting_poses_is_refused() -> None:
+def test_a_place_with_two_fitting_poses_is_refused():
     """An empty box looks the same when it is turned by 180 degrees."""
     box = on_boxes([((6, 4, 1.5), (6, 4, 1.5))], 1.0 / 25.0, np.random.default_rng(0))
     seen = transform_points(exp([0.0, 0.0, 1.2, 1.0, 2.0, 0.0]), box[::2])
@@ -111,7 +109,7 @@ def test_a_place_with_two_fitting_poses_is_refused() -> None:
 
 
 @pytest.mark.long
-def test_the_pose_is_the_same_for_any_number_of_threads() -> None:
+def test_the_pose_is_the_same_for_any_number_of_threads():
     """Sums of several threads have no fixed order."""
     root = str(Path(__file__).parents[2])
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")

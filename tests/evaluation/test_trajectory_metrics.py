@@ -161,7 +161,7 @@ def bend() -> FloatArray:
     return 10.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle])
 
 
-def test_of_one_drive(bend: FloatArray, rng: np.random.Generator) -> None:
+def test_of_one_drive(bend, rng):
     drift = np.linspace(0.0, 3.0, len(bend))[:, None] * [1.0, 0.0, 0.0]
     for estimate in (bend, bend + drift, bend + rng.normal(0.0, 0.1, bend.shape)):
         assert disagreement(evaluate_trajectory(along(estimate), along(bend))) is None
@@ -169,14 +169,14 @@ def test_of_one_drive(bend: FloatArray, rng: np.random.Generator) -> None:
     assert disagreement(evaluate_trajectory(along(standing), along(0.0 * bend))) is None
 
 
-def test_of_two_drives(bend: FloatArray, rng: np.random.Generator) -> None:
+def test_of_two_drives(bend, rng):
     elsewhere, lost = bend[:, [1, 2, 0]] * [3, 1, -2] + 9 * np.sin(bend), rng.normal(0, 50, bend.shape)
     for estimate in (elsewhere, lost, 0.001 * bend[::-1], 1_000.0 * bend):
         said = disagreement(evaluate_trajectory(along(estimate), along(bend)))
         assert "does not follow its reference" in said
 
 
-def test_quaternions_in_another_order_and_orientations_of_a_camera(random_drive) -> None:
+def test_quaternions_in_another_order_and_orientations_of_a_camera(random_drive):
     reference = random_drive(3)
     quaternions = Rotation.from_matrix(reference.T_world_lidar[:, :3, :3]).as_quat()
     forward, other = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), reference.T_world_lidar.copy()

@@ -1,7 +1,6 @@
 """Configurations, weights and trajectories that are not what they should be: one line, exit status 1, nothing run."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
     ],
     ids=range(5),
 )
-def test_a_bad_configuration_file(tmp_path: Path, text: str, message: str) -> None:
+def test_a_bad_configuration_file(tmp_path, text, message):
     (tmp_path / "config.yaml").write_text(text)
     said = refused("config", "--config", tmp_path / "config.yaml")
     assert message in said
@@ -37,7 +36,7 @@ def test_a_bad_configuration_file(tmp_path: Path, text: str, message: str) -> No
     assert said.strip().isprintable()
 
 
-def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(tmp_path: Path, small_recording: Path) -> None:
+def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(tmp_path, small_recording):
     network = NetworkConfig()
     trained = checkpoint_of(make_network(network), network, ImageConfig(columns=180))
     weights = {key: 1e30 * value if value.is_floating_point() else value for key, value in trained.weights.items()}
@@ -52,9 +51,7 @@ def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(tmp_path
     ("scale", "later_s", "message"),
     [(1e200, 0.0, "expected metres"), (1.0, 1_000.0, "is it of this recording"), (np.nan, 0.0, "that are no poses")],
 )
-def test_a_prior_that_is_none(
-    tmp_path: Path, small_recording: Path, scale: float, later_s: float, message: str
-) -> None:
+def test_a_prior_that_is_none(tmp_path, small_recording, scale, later_s, message):
     table = np.loadtxt(small_recording / "ground_truth.tum")
     np.savetxt(tmp_path / "bad.tum", table * [1.0, scale, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0] + np.eye(8)[0] * later_s)
     said = refused("run", small_recording, "--out", tmp_path / "new", "--prior", tmp_path / "bad.tum")
@@ -63,9 +60,7 @@ def test_a_prior_that_is_none(
 
 
 @pytest.mark.parametrize("mapping", ["off", "surfels"])
-def test_scans_without_a_prior_are_counted_and_without_a_mapping_lost(
-    tmp_path: Path, small_recording: Path, mapping: str
-) -> None:
+def test_scans_without_a_prior_are_counted_and_without_a_mapping_lost(tmp_path, small_recording, mapping):
     out, late = tmp_path / "run", np.loadtxt(small_recording / "ground_truth.tum")
     late[:, 0] += 0.25
     np.savetxt(tmp_path / "late.tum", late, fmt="%.9f")

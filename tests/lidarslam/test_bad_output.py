@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +45,7 @@ def left_in(folder: Path) -> list[str]:
         (4_000, ("--set", "global_map.most_points=2000")),
     ],
 )
-def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, more: Sequence[str]) -> None:
+def test_a_run_on_a_full_disk(tmp_path, small_recording, size, more):
     """The map is 300 kB, the log of the scans 600 bytes, the configuration 3.6 kB."""
     out = tmp_path / "run"
     with files_no_longer_than(size):
@@ -68,9 +67,7 @@ def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, 
     succeeds("run", small_recording, "--out", out, *FAST, "--overwrite")
 
 
-def test_tiles_that_find_no_room_cost_no_other_result(
-    tmp_path: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tiles_that_find_no_room_cost_no_other_result(tmp_path, small_recording, monkeypatch):
     written = []
 
     def full_after_one(path: Path, *_: object) -> None:
@@ -92,7 +89,7 @@ def test_tiles_that_find_no_room_cost_no_other_result(
 
 
 @pytest.mark.parametrize("size", [4_000, 100_000])
-def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recording: Path, size: int) -> None:
+def test_results_of_two_runs_are_not_taken_for_one(tmp_path, small_recording, size):
     """Where the disk fills up as a run replaces an earlier one, before it has replaced anything or after."""
     out = tmp_path / "run"
     succeeds("run", small_recording, "--out", out, *FAST)
@@ -111,7 +108,7 @@ def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recordi
     assert summary_of(out)["scans"] == 5
 
 
-def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:
+def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path, small_recording):
     out = tmp_path / "run"
     coarse = ("--set", "global_map.voxel_size_m=0.3")
     command = ("run", small_recording, "--out", out, *FAST, *coarse, "--rerun", "save")
@@ -134,7 +131,7 @@ def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Pa
         ("view {run} --picture {out}/run.png", (0, 3_000)),
     ],
 )
-def test_other_outputs_on_a_full_disk(tmp_path: Path, finished_run: Path, command: str, sizes: Sequence[int]) -> None:
+def test_other_outputs_on_a_full_disk(tmp_path, finished_run, command, sizes):
     out = tmp_path / "out"
     out.mkdir()
     for size in sizes:
@@ -156,7 +153,7 @@ def test_other_outputs_on_a_full_disk(tmp_path: Path, finished_run: Path, comman
     "view {run} --save {place}/run.rrd",
     "view {run} --picture {place}/run.png",
 ])  # fmt: skip
-def test_a_folder_that_cannot_be_written(small_recording: Path, finished_run: Path, command: str) -> None:
+def test_a_folder_that_cannot_be_written(small_recording, finished_run, command):
     for name in ("000000.npy", "000001.npy"):
         shutil.copy(small_recording / name, finished_run.parent)
     said = refused(*command.format(recording=small_recording, run=finished_run, place="/proc/self/task").split())
@@ -170,7 +167,7 @@ NAMES = ["new\nline \x1b[31mred", os.fsdecode(b"bad\xff"), *(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_every_kind(tmp_path, small_recording, name, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = Path(shutil.copytree(small_recording, tmp_path / "in" / name))
     result = lidarslam("run", source, f"--out={name}", *FAST)
@@ -181,7 +178,7 @@ def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, m
     succeeds("evaluate", f"./{name}", "--no-report")
 
 
-def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_recording: Path) -> None:
+def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path, small_recording):
     source = Path(shutil.copytree(small_recording, tmp_path / "room"))
     before = {path: path.read_bytes() for path in source.iterdir()}
     succeeds("run", source, "--out", source / "run", *FAST)
@@ -189,9 +186,7 @@ def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_
     assert "scans         6" in succeeds("info", source)
 
 
-def test_links_are_replaced_and_never_written_through(
-    tmp_path: Path, small_recording: Path, finished_run: Path
-) -> None:
+def test_links_are_replaced_and_never_written_through(tmp_path, small_recording, finished_run):
     outside = tmp_path / "outside"
     outside.mkdir()
     for name in FILES:
@@ -209,9 +204,7 @@ def test_links_are_replaced_and_never_written_through(
     assert summary_of(finished_run)["scans"] == 6
 
 
-def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
-    tmp_path: Path, small_recording: Path, whole_run: Path
-) -> None:
+def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(tmp_path, small_recording, whole_run):
     shutil.copytree(whole_run, tmp_path, dirs_exist_ok=True)
     out = Path(shutil.copytree(whole_run, tmp_path / "merged"))
     elsewhere = [{"directory": name} for name in ("..", ".", "", "/", "../run", 3, None)]
@@ -223,7 +216,7 @@ def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
     assert {"config.yaml", "map.ply", "summary.json"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_a_second_writer_is_turned_away(tmp_path: Path, small_recording: Path, finished_run: Path) -> None:
+def test_a_second_writer_is_turned_away(tmp_path, small_recording, finished_run):
     before, compared = {path.name: path.read_bytes() for path in finished_run.iterdir()}, tmp_path / "compared"
     compared.mkdir()
     with only_writer(finished_run), only_writer(compared):
@@ -238,7 +231,7 @@ def test_a_second_writer_is_turned_away(tmp_path: Path, small_recording: Path, f
 
 @pytest.mark.slow  # a process of its own for each
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[object], sent: signal.Signals) -> None:
+def test_a_request_to_end_leaves_what_there_is(tmp_path, room_scans, sent):
     """The recording is a minute long; the request comes in its first seconds."""
     source, out = tmp_path / "room", tmp_path / "run"
     source.mkdir()
@@ -270,9 +263,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     ("redirected", "status"),
     [("| true", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0), ("> /dev/full", 1), ("| head -n 1", 0)],
 )
-def test_standard_streams_that_are_closed_or_full(
-    tmp_path: Path, small_recording: Path, redirected: str, status: int
-) -> None:
+def test_standard_streams_that_are_closed_or_full(tmp_path, small_recording, redirected, status):
     ended = in_shell(f"{COMMAND} run '{small_recording}' --out run --odometry constant-velocity {redirected}", tmp_path)
     assert ended.returncode == status
     assert "Traceback" not in ended.stderr
@@ -293,7 +284,7 @@ def test_standard_streams_that_are_closed_or_full(
     ],
     ids=" ".join,
 )
-def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, str | None]) -> None:
+def test_environments(tmp_path, small_recording, changed):
     source = shutil.copytree(small_recording, tmp_path / "Größe")
     ended = in_shell(f"{COMMAND} run '{source}' --out läuft {' '.join(FAST)} --pose-graph", tmp_path, **changed)
     assert (ended.returncode, ended.stderr) == (0, "")
@@ -308,7 +299,7 @@ def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, 
         ("ulimit -v 1000000", "the address space is limited to"),  # OpenBLAS would wait for memory, deaf to SIGTERM
     ],
 )
-def test_shells_in_which_nothing_can_be_done(tmp_path: Path, script: str, said: str) -> None:
+def test_shells_in_which_nothing_can_be_done(tmp_path, script, said):
     (tmp_path / "gone").mkdir()
     ended = in_shell(f"{script}; exec {COMMAND} info nothing", tmp_path)
     assert ended.returncode == 1

@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -53,9 +53,7 @@ def unfinished(tmp_path: Path) -> Iterator[Unfinished]:
 
 
 @pytest.mark.parametrize(("cost_s", "pause_s"), [(0.01, 10.0), (0.2, 10.0), (1.0, 50.0)])
-def test_saving_takes_two_percent_of_the_time_at_most(
-    unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch, cost_s: float, pause_s: float
-) -> None:
+def test_saving_takes_two_percent_of_the_time_at_most(unfinished, monkeypatch, cost_s, pause_s):
     log = ScanLog()
     pipeline = Still(cost_s)
     monkeypatch.setattr(time, "monotonic", lambda: pipeline.now)
@@ -73,7 +71,7 @@ def test_saving_takes_two_percent_of_the_time_at_most(
     assert not log.warnings
 
 
-def test_a_disk_that_is_full_does_not_end_the_run(unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_full_does_not_end_the_run(unfinished, monkeypatch):
     log = ScanLog()
 
     def fail(path: Path, _: State) -> None:
@@ -109,7 +107,7 @@ STAMPS = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
 @pytest.mark.parametrize("done", [0, 4])
-def test_a_run_goes_on_after_the_scan_that_was_read_last(done: int) -> None:
+def test_a_run_goes_on_after_the_scan_that_was_read_last(done):
     for saved in (Saved({"odometry": {}}), Saved({"odometry": None})):
         odometry: Any = Deaf()
         left = scans_left(map(scan_at, STAMPS), scan_at(STAMPS[done]), odometry, saved)
@@ -118,7 +116,7 @@ def test_a_run_goes_on_after_the_scan_that_was_read_last(done: int) -> None:
 
 
 @pytest.mark.parametrize("held", [Scan(np.full((1, 3), 3.5), 2.0), Scan(np.full((1, 3), 3.0), 2.1)])
-def test_another_scan_than_the_one_that_was_read_is_noticed(held: Scan) -> None:
+def test_another_scan_than_the_one_that_was_read_is_noticed(held):
     odometry: Any = Deaf()
     with pytest.raises(InputError, match="the recording has changed"):
         scans_left(map(scan_at, STAMPS), held, odometry, Saved({"odometry": {}}))
@@ -129,7 +127,7 @@ def refuse_as_unfinished(path: Path) -> None:
         require_whole(path)
 
 
-def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> None:
+def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path):
     with claim(tmp_path, {"a": 1}) as unfinished:
         unfinished.begin(0)
         refuse_as_unfinished(tmp_path)
@@ -151,9 +149,7 @@ def replace_first_file(directory: RunDirectory) -> None:
 
 
 @pytest.mark.parametrize("change", [replace_first_file, lambda directory: TileWriter(directory)._begin()])
-def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: Callable[[RunDirectory], None]
-) -> None:
+def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(tmp_path, caplog, change):
     """What lies there at an instant is what a run leaves that is killed then."""
     run, killed = tmp_path / "run", tmp_path / "killed"
     with RunDirectory.create(run) as directory:
@@ -197,13 +193,13 @@ def earlier(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def test_a_new_directory_is_gone_when_nothing_came_of_the_run(tmp_path: Path) -> None:
+def test_a_new_directory_is_gone_when_nothing_came_of_the_run(tmp_path):
     with pytest.raises(RuntimeError), RunDirectory.create(tmp_path / "run"):
         raise RuntimeError
     assert names(tmp_path) == []
 
 
-def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier: Path) -> None:
+def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier):
     with pytest.raises(OutputError, match="--overwrite"), RunDirectory.create(earlier):
         pass
     with pytest.raises(RuntimeError), RunDirectory.create(earlier, overwrite=True):
@@ -215,7 +211,7 @@ def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier: Path) ->
     assert "version: 1" in (earlier / CONFIG).read_text()
 
 
-def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path: Path) -> None:
+def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path):
     (tmp_path / MAP_PLY).write_text("somebody's map")
     (tmp_path / CONFIG).write_text("somebody: config\n")
     for overwrite in (False, True):
@@ -224,7 +220,7 @@ def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path: Path
     assert (tmp_path / MAP_PLY).read_text() == "somebody's map"
 
 
-def test_a_directory_with_foreign_files_only_is_used_as_it_is(tmp_path: Path) -> None:
+def test_a_directory_with_foreign_files_only_is_used_as_it_is(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with RunDirectory.create(tmp_path) as directory:
         directory.write_text(CONFIG, "run:\n")

@@ -18,7 +18,6 @@ from lidarslam.compare.method_run import Ending, Limits, supervise
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import CompareRequest, RecordingEntry
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, write_tum
 
 from ..conftest import lidarslam, succeeds, write_recording
@@ -62,7 +61,7 @@ def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finis
     return out, compare(_request(recording, out, "kiss-icp@0.5,prior"), Told().narrator)
 
 
-def test_comparison_json_holds_what_the_contract_names(finished: Finished) -> None:
+def test_comparison_json_holds_what_the_contract_names(finished):
     content = json.loads((finished[0] / "comparison.json").read_text())
     assert content["sequence"] == "room"
     assert list(content["methods"]) == ["kiss-icp@0.5", "prior"]
@@ -78,7 +77,7 @@ def test_comparison_json_holds_what_the_contract_names(finished: Finished) -> No
     assert content["methods"]["prior"]["metrics"]["map"] is None
 
 
-def test_every_method_leaves_a_run_directory_and_a_row_of_which_the_best_is_marked(finished: Finished) -> None:
+def test_every_method_leaves_a_run_directory_and_a_row_of_which_the_best_is_marked(finished):
     out, outcome = finished
     for method in ("kiss-icp@0.5", "prior"):
         files = {"trajectory.tum", "map.ply", "config.yaml", "summary.json", "process.log"}
@@ -92,7 +91,7 @@ def test_every_method_leaves_a_run_directory_and_a_row_of_which_the_best_is_mark
     assert any(line.startswith("look      lidarslam view ") for line in lines)
 
 
-def test_what_is_finished_is_reused_and_keeps_its_time(finished: Finished, recording: Path, told: Told) -> None:
+def test_what_is_finished_is_reused_and_keeps_its_time(finished, recording, told):
     out, before = finished
     with pytest.raises(OutputError, match=r"a comparison already \(comparison.json\); .* --reuse, .* --overwrite"):
         compare(_request(recording, out, "prior"), told.narrator)
@@ -103,9 +102,7 @@ def test_what_is_finished_is_reused_and_keeps_its_time(finished: Finished, recor
     assert all("in an earlier comparison" in line for line in told.lines)
 
 
-def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(
-    finished: Finished, recording: Path, tmp_path: Path, told: Told
-) -> None:
+def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(finished, recording, tmp_path, told):
     out = Path(shutil.copytree(finished[0], tmp_path / "out"))
     broken = (sys.executable, "-c", "import sys; sys.exit('broken')")
     changed = _request(recording, out, "prior", reuse=True, settings=("global_map.voxel_size_m=0.3",))
@@ -117,9 +114,7 @@ def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(
 
 
 @pytest.mark.long
-def test_whatever_a_method_dies_of_is_its_row(
-    recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
-) -> None:
+def test_whatever_a_method_dies_of_is_its_row(recording, tmp_path, told, faults):
     names = "".join(f"kiss-icp@{number}," for number in (1, 4, 5, 6, 7))
     request = _request(recording, tmp_path, names + "prior", limits=Limits(memory_mb=1000.0))
     outcome = compare(request, told.narrator, faults)
@@ -140,9 +135,7 @@ def test_whatever_a_method_dies_of_is_its_row(
 
 @pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_ends_the_method_at_work_and_writes_what_there_is(
-    recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
-) -> None:
+def test_ctrl_c_ends_the_method_at_work_and_writes_what_there_is(recording, tmp_path, told, faults):
     def interrupt() -> None:
         while not any(name == "room kiss-icp@3" for name, _, _ in told.counts):
             threading.Event().wait(0.05)
@@ -164,9 +157,7 @@ def _against(reference: str, finished: Finished, recording: Path, told: Told) ->
     return compare(request, told.narrator).comparison.sequences[0]
 
 
-def test_a_method_can_be_the_reference_and_has_no_errors_itself(
-    finished: Finished, recording: Path, told: Told
-) -> None:
+def test_a_method_can_be_the_reference_and_has_no_errors_itself(finished, recording, told):
     sequence = _against("prior", finished, recording, told)
     assert sequence.reference_name == "prior"
     kiss, prior = sequence.methods
@@ -175,9 +166,7 @@ def test_a_method_can_be_the_reference_and_has_no_errors_itself(
     assert any("no truth" in note for note in sequence.notes)
 
 
-def test_a_file_can_be_the_reference(
-    finished: Finished, recording: Path, told: Told, tmp_path: Path, room_truth: Trajectory
-) -> None:
+def test_a_file_can_be_the_reference(finished, recording, told, tmp_path, room_truth):
     late = tmp_path / "late.tum"
     write_tum(late, Trajectory(room_truth.stamps + 100.0, room_truth.T_world_lidar))
     assert _against(f"{recording}/ground_truth.tum", finished, recording, told).methods[1].metrics is not None
@@ -187,9 +176,7 @@ def test_a_file_can_be_the_reference(
 
 
 @pytest.mark.long
-def test_without_any_reference_there_is_still_a_table(
-    recording: Path, tmp_path: Path, told: Told, room_scans: list[Scan]
-) -> None:
+def test_without_any_reference_there_is_still_a_table(recording, tmp_path, told, room_scans):
     bare = write_recording(tmp_path / "bare", room_scans[:3])
     entry = RecordingEntry(bare, prior=recording / "ground_truth.tum")
     outcome = compare(_request(bare, tmp_path / "out", "prior", recordings=(entry,)), told.narrator)
@@ -202,7 +189,7 @@ def test_without_any_reference_there_is_still_a_table(
 
 
 @pytest.mark.long
-def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tmp_path: Path, told: Told) -> None:
+def test_several_recordings_have_a_file_each_and_one_for_all(recording, tmp_path, told):
     prior = recording / "ground_truth.tum"
     entries = [RecordingEntry(recording, prior=prior, start=start) for start in (2, 1)]
     entries.append(RecordingEntry(tmp_path / "nowhere", name="gone", prior=prior))
@@ -218,9 +205,7 @@ def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tm
         assert own == sequence
 
 
-def test_an_interruption_before_any_turn_is_written_for_every_recording(
-    recording: Path, tmp_path: Path, told: Told, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interruption_before_any_turn_is_written_for_every_recording(recording, tmp_path, told, monkeypatch):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -233,7 +218,7 @@ def test_an_interruption_before_any_turn_is_written_for_every_recording(
         assert content["methods"]["kiss-icp"]["status"] == "not run"
 
 
-def test_mistakes_are_found_before_anything_is_run(recording: Path, tmp_path: Path, told: Told) -> None:
+def test_mistakes_are_found_before_anything_is_run(recording, tmp_path, told):
     out = tmp_path / "out"
     bare, lost = RecordingEntry(recording), RecordingEntry(tmp_path / "nowhere")
     mistakes: list[tuple[str, tuple[RecordingEntry, ...], bool, str]] = [
@@ -248,7 +233,7 @@ def test_mistakes_are_found_before_anything_is_run(recording: Path, tmp_path: Pa
     assert not out.exists()
 
 
-def test_a_bound_that_is_not_met_has_a_status_of_its_own(finished: Finished, recording: Path) -> None:
+def test_a_bound_that_is_not_met_has_a_status_of_its_own(finished, recording):
     command = ["compare", recording, "--out", finished[0], "--methods", "kiss-icp@0.5,prior", "--reuse"]
     command += ["--prior", recording / "ground_truth.tum"]
     passed = succeeds(*command, "--max", "prior:ate=0.001", "--max", "lost=0", "--min", "memory_mb=1")
@@ -259,7 +244,7 @@ def test_a_bound_that_is_not_met_has_a_status_of_its_own(finished: Finished, rec
 
 
 @pytest.mark.long
-def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, tmp_path: Path) -> None:
+def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording, tmp_path):
     prior = tmp_path / "short.tum"
     prior.write_text("0.1 0 0 0 0 0 0 1\n0.2 0 0 0 0 0 0 1\n")
     arguments = ["compare", recording, "--methods", "prior", "--prior", prior]
@@ -288,22 +273,20 @@ def run(tmp_path: Path, lines: list[str]) -> Run:
     return supervised
 
 
-def test_lines_come_through_and_standard_error_is_kept(run: Run, lines: list[str], tmp_path: Path) -> None:
+def test_lines_come_through_and_standard_error_is_kept(run, lines, tmp_path):
     ending = run("import sys; print('1 2'); print('2 2'); print('oh', file=sys.stderr); sys.exit(3)")
     assert (ending.cause, ending.status, lines) == ("itself", 3, ["1 2", "2 2"])
     assert (tmp_path / "log").read_text() == "oh\n"
 
 
-def test_time_and_the_memory_of_all_processes_are_measured(run: Run) -> None:
+def test_time_and_the_memory_of_all_processes_are_measured(run):
     child = "import time; held = bytearray(100_000_000); held[::4096] = b'x' * len(held[::4096]); time.sleep(0.8)"
     ending = run(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])")
     assert 0.8 < ending.wall_s < 10.0
     assert 100.0 < ending.peak_rss_mb < 300.0
 
 
-def test_one_that_hangs_is_ended_with_its_children(
-    run: Run, lines: list[str], still_runs: Callable[[int], bool]
-) -> None:
+def test_one_that_hangs_is_ended_with_its_children(run, lines, still_runs):
     code = "import subprocess, time; print(subprocess.Popen(['sleep', '60']).pid, flush=True); time.sleep(60)"
     ending = run(code, timeout_s=1.0)
     assert (ending.cause, ending.status) == ("time", -signal.SIGKILL)
@@ -311,7 +294,7 @@ def test_one_that_hangs_is_ended_with_its_children(
     assert not still_runs(int(lines[0]))
 
 
-def test_one_that_eats_memory_is_ended(run: Run) -> None:
+def test_one_that_eats_memory_is_ended(run):
     code = "import time; held = []\nwhile True: held.append(b'x' * 10_000_000); time.sleep(0.02)"
     ending = run(code, memory_mb=150.0, timeout_s=30.0)
     assert ending.cause == "memory"
@@ -319,7 +302,7 @@ def test_one_that_eats_memory_is_ended(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interruption_is_passed_on_and_waited_for(run: Run, tmp_path: Path) -> None:
+def test_an_interruption_is_passed_on_and_waited_for(run, tmp_path):
     mark = tmp_path / "written"
     code = f"""
 import time

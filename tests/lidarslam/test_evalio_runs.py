@@ -80,7 +80,7 @@ def sequence(
     return folder
 
 
-def test_info_and_python_know_the_name(sequence: Path) -> None:
+def test_info_and_python_know_the_name(sequence):
     known = json.loads(succeeds("info", SOURCE, "--json"))
     assert (known["reader"], known["scans"], known["source"]) == ("evalio", SCANS, str(sequence))
     assert known["first_scan"]["has_rings"]

@@ -105,7 +105,7 @@ BAGS = [(name, read_with_rosbags) for name in ("slam.mcap", "slam.bag", "slam.db
 
 
 @pytest.mark.parametrize(("name", "read"), [*BAGS, ("slam.mcap", read_with_mcap)])
-def test_poses_and_points_come_back(run: Path, landmarks: FloatArray, tmp_path: Path, name: str, read: Any) -> None:
+def test_poses_and_points_come_back(run, landmarks, tmp_path, name, read):
     succeeds("export-bag", run, "--out", tmp_path / name)
     messages = read(tmp_path / name)
     scans = read_run_scans(run)
@@ -131,7 +131,7 @@ def test_poses_and_points_come_back(run: Path, landmarks: FloatArray, tmp_path: 
     np.testing.assert_allclose(xyz(messages["/map_points"][0][1]), landmarks, atol=1e-5)
 
 
-def test_covariance_and_velocity_are_in_the_frames_of_ros(run: Path, tmp_path: Path) -> None:
+def test_covariance_and_velocity_are_in_the_frames_of_ros(run, tmp_path):
     succeeds("export-bag", run, "--out", tmp_path / "slam.mcap", "--no-clouds")
     messages = read_with_rosbags(tmp_path / "slam.mcap")
     assert "/points" not in messages
@@ -146,7 +146,7 @@ def test_covariance_and_velocity_are_in_the_frames_of_ros(run: Path, tmp_path: P
     np.testing.assert_allclose(found, VELOCITY, atol=1e-6)
 
 
-def test_path_and_map_are_latched(run: Path, tmp_path: Path) -> None:
+def test_path_and_map_are_latched(run, tmp_path):
     latched = {}
     for name in ("slam.mcap", "slam.bag"):
         succeeds("export-bag", run, "--out", tmp_path / name, "--no-clouds")
@@ -158,7 +158,7 @@ def test_path_and_map_are_latched(run: Path, tmp_path: Path) -> None:
     assert durable == kinds
 
 
-def test_the_bag_is_a_recording(run: Path, landmarks: FloatArray, tmp_path: Path) -> None:
+def test_the_bag_is_a_recording(run, landmarks, tmp_path):
     succeeds("export-bag", run, "--out", tmp_path / "slam.mcap")
     scans = list(open_recording(tmp_path / "slam.mcap", ReaderConfig(topic="/points")).scans())
     trajectory = read_run_scans(run).trajectory
@@ -170,7 +170,7 @@ def test_the_bag_is_a_recording(run: Path, landmarks: FloatArray, tmp_path: Path
         np.testing.assert_array_equal(scan.rings, np.arange(len(landmarks)) % 16)
 
 
-def test_what_is_in_the_way(run: Path, tmp_path: Path) -> None:
+def test_what_is_in_the_way(run, tmp_path):
     out = tmp_path / "slam.mcap"
     out.write_text("mine")
     refused("export-bag", run, "--out", out)

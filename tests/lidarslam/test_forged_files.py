@@ -2,7 +2,6 @@
 
 import os
 import socket
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ SUMMARIES = [
 
 
 @pytest.mark.parametrize("text", SUMMARIES, ids=range(len(SUMMARIES)))
-def test_a_forged_summary(finished_run: Path, text: str) -> None:
+def test_a_forged_summary(finished_run, text):
     (finished_run / "summary.json").write_text(text)
     said = refused("view", finished_run, "--save", finished_run / "view.rrd")
     assert "summary.json: not a run's summary" in said
@@ -36,7 +35,7 @@ COMPARISONS = ['{"methods": {"a": {"run": "../../x"}}}', '{"methods": {"a": {"ru
 
 
 @pytest.mark.parametrize("text", COMPARISONS, ids=range(len(COMPARISONS)))
-def test_a_forged_comparison(tmp_path: Path, text: str) -> None:
+def test_a_forged_comparison(tmp_path, text):
     (tmp_path / "comparison.json").write_text(text)
     with pytest.raises(InputError, match=r"comparison\.json: not a comparison"):
         run_directories(tmp_path)
@@ -44,7 +43,7 @@ def test_a_forged_comparison(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize("count", ["99999999999999999999", "9223372036854775807", "1000000000000", LONG])
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-def test_a_ply_with_endless_faces_before_its_vertices(tmp_path: Path, count: str, encoding: str) -> None:
+def test_a_ply_with_endless_faces_before_its_vertices(tmp_path, count, encoding):
     path = tmp_path / "scan.ply"
     elements = f"element face {count}\nproperty int a\nelement vertex 1\nproperty float x\n"
     path.write_text(f"ply\nformat {encoding} 1.0\n{elements}end_header\n1\n2\n3.0\n")
@@ -57,9 +56,7 @@ NAMES = ["/abs/path", "../../x", "a/b", "..", "", "a\\0b", "\\e[2J", "report.htm
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("of", ["method", "simulated", "recording"])
-def test_a_name_in_a_benchmark_stays_in_the_folder(
-    tmp_path: Path, small_recording: Path, name: str, of: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_in_a_benchmark_stays_in_the_folder(tmp_path, small_recording, name, of, monkeypatch):
     monkeypatch.chdir(tmp_path)
     quoted = f'"{name.replace("/abs", str(tmp_path / "abs"))}"'
     methods = f"[{{name: {quoted}, method: kiss-icp}}]" if of == "method" else "[kiss-icp]"
@@ -70,7 +67,7 @@ def test_a_name_in_a_benchmark_stays_in_the_folder(
     assert {path.name for path in tmp_path.iterdir()} == {"forged.yaml"}
 
 
-def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
+def test_a_tampered_rerun_recording(tmp_path, finished_run):
     file = finished_run / "recording.rrd"
     succeeds("view", finished_run, "--save", file)
     whole = file.read_bytes()
@@ -82,7 +79,7 @@ def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
     succeeds("view", finished_run, "--save", tmp_path / "view.rrd")
 
 
-def test_a_file_is_opened_without_following_links(tmp_path: Path) -> None:
+def test_a_file_is_opened_without_following_links(tmp_path):
     (tmp_path / "outside").write_text("precious")
     (tmp_path / "link").symlink_to(tmp_path / "outside")
     (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
@@ -107,9 +104,7 @@ def test_a_file_is_opened_without_following_links(tmp_path: Path) -> None:
         ("walk/constant-velocity+map", "source: recorded", "constant-velocity+map", "--reuse"),
     ],
 )
-def test_a_comparison_writes_nothing_behind_a_link(
-    tmp_path: Path, small_recording: Path, link: str, source: str, method: str, option: str
-) -> None:
+def test_a_comparison_writes_nothing_behind_a_link(tmp_path, small_recording, link, source, method, option):
     place, outside, benchmark = tmp_path / "out" / link, tmp_path / "outside", tmp_path / "benchmark.yaml"
     place.parent.mkdir(parents=True)
     outside.mkdir()
@@ -134,9 +129,7 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow  # every kind of command
 @pytest.mark.usefixtures("no_network")
-def test_only_the_run_directory_is_written_and_nobody_is_called(
-    tmp_path: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_run_directory_is_written_and_nobody_is_called(tmp_path, small_recording, monkeypatch):
     for name, variable in (("home", "HOME"), ("tmp", "TMPDIR")):
         (tmp_path / name).mkdir()
         monkeypatch.setenv(variable, str(tmp_path / name))
@@ -153,7 +146,7 @@ def test_only_the_run_directory_is_written_and_nobody_is_called(
     assert {path: path.stat().st_mtime_ns for path in small_recording.iterdir()} == before
 
 
-def test_rerun_is_told_not_to_report(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rerun_is_told_not_to_report(monkeypatch):
     monkeypatch.delenv("CI", raising=False)
     monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
     succeeds("config")
@@ -161,7 +154,7 @@ def test_rerun_is_told_not_to_report(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "FORCE_RERUN_ANALYTICS" not in os.environ
 
 
-def test_names_in_a_recording_do_not_steer_the_terminal(tmp_path: Path, small_recording: Path) -> None:
+def test_names_in_a_recording_do_not_steer_the_terminal(tmp_path, small_recording):
     source = tmp_path / "e\x1b]0;owned\x07\u202e\nnote  all is well"
     source.mkdir()
     np.save(source / "000000.npy", np.load(small_recording / "000000.npy"))

@@ -3,7 +3,6 @@
 import copy
 from dataclasses import replace
 from itertools import accumulate, pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
-from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
@@ -43,21 +42,19 @@ def sweep(begin: float, end: float) -> Scan:
     [(0.0, 0.1, 1.0), (-0.1, 0.0, 0.0), (-0.05, 0.05, 0.5), (-0.075, 0.025, 0.25), (0.02, 0.1, 1.0)],
     ids=["stamped at the start", "at the end", "in the middle", "late", "before its start"],
 )
-def test_the_mean_motion_counts_how_much_of_the_sweep_lies_after_the_stamp(
-    begin: float, end: float, share_after: float
-) -> None:
+def test_the_mean_motion_counts_how_much_of_the_sweep_lies_after_the_stamp(begin, end, share_after):
     mean = SweepMotion(BEFORE, AFTER).mean(sweep(begin, end))
     np.testing.assert_allclose(mean, share_after * AFTER + (1.0 - share_after) * BEFORE, atol=1e-12)
 
 
-def test_a_motion_known_on_one_side_only_serves_for_the_other() -> None:
+def test_a_motion_known_on_one_side_only_serves_for_the_other():
     scan = sweep(-0.05, 0.05)
     np.testing.assert_array_equal(SweepMotion(BEFORE, None).mean(scan), BEFORE)
     np.testing.assert_array_equal(SweepMotion(None, AFTER).mean(scan), AFTER)
     assert SweepMotion(None, None).mean(scan) is None
 
 
-def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> None:
+def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too():
     """Standing still in a corner, of which the odometry says that it leaves nothing open, and that it leaves x open."""
     rng = np.random.default_rng(0)
     corner = np.concatenate([np.insert(rng.uniform(1.0, 6.0, (800, 2)), axis, 1.0, axis=1) for axis in range(3)])
@@ -89,9 +86,7 @@ def errors_of(localised: list[ScanEstimate], truth: FloatArray) -> tuple[FloatAr
     return errors(np.array([result.T_world_lidar for result in localised]), inverse(truth[0]) @ truth)
 
 
-def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
-    room_scans: list[Scan], room_truth: Trajectory, rng: np.random.Generator
-) -> None:
+def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(room_scans, room_truth, rng):
     errors = exp(rng.normal(0.0, [0.01] * 3 + [0.02] * 3, (len(room_scans) - 1, 6)))
     wrong = [np.eye(4), *(room_truth.relative_motions() @ errors)]
     localised = localise_all(room_scans, [Motion(T, 100) for T in wrong])
@@ -100,9 +95,7 @@ def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
     assert np.linalg.norm(chained[-1][:3, 3] - localised[-1].T_world_lidar[:3, 3]) > 0.02, "but not the pose"
 
 
-def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(
-    room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(room_scans, room_truth):
     nothing = [Motion(np.eye(4), 0, "covered") for _ in room_scans]
     localised = localise_all(room_scans, nothing)
     moved = np.linalg.norm(localised[-1].T_odom_lidar[:3, 3])
@@ -111,7 +104,7 @@ def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_m
 
 
 @pytest.mark.long
-def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any) -> None:
+def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room):
     """From 20 to 180 deg/s around the first sweep: the odometry's motion to the second is not the first one's."""
 
     def turning(times: FloatArray) -> FloatArray:
@@ -130,7 +123,7 @@ def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.0, 1.0), (0.5e-3, 0.5), (1e-2, 0.0)])
-def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma: float, share: float) -> None:
+def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma, share):
     """The variances of both velocities, 100 sigma^2 each, add up."""
     change = np.full(6, 0.01)
     before, after = (
@@ -141,7 +134,7 @@ def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma: float, sh
     assert before.turn_acceleration(None) is None
 
 
-def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> None:
+def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room):
     """Three degrees of pitch and roll at two steps a second: the rates change by 50 deg/s within a sweep."""
 
     def swaying(times: FloatArray) -> FloatArray:
@@ -159,7 +152,7 @@ def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> N
     assert distances_m[settled].max() < 0.01
 
 
-def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
+def test_a_drifting_odometry_is_corrected_by_the_map(room, room_scans, room_truth):
     """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
     motions = room_truth.relative_motions() @ exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
     odometry = ExternalOdometry(Trajectory(room_truth.stamps, chain(np.eye(4), motions)))
@@ -175,7 +168,7 @@ def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list
     assert np.percentile(distance, 99) < 0.06
 
 
-def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:
+def test_the_configuration_chooses_the_map(room_scans):
     for method, kind in (("surfels", SurfelMap), ("loam", FeatureMap)):
         mapper = make_localiser(Config(mapping=MappingConfig(method=method))).mapper
         mapper.process(mapper.sample(room_scans[0]), Prior())
@@ -191,9 +184,7 @@ def estimates(room_scans: list[Scan], room_truth: Trajectory) -> list[ScanOdomet
 
 
 @pytest.mark.parametrize("method", ["surfels", "loam"])
-def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
-    estimates: list[ScanOdometry], method: MappingName
-) -> None:
+def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(estimates, method):
     config = Config(mapping=MappingConfig(method=method))
     whole, resumed = make_localiser(config), make_localiser(config)
     for estimated in estimates[:5]:
@@ -205,7 +196,7 @@ def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
         np.testing.assert_array_equal(first.T_odom_lidar, second.T_odom_lidar)
 
 
-def test_scans_may_be_thinned_ahead_of_their_poses(estimates: list[ScanOdometry]) -> None:
+def test_scans_may_be_thinned_ahead_of_their_poses(estimates):
     """As many ahead as the pipeline has scans under way."""
     in_turn, ahead = make_localiser(Config()), make_localiser(Config())
     sampled = [replace(one, sampled=ahead.sample(one.scan)) for one in estimates]

@@ -58,7 +58,7 @@ def run(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("by", ["ground", "gravity"])
-def test_a_tilted_map_is_levelled(run: Path, tmp_path: Path, by: str) -> None:
+def test_a_tilted_map_is_levelled(run, tmp_path, by):
     cloud, said = edited(tmp_path / "level.ply", run, "--level", by, "--ground-at-zero")
     assert float(said.split()[2]) == pytest.approx(7.0, abs=0.03)
     assert "from z = -1.50 m to 0" in said
@@ -67,7 +67,7 @@ def test_a_tilted_map_is_levelled(run: Path, tmp_path: Path, by: str) -> None:
     np.testing.assert_allclose(cloud.normals, hall().normals, atol=2e-3)
 
 
-def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
+def test_crops_keep_exactly_what_lies_inside(run, tmp_path):
     whole = load_map(run / "map.ply").points
     box = np.array([[-2.05, 3.0], [-1.0, 1.05], [-3.0, 0.0]])
     cloud, said = edited(tmp_path / "box.ply", run, "--box", *box.ravel())
@@ -82,7 +82,7 @@ def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", [("--statistical", 8, 3.0), ("--radius", 3, 0.5)])
-def test_floaters_are_removed_and_nothing_else(tmp_path: Path, method: tuple[object, ...]) -> None:
+def test_floaters_are_removed_and_nothing_else(tmp_path, method):
     rng = np.random.default_rng(4)
     grid = np.stack(np.meshgrid(*[np.arange(-3.0, 3.0, 0.1)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     floaters = np.column_stack([3.0 * rng.permutation(FLOATERS), rng.uniform(5.0, 9.0, FLOATERS), np.full(FLOATERS, 8)])
@@ -107,7 +107,7 @@ def l_shaped(rng: np.random.Generator) -> PointCloud:
 
 
 @pytest.mark.long
-def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
+def test_clouds_are_joined_where_they_lie(tmp_path):
     room, T = l_shaped(np.random.default_rng(5)), exp([0.02, -0.03, 2.4, 2.0, -1.0, 0.3])
     write_cloud(tmp_path / "first.ply", room)
     write_cloud(tmp_path / "other.ply", moved(l_shaped(np.random.default_rng(6)), inverse(T)))
@@ -140,7 +140,7 @@ def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
         (["{run}", "{wall}", "-o", "{out}.ply", "--register"], 1, "wall.ply: could not be registered"),
     ],
 )
-def test_mistakes_get_one_line(run: Path, tmp_path: Path, arguments: list[str], status: int, said: str) -> None:
+def test_mistakes_get_one_line(run, tmp_path, arguments, status, said):
     wall: FloatArray = np.random.default_rng(0).uniform([40.0, 0.0, 0.0], [40.01, 9.0, 9.0], (2000, 3))
     write_cloud(tmp_path / "wall.ply", PointCloud(wall, np.tile([1.0, 0.0, 0.0], (len(wall), 1))))
     places = {"run": run, "out": tmp_path / "out", "wall": tmp_path / "wall.ply"}

@@ -67,9 +67,7 @@ def run(source: Path, out: Path, *arguments: str) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("way", WAYS)
-def test_the_map_has_the_intensities_and_colours_of_its_surfaces(
-    source: Path, tmp_path: Path, drive: Callable[[FloatArray], FloatArray], way: str
-) -> None:
+def test_the_map_has_the_intensities_and_colours_of_its_surfaces(source, tmp_path, drive, way):
     printed = run(source, tmp_path / "run", *WAYS[way])
     assert "voxels of 10 cm, with intensity and rgb;" in printed
     cloud = load_map(tmp_path / "run")
@@ -90,9 +88,7 @@ def test_the_map_has_the_intensities_and_colours_of_its_surfaces(
 
 
 @pytest.mark.long
-def test_rings_and_times_are_those_of_the_first_point(
-    source: Path, tmp_path: Path, drive: Callable[[FloatArray], FloatArray]
-) -> None:
+def test_rings_and_times_are_those_of_the_first_point(source, tmp_path, drive):
     run(source, tmp_path / "run", *WAYS["true poses"], "--set", "global_map.fields=[ring, time]")
     known = load_map(tmp_path / "run").attributes
     assert known.intensity is known.rgb is None
@@ -105,7 +101,7 @@ def test_rings_and_times_are_those_of_the_first_point(
 
 
 @pytest.mark.long
-def test_further_formats(source: Path, tmp_path: Path) -> None:
+def test_further_formats(source, tmp_path):
     pytest.importorskip("pye57")
     out = tmp_path / "run"
     run(source, out, *WAYS["true poses"], "--pcd", "--map-format", "laz", "--map-format", "e57", "--map-format", "pcd")

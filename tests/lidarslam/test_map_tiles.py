@@ -30,7 +30,7 @@ def whole(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.mark.parametrize("graph", [(), ("--pose-graph",)])
-def test_a_run_with_tiles(whole: Path, small_recording: Path, tmp_path: Path, graph: tuple[str, ...]) -> None:
+def test_a_run_with_tiles(whole, small_recording, tmp_path, graph):
     out, expected = tmp_path / "run", whole
     if graph:
         expected = tmp_path / "expected"
@@ -60,7 +60,7 @@ def test_a_run_with_tiles(whole: Path, small_recording: Path, tmp_path: Path, gr
     assert (out / "trajectory.tum").read_bytes() == (expected / "trajectory.tum").read_bytes()
 
 
-def test_tiles_of_an_earlier_run_go_with_it(whole: Path, small_recording: Path, tmp_path: Path) -> None:
+def test_tiles_of_an_earlier_run_go_with_it(whole, small_recording, tmp_path):
     out = tmp_path / "run"
     succeeds("run", small_recording, "--out", out, *FAST, *BOUND)
     (out / "map" / "7_-3.laz").write_bytes(b"of a run that was killed")
@@ -76,7 +76,7 @@ def test_tiles_of_an_earlier_run_go_with_it(whole: Path, small_recording: Path, 
     assert not out.exists()
 
 
-def test_tiles_of_others_are_not_touched(small_recording: Path, tmp_path: Path) -> None:
+def test_tiles_of_others_are_not_touched(small_recording, tmp_path):
     """Neither where they lie in a folder that is no run's, nor a file of their name, nor where a link in one leads."""
     out, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
     for folder in (out / "map", elsewhere):
@@ -101,7 +101,7 @@ def test_tiles_of_others_are_not_touched(small_recording: Path, tmp_path: Path) 
     assert [path.read_text() for path in elsewhere.iterdir()] == ["precious", "precious"]
 
 
-def test_a_merge_with_tiles(small_recording: Path, tmp_path: Path) -> None:
+def test_a_merge_with_tiles(small_recording, tmp_path):
     """The common map and that of each recording."""
     sources = [shutil.copytree(small_recording, tmp_path / name) for name in ("one", "two")]
     out = tmp_path / "merged"
@@ -113,7 +113,7 @@ def test_a_merge_with_tiles(small_recording: Path, tmp_path: Path) -> None:
         assert 0 < summary["map_points"] <= MOST
 
 
-def test_the_python_interface_writes_tiles(tmp_path: Path, small_recording: Path) -> None:
+def test_the_python_interface_writes_tiles(tmp_path, small_recording):
     from lidarslam import Slam
 
     settings = {"odometry.method": "constant-velocity", "global_map.voxel_size_m": 0.1, "global_map.most_points": MOST}

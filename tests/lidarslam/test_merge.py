@@ -3,7 +3,7 @@
 import json
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -29,7 +29,6 @@ from lidarslam.storage.finished_run import load_map, load_run
 
 from ..conftest import write_recording
 from .conftest import quiet
-from .killable import Ended
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 PARTS = ("01_first", "02_foreign", "03_second")
@@ -75,9 +74,7 @@ def merged(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.long
-def test_all_that_find_one_another_are_in_the_frame_of_the_first(
-    merged: tuple[Path, MergeOutcome], places: dict[str, Path]
-) -> None:
+def test_all_that_find_one_another_are_in_the_frame_of_the_first(merged, places):
     out, outcome = merged
     assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
     T_office_common = read_tum(places["first"] / "ground_truth.tum").T_world_lidar[0]
@@ -96,7 +93,7 @@ def test_all_that_find_one_another_are_in_the_frame_of_the_first(
 
 
 @pytest.mark.long
-def test_the_common_map_holds_what_is_joined_and_nothing_else(merged: tuple[Path, MergeOutcome]) -> None:
+def test_the_common_map_holds_what_is_joined_and_nothing_else(merged):
     out, outcome = merged
     common = load_map(out).points
     assert len(common) == outcome.summary.map.points > 0
@@ -112,7 +109,7 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(merged: tuple[Path
 
 
 @pytest.mark.long
-def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
+def test_the_summary_tells_who_is_joined_by_what(merged, places):
     out, outcome = merged
     summary = json.loads((out / "summary.json").read_text())
     given = [places[name] for name in ("first", "foreign", "second")]
@@ -138,9 +135,7 @@ def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcom
 
 
 @pytest.mark.slow
-def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(
-    merged: tuple[Path, MergeOutcome], places: dict[str, Path], tmp_path: Path
-) -> None:
+def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(merged, places, tmp_path):
     for place in places.values():
         turned = tmp_path / place.name
         turned.mkdir()
@@ -166,7 +161,7 @@ def graph_keys(out: Path) -> tuple[list[int], int]:
 
 
 @pytest.mark.long
-def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) -> None:
+def test_each_recording_has_a_run_of_its_own(merged):
     out, _ = merged
     keyframes = []
     for name, scans in zip(PARTS, (90, 12, 75), strict=True):
@@ -200,7 +195,7 @@ def folders(out: Path) -> list[str]:
 
 
 @pytest.mark.long
-def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_path: Path) -> None:
+def test_an_earlier_merge_is_replaced_only_when_asked(rooms, tmp_path):
     out = tmp_path / "out"
     merge(request(out, *rooms, settings=FAST), quiet)
     assert folders(out) == ["01_in_room_0", "02_in_room_1", "03_in_room_2"]
@@ -214,7 +209,7 @@ def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_pat
 
 
 @pytest.mark.long
-def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: list[Path], tmp_path: Path) -> None:
+def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms, tmp_path):
     (rooms[0] / "000003.npy").write_bytes(b"not an array")
     for scan in rooms[1].glob("*.npy"):
         scan.write_bytes(b"not an array")
@@ -229,9 +224,7 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: l
 
 
 @pytest.mark.long
-def test_an_interrupted_merge_goes_on_where_it_was(
-    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_an_interrupted_merge_goes_on_where_it_was(rooms, tmp_path, timeless):
     """Neither the recording that was tracked is tracked again, nor the scans before the last checkpoint."""
     whole, out = tmp_path / "whole", tmp_path / "out"
     merge(request(whole, *rooms, settings=FAST), quiet)
@@ -262,9 +255,7 @@ def test_an_interrupted_merge_goes_on_where_it_was(
 
 
 @pytest.mark.slow
-def test_a_killed_merge_is_refused_and_resumed_or_made_again(
-    rooms: list[Path], tmp_path: Path, killable: Callable[..., Ended], timeless: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_a_killed_merge_is_refused_and_resumed_or_made_again(rooms, tmp_path, killable, timeless):
     """Killed as it begins, halfway and among its results, it leaves no run and no map."""
     rooms = rooms[:2]
     whole, command = tmp_path / "whole", ["merge", *rooms]
@@ -296,7 +287,7 @@ def test_a_killed_merge_is_refused_and_resumed_or_made_again(
 
 
 @pytest.mark.long
-def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms: list[Path], tmp_path: Path) -> None:
+def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(OutputError, match="is the recording itself"):
         merge(request(rooms[1], *rooms, overwrite=True), quiet)

@@ -57,11 +57,11 @@ def steady(scans: int = 40) -> list[FloatArray]:
 
 
 @pytest.mark.parametrize("behind", [1, 2])
-def test_a_steady_motion_needs_the_odometry_for_the_first_scans_only(behind: int) -> None:
+def test_a_steady_motion_needs_the_odometry_for_the_first_scans_only(behind):
     assert asked(steady(), behind=behind) == list(range(10 + behind))
 
 
-def test_a_change_of_velocity_needs_it_until_predictions_are_good_again() -> None:
+def test_a_change_of_velocity_needs_it_until_predictions_are_good_again():
     poses = steady(20) + [exp(1.9 * VELOCITY) @ exp(0.1 * index * 1.6 * VELOCITY) for index in range(1, 61)]
     later = [index for index in asked(poses) if index > 11]
     assert later[0] == 21
@@ -70,11 +70,11 @@ def test_a_change_of_velocity_needs_it_until_predictions_are_good_again() -> Non
 
 
 @pytest.mark.parametrize("status", [Status.LOST, Status.DEGRADED])
-def test_it_is_asked_from_the_scan_after_one_that_is_not_ok(status: Status) -> None:
+def test_it_is_asked_from_the_scan_after_one_that_is_not_ok(status):
     assert [index for index in asked(steady(), {20: status}) if index > 11] == list(range(21, 32))
 
 
-def test_after_a_gap_and_at_an_empty_scan_it_is_asked() -> None:
+def test_after_a_gap_and_at_an_empty_scan_it_is_asked():
     stamps = 0.05 * np.arange(40)
     stamps[25:] += 0.05
     poses = [exp(stamp * VELOCITY) for stamp in stamps]
@@ -82,12 +82,12 @@ def test_after_a_gap_and_at_an_empty_scan_it_is_asked() -> None:
     assert 30 in asked(steady(), empty=30)
 
 
-def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked() -> None:
+def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked():
     assert asked(steady(), stamps=0.2 * np.arange(40)) == list(range(40))
     assert asked(steady(), cell_m=None) == list(range(40))
 
 
-def test_only_results_that_can_matter_are_waited_for() -> None:
+def test_only_results_that_can_matter_are_waited_for():
     gate = OdometryGate(odometry_that_answers())
     taken = []
     for index, pose in enumerate(steady(12)):

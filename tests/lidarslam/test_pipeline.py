@@ -3,7 +3,6 @@
 import ctypes
 import itertools
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,9 +42,7 @@ def true_odometry(room_truth: Trajectory) -> ExternalOdometry:
     return ExternalOdometry(room_truth)
 
 
-def test_true_motions_give_true_poses_and_a_true_map(
-    true_odometry: ExternalOdometry, room: Any, room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_true_motions_give_true_poses_and_a_true_map(true_odometry, room, room_scans, room_truth):
     pipeline = make_pipeline(true_odometry)
     results = list(pipeline.run(room_scans))
     truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
@@ -60,7 +57,7 @@ def test_true_motions_give_true_poses_and_a_true_map(
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
-def test_free_memory_is_returned(true_odometry: ExternalOdometry, room_scans: list[Scan]) -> None:
+def test_free_memory_is_returned(true_odometry, room_scans):
     """Blocks that are kept between others hold what is freed around them."""
     blocks = [b"x" * 60_000 for _ in range(4_000)]
     kept = blocks[::50]
@@ -108,9 +105,7 @@ class _Notes:
 
 
 @pytest.mark.parametrize("failure", [None, "the sensor was covered"])
-def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(
-    room: Any, room_scans: list[Scan], room_truth: Trajectory, failure: str | None
-) -> None:
+def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(room, room_scans, room_truth, failure):
     error = [0.0] * 6 if failure else [0.0, 0.0, 0.4, 0.0, 0.0, 0.0]
     pipeline = make_pipeline(_Astray(room_truth, 19, error, failure), notes := _Notes())
     results = list(pipeline.run(room_scans))
@@ -126,9 +121,7 @@ def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(
     assert isinstance(notes.told[-1], GraphScan), "which is not drawn"
 
 
-def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(
-    true_odometry: ExternalOdometry, room_scans: list[Scan]
-) -> None:
+def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(true_odometry, room_scans):
     def scans() -> Any:
         yield from room_scans[:3]
         raise InputError("disk")
@@ -140,9 +133,7 @@ def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(
     assert len(results) == 3
 
 
-def test_a_follower_sees_what_a_scan_showed_before_the_next(
-    true_odometry: ExternalOdometry, room_scans: list[Scan]
-) -> None:
+def test_a_follower_sees_what_a_scan_showed_before_the_next(true_odometry, room_scans):
     notes = _Notes()
     results = list(make_pipeline(true_odometry, notes).run(room_scans))
     assert [isinstance(one, GraphScan) for one in notes.told] == [True, *([False, True] * 19), False]
@@ -157,9 +148,7 @@ def test_a_follower_sees_what_a_scan_showed_before_the_next(
     np.testing.assert_allclose(motions, inverse(poses[:-1]) @ poses[1:], atol=1e-12)
 
 
-def test_a_follower_is_up_to_date_when_a_run_is_broken_off(
-    true_odometry: ExternalOdometry, room_scans: list[Scan]
-) -> None:
+def test_a_follower_is_up_to_date_when_a_run_is_broken_off(true_odometry, room_scans):
     notes = _Notes()
     results = make_pipeline(true_odometry, notes).run(room_scans)
     for _ in range(5):
@@ -169,7 +158,7 @@ def test_a_follower_is_up_to_date_when_a_run_is_broken_off(
     assert not any(thread.name.startswith("graph") for thread in threading.enumerate())
 
 
-def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: Trajectory) -> None:
+def test_a_sweep_is_compensated_with_the_motion_after_it(room, room_truth):
     """A robot that stands still for a second and then turns: stamps at the sweeps' starts, as drivers put them."""
 
     def turning(time: FloatArray) -> FloatArray:
@@ -185,7 +174,7 @@ def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: 
     assert all(result.status is Status.OK for result in results)
 
 
-def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows() -> None:
+def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows():
     """A car at speed, without an odometry: nothing is known of the first sweep's motion until the second."""
     simulation = make_simulation(RecordRequest(Path(), "street", "vlp-16", "car-fast", "upright", 2, 0, ""))
     first, second = simulation.scans()
@@ -201,7 +190,7 @@ def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows(
     assert np.quantile(distance, 0.99) < 0.2, "a voxel; the sweep moves by a metre"
 
 
-def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive: Callable[..., FloatArray]) -> None:
+def test_the_range_is_cropped(true_odometry, room, drive):
     scans = [room.sweep(drive, float(stamp)) for stamp in (0.1, 0.2)]
     for result in make_pipeline(true_odometry, min_range_m=2.0, max_range_m=4.0).run(scans):
         ranges = np.linalg.norm(result.points, axis=1)
@@ -209,7 +198,7 @@ def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive:
         assert ranges.max() < 4.1
 
 
-def test_reads_no_further_ahead_than_it_may_and_leaving_early_ends_the_thread() -> None:
+def test_reads_no_further_ahead_than_it_may_and_leaving_early_ends_the_thread():
     made = []
     reader = prefetch((made.append(item) for item in itertools.count()), ahead=2)
     next(reader)
@@ -232,7 +221,7 @@ class Slow:
         self.threads.add(threading.current_thread().name)
 
 
-def test_calls_are_carried_out_in_order_on_a_thread_of_their_own() -> None:
+def test_calls_are_carried_out_in_order_on_a_thread_of_their_own():
     slow, worker = Slow(), BackgroundWorker("graph", max_pending=20)
     for number in range(10):
         worker.submit(slow.call, number)
@@ -243,7 +232,7 @@ def test_calls_are_carried_out_in_order_on_a_thread_of_their_own() -> None:
     assert slow.threads == {"graph_0"}
 
 
-def test_the_caller_waits_when_too_many_calls_are_pending() -> None:
+def test_the_caller_waits_when_too_many_calls_are_pending():
     slow, worker = Slow(), BackgroundWorker("graph", max_pending=2)
     worker.submit(slow.call, 0)
     worker.submit(slow.call, 1)
@@ -263,7 +252,7 @@ def fail() -> None:
 
 
 @pytest.mark.parametrize("wait", ["wait", "close"])
-def test_an_error_is_raised(wait: str) -> None:
+def test_an_error_is_raised(wait):
     worker = BackgroundWorker("graph", max_pending=2)
     worker.submit(fail)
     with pytest.raises(ValueError, match="no memory"):

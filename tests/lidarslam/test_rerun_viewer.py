@@ -62,9 +62,7 @@ def finished() -> FinishedRun:
 
 
 @pytest.mark.parametrize("size", [0, 1_000, 100_000])
-def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
-) -> None:
+def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(tmp_path, monkeypatch, size):
     """Rerun's own writer is never told, because it may wait without end then; the room it took is given back."""
     monkeypatch.setattr(rerun_environment, "abandoned", False)
     begun = time.monotonic()
@@ -89,9 +87,7 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_display")
-def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(
-    finished: FinishedRun, small_recording: Path, tmp_path: Path
-) -> None:
+def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(finished, small_recording, tmp_path):
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
         show_in_window(show_runs([finished], None, ViewerConfig()))
     save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
@@ -122,9 +118,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch, program: Path, text: str) -> None:
     monkeypatch.setattr("lidarslam.viewer.rerun_program._program", lambda: str(program))
 
 
-def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int
-) -> None:
+def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(tmp_path, monkeypatch, port):
     """It asks for a newer version by way of a proxy: one that is not there."""
     proxies = ("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy")
     for name in proxies[::2]:
@@ -143,7 +137,7 @@ def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(
     assert {environment[name] for name in proxies} == {"http://127.0.0.1:1"}
 
 
-def test_a_window_that_never_listens_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
+def test_a_window_that_never_listens_is_ended(tmp_path, monkeypatch, port):
     monkeypatch.setattr("lidarslam.viewer.rerun_program._START_S", 1.0)
     pretend(monkeypatch, tmp_path / "rerun", f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 60\n")
     begun = time.monotonic()
@@ -167,7 +161,7 @@ def get(page: WebPage, path: str, host: str | None = None) -> http.client.HTTPRe
     return connection.getresponse()
 
 
-def test_the_page_may_load_from_its_own_server_alone(page: WebPage) -> None:
+def test_the_page_may_load_from_its_own_server_alone(page):
     for path in ("/?url=there", "/re_viewer.js", "/"):
         policy = get(page, path).headers["Content-Security-Policy"]
         assert {"default-src 'none'", "connect-src 'self'"} <= {part.strip() for part in policy.split(";")}
@@ -181,7 +175,7 @@ def test_the_page_may_load_from_its_own_server_alone(page: WebPage) -> None:
     assert b"re_viewer.js" in body
 
 
-def test_the_viewer_is_reruns_own() -> None:
+def test_the_viewer_is_reruns_own():
     """Whatever its page names of elsewhere is not loaded, or only when clicked."""
     with served_page(lambda _: None) as page:
         body = get(page, "/?url=there").read().decode()
@@ -191,7 +185,7 @@ def test_the_viewer_is_reruns_own() -> None:
         assert get(page, "/re_viewer_bg.wasm").read(4) == b"\0asm"
 
 
-def test_a_recording_is_shown_while_it_is_written(page: WebPage, tmp_path: Path) -> None:
+def test_a_recording_is_shown_while_it_is_written(page, tmp_path):
     announced: list[str] = []
     page._announce = announced.append
     path = tmp_path / "recording.rrd"
@@ -208,7 +202,7 @@ def test_a_recording_is_shown_while_it_is_written(page: WebPage, tmp_path: Path)
     assert get(page, "/recording.rrd").read() == b"begun, continued, ended"
 
 
-def test_the_recording_is_found_at_the_end_of_a_tunnel_but_not_by_a_name_made_to_point_here(page: WebPage) -> None:
+def test_the_recording_is_found_at_the_end_of_a_tunnel_but_not_by_a_name_made_to_point_here(page):
     """Otherwise any page in the browser could read the recording."""
     response = get(page, "/", "localhost:1234")
     assert response.status == 302
@@ -218,7 +212,7 @@ def test_the_recording_is_found_at_the_end_of_a_tunnel_but_not_by_a_name_made_to
     assert get(page, "/", "elsewhere.example").status == 403
 
 
-def test_this_machine_alone_is_served_from_a_port_that_is_free(page: WebPage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_this_machine_alone_is_served_from_a_port_that_is_free(page, monkeypatch):
     taken = urlsplit(page.address).port
     assert_on_this_machine_alone(taken or 0)
     other = WebPage({"/": INDEX})
@@ -254,7 +248,7 @@ def serve() -> "Iterator[Serve]":
 @pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("request_to_end", [signal.SIGINT, signal.SIGTERM])
-def test_a_view_ends_well(serve: Serve, finished_run: Path, request_to_end: signal.Signals) -> None:
+def test_a_view_ends_well(serve, finished_run, request_to_end):
     process, address = serve("view", finished_run, "--web")
     with urlopen(f"{address}/recording.rrd", timeout=120) as recording:
         assert recording.read(4) == b"RRF2"
@@ -267,7 +261,7 @@ def test_a_view_ends_well(serve: Serve, finished_run: Path, request_to_end: sign
 
 @pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
-def test_a_run_is_served_while_it_goes_on_and_afterwards(serve: Serve, small_recording: Path, tmp_path: Path) -> None:
+def test_a_run_is_served_while_it_goes_on_and_afterwards(serve, small_recording, tmp_path):
     out = tmp_path / "run"
     process, address = serve("run", small_recording, "--out", out, "--odometry", "constant-velocity", "--rerun", "web")
     with urlopen(f"{address}/recording.rrd", timeout=300) as recording:
@@ -289,7 +283,7 @@ def test_a_run_is_served_while_it_goes_on_and_afterwards(serve: Serve, small_rec
 
 @pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
-def test_a_run_that_is_interrupted_does_not_stay(serve: Serve, small_recording: Path, tmp_path: Path) -> None:
+def test_a_run_that_is_interrupted_does_not_stay(serve, small_recording, tmp_path):
     process, _ = serve("run", small_recording, "--out", tmp_path / "run", "--rerun", "web")
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)

@@ -141,7 +141,7 @@ SLOW = ("learned", "odometry alone", "kiss-icp")  # for their odometry; those wi
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in METHODS])
-def test_a_killed_run_comes_to_the_same_results(whole: Callable[[str], Whole], tmp_path: Path, method: str) -> None:
+def test_a_killed_run_comes_to_the_same_results(whole, tmp_path, method):
     """Killed twice, at a third and at two thirds of all that is done on disk."""
     expected, out = whole(method), tmp_path / "run"
     events = expected.ended.events
@@ -174,9 +174,7 @@ def go_on(expected: Whole, out: Path, *more: str) -> None:
 
 @pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
 @pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10), ("tiles", 5)])
-def test_a_run_may_be_killed_before_anything_it_does_on_disk(
-    whole: Callable[[str], Whole], tmp_path: Path, method: str, every_scans: int
-) -> None:
+def test_a_run_may_be_killed_before_anything_it_does_on_disk(whole, tmp_path, method, every_scans):
     """What lies there before each of these things is kept of one run, as so many kills would leave it.
 
     A state is saved three times, each time by the same steps.
@@ -201,7 +199,7 @@ def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
 
 
 @pytest.mark.long
-def test_a_run_that_is_stopped_can_be_resumed_as_well(expected: Whole, tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_can_be_resumed_as_well(expected, tmp_path):
     """Ctrl-C comes just as a state is written; what there is can be looked at meanwhile."""
     out = tmp_path / "run"
     ended = expected.again(out, kill_at=expected.ended.events // 3, signal=signal.SIGINT)
@@ -247,13 +245,13 @@ def assert_refused(ended: Ended, told: str) -> None:
         (["--odometry", "learned"], "odometry.method constant-velocity (now learned)"),
     ],
 )
-def test_another_run_is_not_resumed(expected: Whole, killed: Path, arguments: list[str], told: str) -> None:
+def test_another_run_is_not_resumed(expected, killed, arguments, told):
     before = contents(killed)
     assert_refused(expected.again(killed, *arguments, "--resume"), told)
     assert contents(killed) == before
 
 
-def test_another_recording_is_not_taken_for_it(expected: Whole, source: Path, killed: Path, tmp_path: Path) -> None:
+def test_another_recording_is_not_taken_for_it(expected, source, killed, tmp_path):
     other = shutil.copytree(source, tmp_path / "other")
     assert_refused(expected.again(killed, "--resume", source=other), "was begun with source")
     about = killed / "unfinished" / "run.json"
@@ -268,7 +266,7 @@ def test_another_recording_is_not_taken_for_it(expected: Whole, source: Path, ki
 
 
 @pytest.mark.long
-def test_a_run_killed_before_its_first_state_begins_again(expected: Whole, tmp_path: Path) -> None:
+def test_a_run_killed_before_its_first_state_begins_again(expected, tmp_path):
     out, event = tmp_path / "run", 1
     while not (out / "unfinished" / "run.json").exists():
         shutil.rmtree(out, ignore_errors=True)
@@ -278,7 +276,7 @@ def test_a_run_killed_before_its_first_state_begins_again(expected: Whole, tmp_p
     assert "no checkpoint yet" in expected.assert_finishes(out, "--resume").said
 
 
-def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(expected: Whole, source: Path, killed: Path) -> None:
+def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(expected, source, killed):
     ended = expected.again(killed)
     assert ended.status == 1
     assert "holds an unfinished run or merge; replace it with --overwrite" in ended.said
@@ -292,9 +290,7 @@ def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(expected: Whole,
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", [0.5, 0.9])
-def test_what_a_killed_overwrite_was_to_replace_is_given_back(
-    expected: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture, part: float
-) -> None:
+def test_what_a_killed_overwrite_was_to_replace_is_given_back(expected, tmp_path, caplog, part):
     """Killed on its way, and among its final results."""
     out = tmp_path / "run"
     expected.again(out, "--stop", "6")
@@ -313,7 +309,7 @@ def test_what_a_killed_overwrite_was_to_replace_is_given_back(
     expected.assert_finishes(out, "--resume")
 
 
-def test_a_finished_run_is_left_as_it_is(expected: Whole) -> None:
+def test_a_finished_run_is_left_as_it_is(expected):
     before = contents(expected.out)
     ended = expected.again(expected.out, "--resume")
     assert ended.status == expected.ended.status
@@ -324,7 +320,7 @@ def test_a_finished_run_is_left_as_it_is(expected: Whole) -> None:
     assert contents(expected.out) == before
 
 
-def test_there_must_be_something_to_resume(run: Run, source: Path, tmp_path: Path) -> None:
+def test_there_must_be_something_to_resume(run, source, tmp_path):
     ended = run(source, tmp_path / "run", "--resume")
     assert ended.status == 1
     assert "holds no run to resume" in ended.said
@@ -333,7 +329,7 @@ def test_there_must_be_something_to_resume(run: Run, source: Path, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_a_rerun_recording_goes_on_in_a_new_file(expected: Whole, killed: Path) -> None:
+def test_a_rerun_recording_goes_on_in_a_new_file(expected, killed):
     ended = expected.again(killed, "--resume", "--rerun", "save")
     assert ended.status == expected.ended.status
     assert "warning: recording.rrd holds the scans from" in ended.said

@@ -35,7 +35,7 @@ def loops(out: Path) -> list[dict[str, Any]]:
     return list(summary_of(out)["pose_graph"]["loops"])
 
 
-def test_a_given_loop_is_closed_and_part_of_the_run(small_recording: Path, tmp_path: Path) -> None:
+def test_a_given_loop_is_closed_and_part_of_the_run(small_recording, tmp_path):
     out, given = tmp_path / "run", ("--loop", 5, 0, "--no-loop", 1, 4)
     assert "not closed" not in succeeds(*command(small_recording, out, *given))
     (loop,) = [one for one in loops(out) if one["found_by"] == "given"]
@@ -51,9 +51,7 @@ def test_a_given_loop_is_closed_and_part_of_the_run(small_recording: Path, tmp_p
     ("overlap", "pair", "reason"),
     [("1.0", (0, 5), "of the points in view are inliers"), ("0.75", (4, 5), "no keyframe lies between the scans")],
 )
-def test_a_loop_that_cannot_be_closed_is_said_in_a_line(
-    small_recording: Path, tmp_path: Path, overlap: str, pair: tuple[int, int], reason: str
-) -> None:
+def test_a_loop_that_cannot_be_closed_is_said_in_a_line(small_recording, tmp_path, overlap, pair, reason):
     distance = () if pair == (0, 5) else ("--set", "pose_graph.keyframes.distance_m=50")
     given = ("--loop", *pair, "--set", f"pose_graph.loops.min_overlap={overlap}", *distance)
     said = succeeds(*command(small_recording, tmp_path / "run", *given))
@@ -82,7 +80,7 @@ def position_errors(run: Path, source: Path) -> FloatArray:
 
 
 @pytest.mark.long
-def test_a_run_with_loam(source: Path, tmp_path: Path) -> None:
+def test_a_run_with_loam(source, tmp_path):
     out, more = tmp_path / "run", ["--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2"]
     succeeds("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
     assert position_errors(out, source).max() < 0.03
@@ -109,7 +107,7 @@ def turning(rates: FloatArray, interval_s: float = 0.1) -> Trajectory:
 @pytest.mark.parametrize(
     ("ratio", "fault"), [(1.0, None), (0.8, None), (0.5, "too long"), (2.0, "too short"), (-0.6, "backwards")]
 )
-def test_the_ratio_of_the_turn_rates_is_that_of_the_times(ratio: float, fault: str | None) -> None:
+def test_the_ratio_of_the_turn_rates_is_that_of_the_times(ratio, fault):
     rates = 0.5 * np.sin(STAMPS)
     found = time_scale(turning(rates), ratio * np.outer(rates, [0.0, 0.0, 1.0]), np.full(60, True))
     assert found[0] == pytest.approx(ratio, rel=0.01)
@@ -118,7 +116,7 @@ def test_the_ratio_of_the_turn_rates_is_that_of_the_times(ratio: float, fault: s
     assert warning is None or f"times are {fault}" in warning
 
 
-def test_few_turns_lost_scans_and_long_intervals_decide_nothing() -> None:
+def test_few_turns_lost_scans_and_long_intervals_decide_nothing():
     rates, tracked = np.full(60, 0.5), np.full(60, True)
     within = 0.5 * np.outer(rates, [0.0, 0.0, 1.0])
     assert time_scale(turning(rates), within, tracked) is not None
@@ -138,7 +136,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("scale", "fault"), [(1.0, None), (2.0, "too long"), (-1.0, "backwards")])
-def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: float, fault: str | None) -> None:
+def test_a_run_says_that_the_times_are_wrong(walk, tmp_path, scale, fault):
     options = ["--odometry", "constant-velocity", "--no-report", "--set", f"reader.time_scale={scale}"]
     out = tmp_path / "run"
     lidarslam("run", walk, "--out", out, *options)
@@ -149,7 +147,7 @@ def test_a_run_says_that_the_times_are_wrong(walk: Path, tmp_path: Path, scale: 
 
 @pytest.mark.long
 @pytest.mark.parametrize("mounting", ["auto", "upright", "left"])
-def test_the_scale_holds_for_any_mounting(walk: Path, mounting: str) -> None:
+def test_the_scale_holds_for_any_mounting(walk, mounting):
     configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))
     (recorded,), (scaled,) = (list(open_recording(walk, config).scans(stop=1)) for config in configs)
     np.testing.assert_array_equal(scaled.time_offsets, -0.5 * recorded.time_offsets)
@@ -174,7 +172,7 @@ def low(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
 
 
 @pytest.mark.long
-def test_a_run_reports_the_bias_and_what_to_set(low: Path, tmp_path: Path) -> None:
+def test_a_run_reports_the_bias_and_what_to_set(low, tmp_path):
     succeeds("run", low, "--out", tmp_path / "run", *FAST)
     found = summary_of(tmp_path / "run")
     bias_deg, sigma_deg, correction_deg = (found[key] for key in KEYS)
@@ -185,7 +183,7 @@ def test_a_run_reports_the_bias_and_what_to_set(low: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
+def test_corrected_beforehand(low, tmp_path):
     out = tmp_path / "run"
     command = ("run", low, "--out", out, *FAST, "--set", "reader.elevation_correction_deg=auto")
     succeeds(*command)
@@ -200,7 +198,7 @@ def test_corrected_beforehand(low: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mounting", ["upright", "upside-down"])
-def test_any_reader_raises_points_above_the_recorded_plane(low: Path, mounting: str) -> None:
+def test_any_reader_raises_points_above_the_recorded_plane(low, mounting):
     config = ReaderConfig(mounting=mounting, elevation_correction_deg=0.0)
     plain = next(open_recording(low, config).scans()).points
     raised = next(open_recording(low, config.model_copy(update={"elevation_correction_deg": 0.3})).scans()).points
@@ -229,7 +227,7 @@ def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str)
 
 
 @pytest.mark.long
-def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path, room_truth: Trajectory) -> None:
+def test_a_slide_is_a_warning_and_exit_status_3(tmp_path, recording, room_truth):
     good, fine = run(recording, room_truth, tmp_path / "good", 1.0)
     assert good.exit_code == 0, good.output
     assert fine["map_contradictions"] == []
@@ -250,7 +248,7 @@ def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path,
     assert "is finished already" in again.output
 
 
-def test_a_large_map_is_sampled_by_blocks_and_no_map_has_no_entropy(rng: np.random.Generator) -> None:
+def test_a_large_map_is_sampled_by_blocks_and_no_map_has_no_entropy(rng):
     ground = rng.uniform(-60.0, 60.0, (400_000, 3)) * [1.0, 1.0, 0.0005]
     part = sampled_map_entropy(ground, 100_000)
     assert 2_000 < part.points <= 10_000

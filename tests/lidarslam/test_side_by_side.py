@@ -75,9 +75,7 @@ def _two_nodes(doomed: Callable[[list[Any]], Any]) -> Iterator[Where]:
 
 
 @pytest.mark.slow
-def test_side_by_side_is_the_same_as_one_after_another(
-    small_recording: Path, tmp_path: Path, serial: dict[str, Any], timeless: Files, told: Told
-) -> None:
+def test_side_by_side_is_the_same_as_one_after_another(small_recording, tmp_path, serial, timeless, told):
     _compare(small_recording, tmp_path / "out", Where(2), told)
     assert timeless(tmp_path / "out", *TIMED) == serial
     assert told.counts[-1][1:] == (18, 18)
@@ -90,7 +88,7 @@ def test_side_by_side_is_the_same_as_one_after_another(
 
 
 @pytest.mark.slow
-def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
+def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path):
     for jobs in ("1", "2"):
         out = tmp_path / jobs / "walk"
         command = ["simulate", "--out", str(out), "--scans", "23", "--format", "ply", "--jobs", jobs]
@@ -135,9 +133,7 @@ def serial_merge(crossings: list[Path], tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.mark.long
-def test_a_node_that_dies_costs_a_merge_only_its_recordings(
-    crossings: list[Path], tmp_path: Path, serial_merge: dict[str, Any], timeless: Files
-) -> None:
+def test_a_node_that_dies_costs_a_merge_only_its_recordings(crossings, tmp_path, serial_merge, timeless):
     """One of the nodes is killed in the middle of a recording, after a checkpoint."""
     out = tmp_path / "out"
 
@@ -165,9 +161,7 @@ def _has_submaps_open(node: Any) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(
-    crossings: list[Path], tmp_path: Path, serial_merge: dict[str, Any], timeless: Files
-) -> None:
+def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(crossings, tmp_path, serial_merge, timeless):
     out, whole = tmp_path / "out", TIMES * 20
 
     def interrupt() -> None:
@@ -184,7 +178,7 @@ def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(
     assert timeless(out) == serial_merge
 
 
-def test_a_directory_that_other_machines_do_not_have_is_said(crossings: list[Path], tmp_path: Path) -> None:
+def test_a_directory_that_other_machines_do_not_have_is_said(crossings, tmp_path):
     config = load_config(None, MERGED)
     request = tracking.RunRequest(crossings[0], tmp_path / "out" / "01_crossing", config)
     with pytest.raises(OutputError, match="not shared by the nodes"):

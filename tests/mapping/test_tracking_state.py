@@ -80,9 +80,7 @@ def test_a_scan_fits_poorly_beside_what_is_usual():
     (0.5, 1.5, False, True), (0.5, 3.0, False, False), (1.5, 30.0, False, True),
     (0.5, 0.6, True, True), (0.5, 1.5, True, False), (1.5, 1.5, True, False), (3.5, 30.0, True, True),
 ])  # fmt: skip
-def test_a_place_is_reachable_within_the_uncertainty_of_the_motion_since(
-    since_s: float, away_m: float, measured: bool, reachable: bool
-) -> None:
+def test_a_place_is_reachable_within_the_uncertainty_of_the_motion_since(since_s, away_m, measured, reachable):
     prediction = Prediction(10.0 + since_s, np.eye(4), np.zeros(6), np.eye(12))
     found = replace(prediction, T_world_lidar=make_transform(np.eye(3), np.array([0.0, 0.0, away_m])))
     attempt = Attempt(prediction, cast(Any, None), cast(Any, found), NO_FIT, Status.OK, relocalised=True)
