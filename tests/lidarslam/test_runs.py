@@ -1,7 +1,6 @@
 """Runs with loops given and forbidden, with LOAM, and what they say of times, elevations and maps that are wrong."""
 
 import csv
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from lidarslam.compare.method_run import Ending, Limits, judge
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, chain, read_tum, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
@@ -24,6 +23,7 @@ from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
 from lidarslam.run.summary import time_scale, time_scale_warning
 
 from ..conftest import lidarslam, succeeds, write_recording
+from ..mapping.runs import errors
 from .conftest import FAST, refused, summary_of
 
 
@@ -72,18 +72,12 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[
     return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, truth, is_timed=True)
 
 
-def position_errors(run: Path, source: Path) -> FloatArray:
-    """Distances (N,) of the run's positions from the truth, whose world is the first scan's frame."""
-    truth, found = read_tum(source / "ground_truth.tum"), read_tum(run / "trajectory.tum")
-    T = inverse(inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar) @ found.T_world_lidar
-    return np.asarray(np.linalg.norm(T[:, :3, 3], axis=1))
-
-
 @pytest.mark.long
 def test_a_run_with_loam(source, tmp_path):
     out, more = tmp_path / "run", ["--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2"]
     succeeds("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
-    assert position_errors(out, source).max() < 0.03
+    found, truth = (read_tum(path).T_world_lidar for path in (out / "trajectory.tum", source / "ground_truth.tum"))
+    assert errors(found, inverse(truth[0]) @ truth)[0].max() < 0.03
     assert "method: loam" in (out / "config.yaml").read_text()
     with (out / "scans.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -140,7 +134,7 @@ def test_a_run_says_that_the_times_are_wrong(walk, tmp_path, scale, fault):
     options = ["--odometry", "constant-velocity", "--no-report", "--set", f"reader.time_scale={scale}"]
     out = tmp_path / "run"
     lidarslam("run", walk, "--out", out, *options)
-    warnings = [text for text in json.loads((out / "summary.json").read_text())["warnings"] if "points' times" in text]
+    warnings = [text for text in summary_of(out)["warnings"] if "points' times" in text]
     assert len(warnings) == (fault is not None)
     assert all(f"times are {fault}" in text for text in warnings)
 
@@ -215,15 +209,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) 
 
 def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str) -> tuple[Result, dict[str, Any]]:
     """A run on the true motion, its translation scaled; and the summary."""
-    motions = inverse(truth.T_world_lidar[:-1]) @ truth.T_world_lidar[1:]
+    motions = truth.relative_motions()
     motions[:, :3, 3] *= scale
-    poses = [np.eye(4)]
-    for motion in motions:
-        poses.append(poses[-1] @ motion)
     prior = out.parent / f"{scale}.tum"
-    write_tum(prior, Trajectory(truth.stamps, np.array(poses)))
+    write_tum(prior, Trajectory(truth.stamps, chain(np.eye(4), motions)))
     result = lidarslam("run", recording, "--out", out, "--prior", prior, "--no-mapping", *more)
-    return result, json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    return result, summary_of(out)
 
 
 @pytest.mark.long

@@ -68,17 +68,14 @@ def test_a_turn_that_was_missed_is_made_up_for_evenly():
     assert np.linalg.norm(from_first[2, :3]) == pytest.approx(0.5 * np.linalg.norm(log(poses[1])[:3]))
 
 
-def random_covariance(rng: np.random.Generator) -> FloatArray:
-    A = rng.normal(size=(6, 6)) * np.array([0.01, 0.02, 0.03, 0.3, 0.2, 0.1])[:, None]
-    return A @ A.T + np.diag([1e-5] * 3 + [1e-3] * 3)
-
-
 def test_gtsam_reads_the_g2o_text_that_is_written(rng, tmp_path):
     """Poses turned every way, kilometres from the origin, to the last digits."""
     poses = exp(rng.normal(size=(5, 6)) * [1.0, 1.0, 1.0, 2000.0, 2000.0, 100.0])
     motions = exp(rng.normal(size=(6, 6)) * [1.0, 1.0, 1.0, 5.0, 5.0, 5.0])
     ends = [(0, 1), (1, 2), (2, 3), (4, 3), (4, 0), (2, 0)]
-    edges = [RelativePose(*pair, T, random_covariance(rng)) for pair, T in zip(ends, motions, strict=True)]
+    A = rng.normal(size=(6, 6, 6)) * np.array([0.01, 0.02, 0.03, 0.3, 0.2, 0.1])[:, None]
+    covariances = A @ A.swapaxes(1, 2) + np.diag([1e-5] * 3 + [1e-3] * 3)
+    edges = [RelativePose(*pair, T, P) for pair, T, P in zip(ends, motions, covariances, strict=True)]
     path = tmp_path / "graph.g2o"
     path.write_text(format_g2o(poses, edges), encoding="utf-8")
     factors, values = gtsam.readG2o(str(path), True)
