@@ -13,10 +13,12 @@ import pytest
 from click.testing import CliRunner, Result
 from hypothesis import settings
 
+from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State, read_state, write_state
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 # The benchmarks are scripts that import one another from their own folder.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -173,6 +175,17 @@ def write_recording(
     np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
     if truth is not None:
         truth.save(folder / "ground_truth.tum")
+    return folder
+
+
+def write_run(folder: Path, trajectory: Trajectory, cloud: PointCloud | None = None, **about: object) -> Path:
+    """A run directory with these results, and what its configuration says of it."""
+    folder.mkdir(exist_ok=True)
+    trajectory.save(folder / "trajectory.tum")
+    if cloud is not None:
+        write_cloud(folder / "map.ply", cloud)
+    if about:
+        (folder / "config.yaml").write_text(dump_yaml(Config(), about))
     return folder
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, write_tum
@@ -21,7 +20,7 @@ from lidarslam.evaluation.comparison.gates import (
     parse_gate,
 )
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, write_run
 
 LOST = 2
 
@@ -34,10 +33,7 @@ def run(tmp_path: Path) -> Path:
     write_tum(tmp_path / "truth.tum", Trajectory(stamps, T))
     T = T.copy()
     T[::2, 1, 3] += 0.06
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
-    (folder / "config.yaml").write_text(dump_yaml(Config(), {"source": "nowhere"}))
+    folder = write_run(tmp_path / "run", Trajectory(stamps, T), source="nowhere")
     (folder / "summary.json").write_text(f'{{"scans": 240, "lost_scans": {LOST}, "realtime_factor": null}}')
     return folder
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform, write_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+
+from ..conftest import write_run
 
 # Where the run's world lies in the recording's.
 T_TRUTH_RUN = exp([0.0, 0.0, 2.0, 5.0, -3.0, 0.5])
@@ -46,13 +47,10 @@ def recording(tmp_path: Path, surfaces: FloatArray) -> Path:
 @pytest.fixture
 def run(tmp_path: Path, recording: Path, surfaces: FloatArray) -> Path:
     """A run without error but for its map, of which every point is 3 cm too high."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_tum(folder / "trajectory.tum", Trajectory(STAMPS, T))
-    (folder / "trajectory.kitti").write_text(format_kitti(T))
     points = transform_points(inverse(T_TRUTH_RUN), surfaces + np.array([0.0, 0.0, 0.03]))
-    write_cloud(folder / "map.ply", PointCloud(points, np.zeros_like(points)))
-    (folder / "config.yaml").write_text(dump_yaml(Config(), {"source": str(recording)}))
+    cloud = PointCloud(points, np.zeros_like(points))
+    folder = write_run(tmp_path / "run", Trajectory(STAMPS, T), cloud, source=str(recording))
+    (folder / "trajectory.kitti").write_text(format_kitti(T))
     (folder / "metrics.json").write_text("{}")
     return folder
 

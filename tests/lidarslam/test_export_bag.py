@@ -9,15 +9,14 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.exports.source import read_run_scans
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 from .conftest import refused
 
 SCANS = 6
@@ -35,9 +34,8 @@ def landmarks(rng: np.random.Generator) -> FloatArray:
 @pytest.fixture
 def run(tmp_path: Path, landmarks: FloatArray) -> Path:
     """A run of constant velocity over sweeps of 0.1 s; the odometry drifts, and the last scan is lost."""
-    recording, folder = tmp_path / "recording", tmp_path / "run"
+    recording = tmp_path / "recording"
     recording.mkdir()
-    folder.mkdir()
     stamps = FIRST_STAMP + 0.1 * np.arange(SCANS)
     offsets = np.linspace(0.0, 0.1, len(landmarks))
     for number in range(SCANS):
@@ -49,12 +47,11 @@ def run(tmp_path: Path, landmarks: FloatArray) -> Path:
         np.save(recording / f"{number:06d}.npy", table)
     np.savetxt(recording / "timestamps.txt", stamps, fmt="%.9f")
     T = exp(np.multiply.outer(0.1 * np.arange(SCANS), VELOCITY))
-    write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
+    about = {"source": str(recording), "start": 0, "stop": None, "step": 1}
+    cloud = PointCloud(landmarks, np.zeros((500, 3)))
+    folder = write_run(tmp_path / "run", Trajectory(stamps, T), cloud, **about)
     drift = exp(np.multiply.outer(np.arange(SCANS), [0.0, 0.0, 0.01, 0.02, 0.0, 0.0]))
     write_tum(folder / "odometry.tum", Trajectory(stamps, T @ drift))
-    write_cloud(folder / "map.ply", PointCloud(landmarks, np.zeros((500, 3))))
-    about = {"source": str(recording), "start": 0, "stop": None, "step": 1}
-    (folder / "config.yaml").write_text(dump_yaml(Config(), about))
     names = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
     rows = [["ok", *map(str, SIGMAS)]] * (SCANS - 1) + [["lost", *[""] * 6]]
     (folder / "scans.csv").write_text("\n".join(",".join(row) for row in [["status", *names], *rows]) + "\n")

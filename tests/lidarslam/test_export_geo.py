@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.exports.bag import RosTopics
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 from .conftest import FAST, refused
 
 pyproj = pytest.importorskip("pyproj")
@@ -49,12 +48,8 @@ def run(tmp_path_factory: pytest.TempPathFactory, truth: FloatArray) -> Path:
     T = np.linalg.inv(truth[0]) @ truth
     T[:, :3, 3] /= scale
     write_bag(folder / "drive.bag", stamps, truth)
-    out = folder / "run"
-    out.mkdir()
-    write_tum(out / "trajectory.tum", Trajectory(stamps, T))
-    write_cloud(out / "map.ply", PointCloud(T[:, :3, 3] + [0.0, 5.0, 0.0], np.tile([0.0, 1.0, 0.0], (SCANS, 1))))
-    (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(folder / "drive.bag")}))
-    return out
+    cloud = PointCloud(T[:, :3, 3] + [0.0, 5.0, 0.0], np.tile([0.0, 1.0, 0.0], (SCANS, 1)))
+    return write_run(folder / "run", Trajectory(stamps, T), cloud, source=str(folder / "drive.bag"))
 
 
 def write_bag(
@@ -115,10 +110,8 @@ def test_the_path_for_maps_on_the_web(run, tmp_path):
 def test_what_cannot_be_placed_is_refused(run, tmp_path, monkeypatch):
     succeeds("export-geo", run, "--out", tmp_path / "utm")
     assert "--overwrite" in refused("export-geo", run, "--out", tmp_path / "utm")
-    short = tmp_path / "short"
-    short.mkdir()
-    (short / "config.yaml").write_text((run / "config.yaml").read_text())
-    write_tum(short / "trajectory.tum", read_tum(run / "trajectory.tum").select(slice(0, 12)))
+    few = read_tum(run / "trajectory.tum").select(slice(0, 12))
+    short = write_run(tmp_path / "short", few, source=str(run.parent / "drive.bag"))
     assert "too short to determine the heading" in refused("export-geo", short, "--out", tmp_path / "other")
     assert not (tmp_path / "other").exists()
     monkeypatch.setitem(sys.modules, "pyproj", None)

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.finished_run import load_map, load_run
+
+from ..conftest import write_run
 
 
 @pytest.fixture
 def finished(tmp_path: Path) -> Path:
-    write_tum(tmp_path / "trajectory.tum", Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1))))
     (tmp_path / "scans.csv").write_text("index,status\n0,ok\n1,lost\n2,ok\n")
-    write_cloud(tmp_path / "map.ply", PointCloud(np.eye(3), np.eye(3)))
-    return tmp_path
+    still = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    return write_run(tmp_path, still, PointCloud(np.eye(3), np.eye(3)))
 
 
 def test_a_run_is_read_back(finished):

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.edits import moved
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 
 TILT = exp([np.deg2rad(7.0), 0.0, 0.0, 0.0, 0.0, 0.0])
 POSES = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
@@ -42,19 +41,14 @@ def hall() -> PointCloud:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run in it, tilted, 4 m along its middle, with an IMU in its recording."""
-    out, source = tmp_path / "run", tmp_path / "room"
-    out.mkdir()
+    stamps, source = np.arange(41) / 10.0, tmp_path / "room"
     source.mkdir()
-    stamps = np.arange(41) / 10.0
-    write_tum(out / "trajectory.tum", Trajectory(stamps, POSES))
-    write_cloud(out / "map.ply", moved(hall(), TILT))
-    (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(source)}))
     np.save(source / "000000.npy", np.eye(3))
     accelerations = np.gradient(np.gradient(POSES[:, :3, 3], 0.1, axis=0), 0.1, axis=0)
     force = np.einsum("nji,nj->ni", POSES[:, :3, :3], accelerations + TILT[:3, :3] @ [0.0, 0.0, 9.81])
     rows = np.column_stack([stamps, np.zeros((41, 3)), force])
     np.savetxt(source / "imu.csv", rows, delimiter=",", header="T_lidar_imu: 1 0 0 0 0 1 0 0 0 0 1 0")
-    return out
+    return write_run(tmp_path / "run", Trajectory(stamps, POSES), moved(hall(), TILT), source=str(source))
 
 
 @pytest.mark.parametrize("by", ["ground", "gravity"])

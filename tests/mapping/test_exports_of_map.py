@@ -8,7 +8,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.edits import reconstruct
 from lidarslam.mapping.global_map.occupancy_grid import (
     FREE,
@@ -19,10 +19,10 @@ from lidarslam.mapping.global_map.occupancy_grid import (
     find_ground,
     occupancy_grid,
 )
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 
 SLOPE = np.tan(np.deg2rad(10.0))
 SENSOR_M = 1.0
@@ -121,14 +121,6 @@ def test_without_ground_there_is_no_grid(room):
     assert occupancy_grid(points[above], normals[above], path, GridOptions()) is None
 
 
-def finished_run(folder: Path, cloud: PointCloud, path: FloatArray) -> Path:
-    """A folder with the map and the positions (N, 3) of a run."""
-    folder.mkdir()
-    write_tum(folder / "trajectory.tum", Trajectory(0.1 * np.arange(len(path)), make_transform(np.eye(3), path)))
-    write_cloud(folder / "map.ply", cloud)
-    return folder
-
-
 def _read(file: Path) -> tuple[dict[str, object], FloatArray]:
     """As map_server does, by a parser of our own: occupancy of each pixel, the first row at the top."""
     about: dict[str, object] = {}
@@ -144,7 +136,8 @@ def _read(file: Path) -> tuple[dict[str, object], FloatArray]:
 
 def test_files_of_grids_mean_the_same_to_the_map_server(room, tmp_path):
     points, normals, path = room
-    run, out = finished_run(tmp_path / "run", PointCloud(points, normals), path), tmp_path / "map.yaml"
+    trajectory = Trajectory(0.1 * np.arange(len(path)), make_transform(np.eye(3), path))
+    run, out = write_run(tmp_path / "run", trajectory, PointCloud(points, normals)), tmp_path / "map.yaml"
     command = ["export-grid", str(run), "--out", str(out)]
     succeeds(*command)
     cloud = load_map(run)  # in single precision
@@ -196,7 +189,8 @@ def test_the_surface_of_a_mesh_is_the_one_that_was_measured(bowl):
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl"])
 def test_files_of_meshes_are_read_by_others(bowl, tmp_path, suffix):
-    run, out = finished_run(tmp_path / "run", bowl, np.zeros((2, 3))), tmp_path / f"mesh{suffix}"
+    still = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
+    run, out = write_run(tmp_path / "run", still, bowl), tmp_path / f"mesh{suffix}"
     command = ["export-mesh", str(run), "--out", str(out), "--cell", "0.3"]
     succeeds(*command)
     mesh = o3d.io.read_triangle_mesh(str(out))
