@@ -51,7 +51,7 @@ time.sleep(60)
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-@pytest.mark.parametrize("killed_by", [signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize("killed_by", [signal.SIGKILL, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
 @pytest.mark.parametrize("code", [SUPERVISED, COMPILING, KISS], ids=["supervised", "compiling", "kiss"])
 def test_who_is_killed_leaves_no_process_behind(code, killed_by, still_runs):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

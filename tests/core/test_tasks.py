@@ -83,6 +83,7 @@ def test_an_error_of_a_task_is_that_of_the_user(tasks):
         list(tasks.run(fail_at_three, [1.0, 2.0, 3.0, 4.0]))
 
 
+@pytest.mark.long
 @in_processes
 def test_each_process_has_its_share_of_the_cores(tasks):
     share = os.environ.get("OMP_NUM_THREADS") or str(max(1, len(os.sched_getaffinity(0)) // 2))
@@ -90,6 +91,7 @@ def test_each_process_has_its_share_of_the_cores(tasks):
     assert list(tasks.run(environment, ["RAY_USAGE_STATS_ENABLED"])) == ["0"]
 
 
+@pytest.mark.long
 @in_processes
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks, tmp_path):

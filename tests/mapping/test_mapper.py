@@ -1,6 +1,7 @@
 """Sweeps of known truth through the mapper, with either map: accuracy, what stays out of it, and the way back."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -78,12 +79,17 @@ def mapper() -> Mapper:
     return Mapper(MappingConfig())
 
 
-@pytest.fixture
-def settled(rest_scans: list[Scan]) -> Mapper:
-    """A mapper that has followed the first fifteen scans."""
+@pytest.fixture(scope="module")
+def followed(rest_scans: list[Scan]) -> Mapper:
     mapper = Mapper(MappingConfig())
     process(mapper, rest_scans[:15])
     return mapper
+
+
+@pytest.fixture
+def settled(followed: Mapper) -> Mapper:
+    """A mapper that has followed the first fifteen scans."""
+    return deepcopy(followed)
 
 
 @pytest.mark.parametrize(("sensor", "kind"), [("vlp-16", SurfelMap), ("mid-360", FeatureMap)])
