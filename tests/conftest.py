@@ -219,6 +219,19 @@ def room_scans(room: Room, drive: Callable[[FloatArray], FloatArray], room_truth
     return [room.sweep(drive, float(stamp)) for stamp in room_truth.stamps]
 
 
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """Five scans with ground truth, not to be written to."""
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", room_scans[:5], room_truth)
+
+
+@pytest.fixture
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, and nothing is in it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture
 def through_disk(tmp_path: Path) -> Callable[[State], Saved]:
     """Writes a state and reads it back."""

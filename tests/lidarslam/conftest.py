@@ -159,13 +159,6 @@ def _timeless(tree: Any) -> Any:
     return tree
 
 
-@pytest.fixture
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, and nothing is in it."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="session")
 def small_recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
     """Six scans with ground truth, not to be written to."""
@@ -185,9 +178,3 @@ def whole_run(tmp_path_factory: pytest.TempPathFactory, small_recording: Path) -
 def finished_run(tmp_path: Path, whole_run: Path) -> Path:
     """A copy of a finished run."""
     return Path(shutil.copytree(whole_run, tmp_path / "run"))
-
-
-@pytest.fixture(scope="session")
-def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    """Five scans with ground truth, not to be written to."""
-    return write_recording(tmp_path_factory.mktemp("recordings") / "room", room_scans[:5], room_truth)
