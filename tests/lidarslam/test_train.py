@@ -339,7 +339,7 @@ SCANS = 14
 
 
 @pytest.fixture(scope="module")
-def drive() -> tuple[list[Scan], Trajectory]:
+def at_speed() -> tuple[list[Scan], Trajectory]:
     """A car that is at speed from the first scan on, half a metre from scan to scan."""
     request = RecordRequest(Path(), "street", "vlp-16", "car-fast", "upright", SCANS, 5, "", speed_mps=6.0)
     simulation = make_simulation(request)
@@ -347,8 +347,8 @@ def drive() -> tuple[list[Scan], Trajectory]:
 
 
 @pytest.mark.long
-def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(drive):
-    scans, truth = drive
+def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(at_speed):
+    scans, truth = at_speed
     teacher = MapTeacher()
     for scan in scans:
         teacher.follow(scan)
@@ -364,8 +364,8 @@ def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(drive):
     assert np.linalg.norm(expected[:, :3, 3], axis=1).min() > 0.4
 
 
-def test_what_is_not_sure_is_not_taught(drive):
-    scans, _ = drive
+def test_what_is_not_sure_is_not_taught(at_speed):
+    scans, _ = at_speed
     teacher = MapTeacher()
     strange = [*scans[:5], Scan(scans[5].points[:40], scans[5].stamp), *scans[6:9]]
     for scan in strange:
