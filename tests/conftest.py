@@ -13,10 +13,12 @@ import pytest
 from click.testing import CliRunner, Result
 from hypothesis import settings
 
+from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State, read_state, write_state
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
 # The benchmarks are scripts that import one another from their own folder.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -176,6 +178,17 @@ def write_recording(
     return folder
 
 
+def write_run(folder: Path, trajectory: Trajectory, cloud: PointCloud | None = None, **about: object) -> Path:
+    """A run directory with these results, and what its configuration says of it."""
+    folder.mkdir(exist_ok=True)
+    trajectory.save(folder / "trajectory.tum")
+    if cloud is not None:
+        write_cloud(folder / "map.ply", cloud)
+    if about:
+        (folder / "config.yaml").write_text(dump_yaml(Config(), about))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def room() -> Room:
     """The room."""
@@ -204,6 +217,19 @@ def room_truth(drive: Callable[[FloatArray], FloatArray]) -> Trajectory:
 def room_scans(room: Room, drive: Callable[[FloatArray], FloatArray], room_truth: Trajectory) -> list[Scan]:
     """Twenty rolling sweeps along the drive, stamped in their middle."""
     return [room.sweep(drive, float(stamp)) for stamp in room_truth.stamps]
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """Five scans with ground truth, not to be written to."""
+    return write_recording(tmp_path_factory.mktemp("recordings") / "room", room_scans[:5], room_truth)
+
+
+@pytest.fixture
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, and nothing is in it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture

@@ -207,8 +207,12 @@ def cycle_breaches(modules: Modules) -> list[str]:
         name: sorted({t for t, _ in imports_of(module, modules) if t in modules and not modules[t].is_package})
         for name, module in modules.items()
     }
-    found = {cycle for name in graph if (cycle := _shortest_way_back(name, graph)) and min(cycle) == cycle[0]}
-    return sorted(" -> ".join([*cycle, cycle[0]]) for cycle in found)
+    return _circles(graph)
+
+
+def _circles(graph: Mapping[str, list[str]]) -> list[str]:
+    found = {way for name in graph if (way := _shortest_way_back(name, graph)) and min(way) == way[0]}
+    return sorted(" -> ".join([*way, way[0]]) for way in found)
 
 
 def _shortest_way_back(start: str, graph: Mapping[str, list[str]]) -> tuple[str, ...] | None:
@@ -282,21 +286,13 @@ def folder_breaches(modules: Modules) -> list[str]:
     """Parts of one package, files or folders, that import one another in a circle."""
     breaches = []
     for package in (module.name for module in modules.values() if module.is_package):
-        inside = {
-            name: f"{package}.{_part(name, package)}" for name in modules if name != package and below(name, package)
-        }
+        beneath = [name for name in modules if name != package and below(name, package)]
+        inside = {name: f"{package}.{name.removeprefix(f'{package}.').partition('.')[0]}" for name in beneath}
         graph: dict[str, set[str]] = {part: set() for part in inside.values()}
         for name, part in inside.items():
             graph[part] |= {inside[t] for t, _ in imports_of(modules[name], modules) if t in inside} - {part}
-        sorted_graph = {part: sorted(targets) for part, targets in graph.items()}
-        found = {c for part in graph if (c := _shortest_way_back(part, sorted_graph)) and min(c) == c[0]}
-        breaches += [" -> ".join([*circle, circle[0]]) for circle in found]
+        breaches += _circles({part: sorted(targets) for part, targets in graph.items()})
     return sorted(breaches)
-
-
-def _part(name: str, package: str) -> str:
-    """The file or folder of a package that a module below it lies in."""
-    return name.removeprefix(f"{package}.").partition(".")[0]
 
 
 RULES = [
@@ -329,22 +325,22 @@ def test_all_sources_are_looked_at(sources):
     assert len(sources) > 20
 
 
-def test_light_modules_load_nothing_heavy(sources):
-    """The syntax trees see our own imports only; the interpreter sees those of foreign libraries too."""
-    names = light_modules(sources)
-    assert names
-    code = f"import sys, {', '.join(names)}; print(sorted({HEAVY!r} & set(sys.modules)))"
+def assert_loaded_without(libraries, names):
+    code = f"import sys, {', '.join(names)}; print(sorted({libraries!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_light_modules_load_nothing_heavy(sources):
+    """The syntax trees see our own imports only; the interpreter sees those of foreign libraries too."""
+    assert_loaded_without(HEAVY, light_modules(sources))
 
 
 def test_a_run_begins_without_libraries_that_few_runs_need():
     slow = {*(f"scipy.{part}" for part in ("interpolate", "optimize", "sparse", "spatial"))}
     slow |= {"open3d", "torch", "gtsam", "rerun", "evalio"}
-    names = ("lidarslam.run.run", "lidarslam.datasets.ros.rosbag", "lidarslam.datasets.folders.scan_folder")
-    code = f"import sys, {', '.join(names)}; print(sorted({slow!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "[]", done.stderr
+    readers = ("lidarslam.datasets.ros.rosbag", "lidarslam.datasets.folders.scan_folder")
+    assert_loaded_without(slow, ("lidarslam.run.run", *readers))
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def run(arguments: list[str], environment: dict[str, str], folder: Path) -> "sub
 
 
 @pytest.mark.long
-def test_every_command_but_training_and_export_does_without(base_install: dict[str, str], tmp_path: Path) -> None:
+def test_every_command_but_training_and_export_does_without(base_install, tmp_path):
     commands = [
         "simulate --out office --world office --scans 6 --format ply",
         "info office",
@@ -64,9 +64,7 @@ def test_every_command_but_training_and_export_does_without(base_install: dict[s
     ],
     ids=["train", "export", "weights", "accelerator"],
 )
-def test_what_needs_the_extra_says_so_in_one_line(
-    arguments: list[str], purpose: str, base_install: dict[str, str], tmp_path: Path
-) -> None:
+def test_what_needs_the_extra_says_so_in_one_line(arguments, purpose, base_install, tmp_path):
     scans = tmp_path / "scans"
     scans.mkdir()
     for number in range(2):

@@ -1,25 +1,20 @@
 """The demonstration tells the story it promises."""
 
-from pathlib import Path
-
 import pytest
 
 from lidarslam.compare.demo import format_demo, run_demo
 
 
 @pytest.mark.slow
-def test_the_map_survives_the_turns_that_lose_kiss_icp(tmp_path: Path) -> None:
+def test_the_map_survives_the_turns_that_lose_kiss_icp(tmp_path):
     demo = run_demo(tmp_path, scans=110)
     (sequence,) = demo.outcome.comparison.sequences
     ours, kiss, by_scene = sequence.methods
-    assert ours.metrics is not None
-    assert kiss.metrics is not None
     assert by_scene.metrics is not None
     assert ours.status == "ok"
     assert ours.metrics.errors.ate_rmse_m < 0.02
     assert kiss.status == "lost"
     assert kiss.metrics.errors.ate_rmse_m > 10.0 * ours.metrics.errors.ate_rmse_m
-    assert ours.map_metrics is not None
     names = ["recording.png", "learned+map+graph.png", "kiss-icp.png", "kiss-icp@scene.png"]
     assert [picture.name for picture in demo.pictures] == names
     assert all(picture.stat().st_size > 10_000 for picture in demo.pictures)

@@ -10,7 +10,7 @@ NOTEBOOK = Path(__file__).parents[1] / "docs" / "notebooks" / "first_map.ipynb"
 
 
 @pytest.mark.long
-def test_the_first_map_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_map_is_made(tmp_path, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     # Its shell commands are those of this environment.
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")

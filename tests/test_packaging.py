@@ -29,7 +29,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
 
 
 @pytest.mark.long
-def test_everything_below_the_package_is_in_the_wheel(wheel: ZipFile) -> None:
+def test_everything_below_the_package_is_in_the_wheel(wheel):
     walked = os.walk(REPOSITORY / "lidarslam", followlinks=True)
     files = {Path(folder, name).relative_to(REPOSITORY).as_posix() for folder, _, names in walked for name in names}
     expected = {name for name in files if "__pycache__" not in name}
@@ -38,7 +38,7 @@ def test_everything_below_the_package_is_in_the_wheel(wheel: ZipFile) -> None:
     assert "lidarslam/evaluation/report/templates/report.html.j2" in expected
 
 
-def test_an_editable_install_is_a_path_as_type_checkers_need(tmp_path: Path) -> None:
+def test_an_editable_install_is_a_path_as_type_checkers_need(tmp_path):
     build = "import sys; from hatchling.build import build_editable; build_editable(sys.argv[1])"
     subprocess.run([sys.executable, "-c", build, tmp_path], cwd=REPOSITORY, check=True, capture_output=True, timeout=60)
     built = ZipFile(next(tmp_path.glob("*.whl")))
@@ -47,7 +47,7 @@ def test_an_editable_install_is_a_path_as_type_checkers_need(tmp_path: Path) -> 
     assert (REPOSITORY / "lidarslam" / "py.typed").is_file()
 
 
-def test_links_of_the_description_are_absolute_and_lead_to_files(wheel: ZipFile) -> None:
+def test_links_of_the_description_are_absolute_and_lead_to_files(wheel):
     (metadata,) = (name for name in wheel.namelist() if name.endswith("/METADATA"))
     description = message_from_bytes(wheel.read(metadata)).get_payload()
     links = re.findall(r"\]\(([^)]+)\)", str(description))

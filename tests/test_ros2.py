@@ -44,7 +44,7 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return SimpleNamespace(**runpy.run_path(str(PACKAGE / "launch/lidarslam.launch.py")))
 
 
-def test_the_launched_command_is_one_of_lidarslam(launch_file: SimpleNamespace) -> None:
+def test_the_launched_command_is_one_of_lidarslam(launch_file):
     arguments = {name: default for name, (default, _) in launch_file.ARGUMENTS.items()}
     context = arguments | {"options": "--base-frame base_link --set reader.time_unit=ns"}
     (process,) = launch_file.start_program(context)
@@ -56,7 +56,7 @@ def test_the_launched_command_is_one_of_lidarslam(launch_file: SimpleNamespace) 
         assert parsed.params["base_frame"] == "base_link"
 
 
-def test_the_launch_has_the_program_the_transform_and_rviz(launch_file: SimpleNamespace) -> None:
+def test_the_launch_has_the_program_the_transform_and_rviz(launch_file):
     (actions,) = launch_file.generate_launch_description().positional
     nodes = {action.named["executable"]: action.named for action in actions if "executable" in action.named}
     declared = [action.positional[0] for action in actions if "default_value" in action.named]
@@ -66,7 +66,7 @@ def test_the_launch_has_the_program_the_transform_and_rviz(launch_file: SimpleNa
     assert any(action.named.get("function") is launch_file.start_program for action in actions)
 
 
-def test_the_package_names_what_it_starts_and_installs() -> None:
+def test_the_package_names_what_it_starts_and_installs():
     package = ElementTree.parse(PACKAGE / "package.xml").getroot()
     name = package.findtext("name")
     needed = {element.text for element in package.findall("exec_depend")}
@@ -78,7 +78,7 @@ def test_the_package_names_what_it_starts_and_installs() -> None:
     assert f'FindPackageShare("{name}")' in (PACKAGE / "launch/lidarslam.launch.py").read_text()
 
 
-def test_rviz_shows_the_topics_of_the_program() -> None:
+def test_rviz_shows_the_topics_of_the_program():
     shown = yaml.safe_load((PACKAGE / "rviz/lidarslam.rviz").read_text())["Visualization Manager"]
     assert shown["Global Options"]["Fixed Frame"] == "map"
     topics = {display["Topic"]["Value"] for display in shown["Displays"] if "Topic" in display}

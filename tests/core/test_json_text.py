@@ -1,6 +1,5 @@
 """JSON of unknown origin."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,18 +21,18 @@ from lidarslam.core.json_text import ANY_OBJECT, parse_json, read_json
     ],
     ids=range(6),
 )
-def test_what_is_not_plain_is_a_value_error_of_one_line(text: str, message: str) -> None:
+def test_what_is_not_plain_is_a_value_error_of_one_line(text, message):
     with pytest.raises(ValueError, match=message) as refused:
         parse_json(text, ANY_OBJECT)
     assert "\n" not in str(refused.value)
 
 
-def test_a_fault_of_shape_has_its_place() -> None:
+def test_a_fault_of_shape_has_its_place():
     with pytest.raises(ValueError, match=r"^a\.1: Input should be a valid integer"):
         parse_json('{"a": [1, "b"]}', TypeAdapter(dict[str, list[int]]))
 
 
-def test_plain_values_are_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plain_values_are_as_they_are(tmp_path, monkeypatch):
     values: dict[str, Any] = {"a": [1, -(2**62), 0.5, None, True, "stra\u00dfe"], "b": {"c": []}}
     file = tmp_path / "file.json"
     file.write_text('{"a": [1, -4611686018427387904, 0.5, null, true, "straße"], "b": {"c": []}}')

@@ -69,7 +69,7 @@ def tasks(request: pytest.FixtureRequest) -> Iterator[Tasks]:
 
 
 @pytest.mark.long
-def test_results_are_in_order_whoever_is_first(tasks: Tasks) -> None:
+def test_results_are_in_order_whoever_is_first(tasks):
     done: list[tuple[int, float]] = []
     assert list(tasks.run(square, [0.0, 1.0, 2.0, 3.0, 4.0], lambda *one: done.append(one))) == SQUARES
     assert sorted(done) == list(enumerate(SQUARES))
@@ -78,21 +78,23 @@ def test_results_are_in_order_whoever_is_first(tasks: Tasks) -> None:
 
 
 @pytest.mark.long
-def test_an_error_of_a_task_is_that_of_the_user(tasks: Tasks) -> None:
+def test_an_error_of_a_task_is_that_of_the_user(tasks):
     with pytest.raises(InputError, match="three 3"):
         list(tasks.run(fail_at_three, [1.0, 2.0, 3.0, 4.0]))
 
 
+@pytest.mark.long
 @in_processes
-def test_each_process_has_its_share_of_the_cores(tasks: Tasks) -> None:
+def test_each_process_has_its_share_of_the_cores(tasks):
     share = os.environ.get("OMP_NUM_THREADS") or str(max(1, len(os.sched_getaffinity(0)) // 2))
     assert list(tasks.run(environment, ["OMP_NUM_THREADS", "NUMBA_NUM_THREADS"])) == [share, share]
     assert list(tasks.run(environment, ["RAY_USAGE_STATS_ENABLED"])) == ["0"]
 
 
+@pytest.mark.long
 @in_processes
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks: Tasks, tmp_path: Path) -> None:
+def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks, tmp_path):
     files = [str(tmp_path / name) for name in ("one", "two", "never begun")]
 
     def interrupt() -> None:
@@ -109,7 +111,7 @@ def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks: Tasks, t
     assert list(tasks.run(square, [3.0])) == [9.0]  # the processes serve on
 
 
-def test_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_message_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "lidarslam.core.tasks", raising=False)
     with pytest.raises(ConfigError, match=r"ray is not installed.* pip install 'lidarslam\[ray\]'"):
@@ -118,7 +120,7 @@ def test_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
         assert list(serial.run(square, [2.0])) == [4.0]
 
 
-def test_a_cluster_that_is_not_there_is_named() -> None:
+def test_a_cluster_that_is_not_there_is_named():
     pytest.importorskip("ray")
     with (
         pytest.raises(ConfigError, match=r"--ray 127.0.0.1:9: no cluster answers there"),
@@ -127,7 +129,7 @@ def test_a_cluster_that_is_not_there_is_named() -> None:
         pass
 
 
-def test_a_ray_that_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ray_that_does_not_start_is_told(monkeypatch):
     """On a busy machine it gives up, with an exception of no kind of its own."""
     pytest.importorskip("ray")
 

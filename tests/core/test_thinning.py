@@ -22,14 +22,14 @@ def by_arrays(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
 
 
 @pytest.mark.parametrize("cell_m", [0.05, 0.7, 10.0])
-def test_equals_the_hash_with_arrays(rng: np.random.Generator, cell_m: float) -> None:
+def test_equals_the_hash_with_arrays(rng, cell_m):
     points = rng.normal(0.0, 15.0, (30_000, 3))
     np.testing.assert_array_equal(one_per_cell(points, cell_m), by_arrays(points, cell_m))
     # The slots of the scan before are still there.
     np.testing.assert_array_equal(one_per_cell(points[::7], cell_m), by_arrays(points[::7], cell_m))
 
 
-def test_nearly_every_cell_keeps_one(rng: np.random.Generator) -> None:
+def test_nearly_every_cell_keeps_one(rng):
     points = rng.uniform(-10.0, 10.0, (20_000, 3))
     cells = np.floor(points)
     kept = one_per_cell(points, 1.0)
@@ -37,7 +37,7 @@ def test_nearly_every_cell_keeps_one(rng: np.random.Generator) -> None:
     assert len(kept) > 0.98 * len(np.unique(cells, axis=0))
 
 
-def test_what_is_no_place_does_no_harm() -> None:
+def test_what_is_no_place_does_no_harm():
     points = np.array([[np.nan, 0.0, 0.0], [np.inf, 1e300, -np.inf], [1e30, 1e30, 1e30], [5.0, 5.0, 5.0]])
     with np.errstate(over="ignore"):
         assert 3 in one_per_cell(points, 0.1)
@@ -56,7 +56,7 @@ def assert_central(points: FloatArray, cell_m: float) -> None:
 
 
 @pytest.mark.parametrize("cell_m", [0.7, 3.0, 100.0])
-def test_the_most_central_point_is_the_nearest_to_the_mean_of_its_cell(rng: np.random.Generator, cell_m: float) -> None:
+def test_the_most_central_point_is_the_nearest_to_the_mean_of_its_cell(rng, cell_m):
     points = rng.normal(0.0, 2.0, (2_000, 3))
     assert_central(points, cell_m)
     assert_central(points[::7], cell_m)  # the slots of the scan before are still there
@@ -64,7 +64,7 @@ def test_the_most_central_point_is_the_nearest_to_the_mean_of_its_cell(rng: np.r
     assert_central(points[::3], cell_m)
 
 
-def test_the_most_central_points_are_the_same_whichever_way_the_sensor_goes_round(rng: np.random.Generator) -> None:
+def test_the_most_central_points_are_the_same_whichever_way_the_sensor_goes_round(rng):
     points = rng.uniform(-3.0, 3.0, (30_000, 3))
     forwards, backwards = central_per_cell(points, 0.7), len(points) - 1 - central_per_cell(points[::-1], 0.7)
     assert len(forwards) == len(backwards)

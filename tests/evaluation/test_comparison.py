@@ -65,7 +65,7 @@ def _sequence(name: str, *results: MethodResult) -> SequenceComparison:
     return SequenceComparison(name, f"data/{name}", None, "ground truth", results)
 
 
-def test_a_method_without_anything_is_null_and_never_0() -> None:
+def test_a_method_without_anything_is_null_and_never_0():
     content = MethodResult("kiss-icp", "failed", "aborted (signal 6)").to_json()
     assert content["status"] == "failed"
     assert content["message"] == "aborted (signal 6)"
@@ -73,10 +73,10 @@ def test_a_method_without_anything_is_null_and_never_0() -> None:
     assert [content[key] for key in absent] == [None] * len(absent)
 
 
-def test_one_recording_has_its_own_keys_and_several_a_list(result: MethodResult) -> None:
+def test_one_recording_has_its_own_keys_and_several_a_list(result):
     one = Comparison("t", "c", [_sequence("04", result)], notes=["n"]).to_json()
     assert one["sequence"] == "04"
-    assert set(one["methods"]) == {"kiss-icp"}  # type: ignore[call-overload]
+    assert set(one["methods"]) == {"kiss-icp"}
     assert one["notes"] == ["n"]
     missing = [MissingRecording("06", "data/06", "not there")]
     several = Comparison("t", "c", [_sequence("04", result), _sequence("05", result)], missing=missing)
@@ -86,7 +86,7 @@ def test_one_recording_has_its_own_keys_and_several_a_list(result: MethodResult)
     assert "methods" not in content
 
 
-def test_quantities_are_read_off_the_entry(result: MethodResult) -> None:
+def test_quantities_are_read_off_the_entry(result):
     assert QUANTITIES["kitti_translation_percent"].of(result) == pytest.approx(1.0, abs=0.02)
     assert QUANTITIES["segment_10_translation_percent"].of(result) == pytest.approx(1.0, abs=1e-6)
     assert QUANTITIES["odometry_ms_median"].of(result) == 15.0
@@ -105,7 +105,7 @@ def _timed(name: str, ms: float | None, status: MethodStatus = "ok") -> MethodRe
     return MethodResult(name, status, ms_per_scan_median=ms)
 
 
-def test_means_count_the_recordings_that_have_a_value() -> None:
+def test_means_count_the_recordings_that_have_a_value():
     sequences = [
         _sequence("00", _timed("a", 10.0), _timed("b", 30.0)),
         _sequence("01", _timed("a", 20.0), _timed("b", None, "failed")),
@@ -127,7 +127,7 @@ def test_means_count_the_recordings_that_have_a_value() -> None:
     assert content["columns"][0]["sequences"] == ["00", "01", "02", "03"]
 
 
-def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_contains() -> None:
+def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_contains():
     ours = MethodResult("ours", "ok", elapsed_ms_per_scan=30.0, peak_rss_mb=9.0)
     peer = MethodResult("peer", "ok", elapsed_ms_per_scan=10.0, peak_rss_mb=5.0, times_cover="registration")
     third = MethodResult("third", "ok", elapsed_ms_per_scan=40.0, peak_rss_mb=7.0)
@@ -145,7 +145,7 @@ def test_a_time_of_the_registration_alone_is_no_best_and_the_note_says_what_it_c
     assert "registration alone" not in mean_table(memory, [sequence]).note
 
 
-def test_intervals_have_reasons_and_losses_less_than_a_second_apart_are_one() -> None:
+def test_intervals_have_reasons_and_losses_less_than_a_second_apart_are_one():
     first, second = lost_intervals(LOST)
     assert first == LostInterval(1, 2, 1.0, 2.0, 2, "covered")
     assert second.reason == "kidnapped"

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, write_tum
@@ -21,7 +20,7 @@ from lidarslam.evaluation.comparison.gates import (
     parse_gate,
 )
 
-from ..conftest import lidarslam
+from ..conftest import lidarslam, write_run
 
 LOST = 2
 
@@ -34,10 +33,7 @@ def run(tmp_path: Path) -> Path:
     write_tum(tmp_path / "truth.tum", Trajectory(stamps, T))
     T = T.copy()
     T[::2, 1, 3] += 0.06
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
-    (folder / "config.yaml").write_text(dump_yaml(Config(), {"source": "nowhere"}))
+    folder = write_run(tmp_path / "run", Trajectory(stamps, T), source="nowhere")
     (folder / "summary.json").write_text(f'{{"scans": 240, "lost_scans": {LOST}, "realtime_factor": null}}')
     return folder
 
@@ -52,19 +48,19 @@ def run(tmp_path: Path) -> Path:
         ("a = b: c:lost=0", Gate("max", "lost", 0.0, "a = b: c")),
     ],
 )
-def test_the_grammar(text: str, gate: Gate) -> None:
+def test_the_grammar(text, gate):
     assert parse_gate("max", text, with_method=True) == gate
 
 
 @pytest.mark.parametrize("text", ["ate", "ate=", "=0.1", "ate=nan", "ate=low", ":ate=1", "lost", ""])
-def test_other_forms_are_refused(text: str) -> None:
+def test_other_forms_are_refused(text):
     with pytest.raises(ConfigError, match=r"expected \[METHOD:\]NAME=VALUE"):
         parse_gate("min", text, with_method=True)
     with pytest.raises(ConfigError, match=r"expected NAME=VALUE"):
         parse_gate("min", "learned:ate=0.1")
 
 
-def test_the_names_are_keys_of_the_written_files(run: Path) -> None:
+def test_the_names_are_keys_of_the_written_files(run):
     """Each figure is found in files as the program writes them."""
     written = evaluate(EvaluateRequest(run, reference=run.parent / "truth.tum")).to_json()
     found = {name for name in (*FIGURES, *PATHS) if Gate("max", name, 0.0).of({"metrics": written}) is not None}
@@ -78,7 +74,7 @@ def test_the_names_are_keys_of_the_written_files(run: Path) -> None:
     assert found == expected
 
 
-def test_bounds_are_included_and_null_fails() -> None:
+def test_bounds_are_included_and_null_fails():
     figures = {"metrics": {"trajectory": {"ate_rmse_m": 0.1}, "kitti": None}, "summary": {}}
     bounds = [Gate("max", "ate", 0.1), Gate("min", "ate", 0.1), Gate("max", "ate", 0.09), Gate("min", "ate", 0.11)]
     judged = judge([*bounds, Gate("max", "kitti", 9.0), Gate("max", "lost", 9.0)], figures)
@@ -89,7 +85,7 @@ def test_bounds_are_included_and_null_fails() -> None:
     assert format_gates(judged[:2]).endswith("all 2 passed")
 
 
-def test_a_comparison_is_judged_by_method() -> None:
+def test_a_comparison_is_judged_by_method():
     """The reference has no errors of its own, which is no failure; a method that failed is one."""
     results = [
         MethodResult("reference", "ok", lost=np.zeros(3, np.bool_), run="a"),
@@ -107,7 +103,7 @@ def test_a_comparison_is_judged_by_method() -> None:
     ]
 
 
-def test_the_exit_status_of_evaluate(run: Path) -> None:
+def test_the_exit_status_of_evaluate(run):
     command = ["evaluate", run, "--reference", run.parent / "truth.tum"]
     passed = lidarslam(*command, "--max", "ate=0.04", "--max", f"lost={LOST}", "--min", "matched=240")
     assert passed.exit_code == 0

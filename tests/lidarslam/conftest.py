@@ -3,7 +3,9 @@
 import hashlib
 import json
 import re
+import resource
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,8 +22,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
+from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam, succeeds, write_recording
+from .killable import Ended, serving
 
 FAST = ("--odometry", "constant-velocity", "--no-report")
 
@@ -53,6 +57,19 @@ def fuzzed(examples: int) -> settings:
     return settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=unimportant)
 
 
+@contextmanager
+def files_no_longer_than(size: int) -> Iterator[None]:
+    """A disk that is full after so many bytes of a file, as far as this process sees."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
 def summary_of(run: Path) -> dict[str, Any]:
     return dict(json.loads((run / "summary.json").read_text()))
 
@@ -77,6 +94,12 @@ def scan_estimate(stamp: float, T_world_lidar: FloatArray, status: Status = Stat
     return ScanEstimate(stamp=stamp, T_world_lidar=T_world_lidar, status=status, **given | values)
 
 
+@contextmanager
+def quiet(_name: str) -> Iterator[Progress]:
+    """No progress bar."""
+    yield lambda _number, _total, _result: None
+
+
 class Told:
     """Keeps what a comparison tells: a line for each method, and how many scans of which were counted."""
 
@@ -98,12 +121,21 @@ def told() -> Told:
     return Told()
 
 
+@pytest.fixture(scope="module")
+def killable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Ended]]:
+    """Carries out commands in processes of their own."""
+    with serving(tmp_path_factory.mktemp("log") / "log") as carry_out:
+        yield carry_out
+
+
 @pytest.fixture(scope="session")
-def timeless() -> Callable[[Path], dict[str, Any]]:
-    """What every file of a merge holds, large ones as a digest; without times, memory, and how often it was resumed."""
+def timeless() -> Callable[..., dict[str, Any]]:
+    """What every file of a run, merge or comparison holds, but for those of some names, large ones as a digest; without
+    times, memory, and how often it was resumed.
+    """
 
     def read(path: Path) -> Any:
-        if path.name == "summary.json":
+        if path.name in ("summary.json", "comparison.json"):
             return _timeless(json.loads(path.read_text()))
         if path.name == "scans.csv":
             rows = [row.split(",") for row in path.read_text().splitlines()]
@@ -111,23 +143,20 @@ def timeless() -> Callable[[Path], dict[str, Any]]:
             return [[cell for column, cell in enumerate(row) if column not in timed] for row in rows]
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
-    return lambda out: {str(path.relative_to(out)): read(path) for path in out.rglob("*") if path.is_file()}
+    return lambda out, *left_out: {
+        str(path.relative_to(out)): read(path)
+        for path in out.rglob("*")
+        if path.is_file() and path.name not in left_out
+    }
 
 
 def _timeless(tree: Any) -> Any:
     if isinstance(tree, dict):
-        timed = re.compile(r"_ms|ms_|elapsed_s|realtime|peak_rss|slowest|machine")
+        timed = re.compile(r"_ms|ms_|elapsed_s|wall_s|realtime|peak_rss|slowest|machine")
         return {name: _timeless(value) for name, value in tree.items() if not timed.search(name)}
     if isinstance(tree, list):
         return [_timeless(value) for value in tree if "the run was resumed" not in str(value)]
     return tree
-
-
-@pytest.fixture
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, and nothing is in it."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.fixture(scope="session")
@@ -149,9 +178,3 @@ def whole_run(tmp_path_factory: pytest.TempPathFactory, small_recording: Path) -
 def finished_run(tmp_path: Path, whole_run: Path) -> Path:
     """A copy of a finished run."""
     return Path(shutil.copytree(whole_run, tmp_path / "run"))
-
-
-@pytest.fixture(scope="session")
-def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    """Five scans with ground truth, not to be written to."""
-    return write_recording(tmp_path_factory.mktemp("recordings") / "room", room_scans[:5], room_truth)

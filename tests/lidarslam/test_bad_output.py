@@ -1,15 +1,12 @@
 """Places that cannot be written, disks that fill up, two writers, requests to end: a line, and no half file."""
 
-import contextlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +19,7 @@ from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.directory import FILES, RunDirectory
 
 from ..conftest import lidarslam, succeeds
-from .conftest import FAST, refused, summary_of
+from .conftest import FAST, files_no_longer_than, refused, summary_of
 
 COMMAND = f"'{sys.executable}' -m lidarslam"
 
@@ -39,19 +36,6 @@ def left_in(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) if folder.exists() else []
 
 
-@contextlib.contextmanager
-def files_no_longer_than(size: int) -> Iterator[None]:
-    """A disk that is full after so many bytes of a file, as far as this process sees."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
-
-
 @pytest.mark.parametrize(
     ("size", "more"),
     [
@@ -61,7 +45,7 @@ def files_no_longer_than(size: int) -> Iterator[None]:
         (4_000, ("--set", "global_map.most_points=2000")),
     ],
 )
-def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, more: Sequence[str]) -> None:
+def test_a_run_on_a_full_disk(tmp_path, small_recording, size, more):
     """The map is 300 kB, the log of the scans 600 bytes, the configuration 3.6 kB."""
     out = tmp_path / "run"
     with files_no_longer_than(size):
@@ -83,9 +67,7 @@ def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, 
     succeeds("run", small_recording, "--out", out, *FAST, "--overwrite")
 
 
-def test_tiles_that_find_no_room_cost_no_other_result(
-    tmp_path: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tiles_that_find_no_room_cost_no_other_result(tmp_path, small_recording, monkeypatch):
     written = []
 
     def full_after_one(path: Path, *_: object) -> None:
@@ -107,7 +89,7 @@ def test_tiles_that_find_no_room_cost_no_other_result(
 
 
 @pytest.mark.parametrize("size", [4_000, 100_000])
-def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recording: Path, size: int) -> None:
+def test_results_of_two_runs_are_not_taken_for_one(tmp_path, small_recording, size):
     """Where the disk fills up as a run replaces an earlier one, before it has replaced anything or after."""
     out = tmp_path / "run"
     succeeds("run", small_recording, "--out", out, *FAST)
@@ -126,7 +108,7 @@ def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recordi
     assert summary_of(out)["scans"] == 5
 
 
-def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:
+def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path, small_recording):
     out = tmp_path / "run"
     coarse = ("--set", "global_map.voxel_size_m=0.3")
     command = ("run", small_recording, "--out", out, *FAST, *coarse, "--rerun", "save")
@@ -149,7 +131,7 @@ def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Pa
         ("view {run} --picture {out}/run.png", (0, 3_000)),
     ],
 )
-def test_other_outputs_on_a_full_disk(tmp_path: Path, finished_run: Path, command: str, sizes: Sequence[int]) -> None:
+def test_other_outputs_on_a_full_disk(tmp_path, finished_run, command, sizes):
     out = tmp_path / "out"
     out.mkdir()
     for size in sizes:
@@ -161,23 +143,20 @@ def test_other_outputs_on_a_full_disk(tmp_path: Path, finished_run: Path, comman
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that not even root may write to")
-@pytest.mark.parametrize("command", ["run", "compare", "simulate", "train", "merge", "evaluate", "view", "picture"])
-def test_a_folder_that_cannot_be_written(small_recording: Path, finished_run: Path, command: str) -> None:
-    place = Path("/proc/self/task")
-    commands: dict[str, Sequence[object]] = {
-        "run": ["run", small_recording, *FAST, "--out", place / "run"],
-        "compare": ["compare", small_recording, "--methods", "constant-velocity+map", "--out", place / "c"],
-        "simulate": ["simulate", "--scans", 2, "--out", place / "s"],
-        "train": ["train", small_recording, "--out", place / "t", "--steps", 1],
-        "merge": ["merge", small_recording, finished_run.parent, "--reader", "scan-folder", "--out", place / "m"],
-        "evaluate": ["evaluate", finished_run, "--out", place / "metrics.json"],
-        "view": ["view", finished_run, "--save", place / "run.rrd"],
-        "picture": ["view", finished_run, "--picture", place / "run.png"],
-    }
-    if command == "merge":
-        for name in ("000000.npy", "000001.npy"):
-            shutil.copy(small_recording / name, finished_run.parent)
-    said = refused(*commands[command])
+@pytest.mark.parametrize("command", [
+    "run {recording} --odometry constant-velocity --out {place}/run",
+    "compare {recording} --methods constant-velocity+map --out {place}/c",
+    "simulate --scans 2 --out {place}/s",
+    "train {recording} --out {place}/t --steps 1",
+    "merge {recording} {run}/.. --reader scan-folder --out {place}/m",
+    "evaluate {run} --out {place}/metrics.json",
+    "view {run} --save {place}/run.rrd",
+    "view {run} --picture {place}/run.png",
+])  # fmt: skip
+def test_a_folder_that_cannot_be_written(small_recording, finished_run, command):
+    for name in ("000000.npy", "000001.npy"):
+        shutil.copy(small_recording / name, finished_run.parent)
+    said = refused(*command.format(recording=small_recording, run=finished_run, place="/proc/self/task").split())
     assert "/task" in said
     assert "cannot be written" in said
 
@@ -188,7 +167,7 @@ NAMES = ["new\nline \x1b[31mred", os.fsdecode(b"bad\xff"), *(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_every_kind(tmp_path, small_recording, name, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = Path(shutil.copytree(small_recording, tmp_path / "in" / name))
     result = lidarslam("run", source, f"--out={name}", *FAST)
@@ -199,7 +178,7 @@ def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, m
     succeeds("evaluate", f"./{name}", "--no-report")
 
 
-def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_recording: Path) -> None:
+def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path, small_recording):
     source = Path(shutil.copytree(small_recording, tmp_path / "room"))
     before = {path: path.read_bytes() for path in source.iterdir()}
     succeeds("run", source, "--out", source / "run", *FAST)
@@ -207,9 +186,7 @@ def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_
     assert "scans         6" in succeeds("info", source)
 
 
-def test_links_are_replaced_and_never_written_through(
-    tmp_path: Path, small_recording: Path, finished_run: Path
-) -> None:
+def test_links_are_replaced_and_never_written_through(tmp_path, small_recording, finished_run):
     outside = tmp_path / "outside"
     outside.mkdir()
     for name in FILES:
@@ -227,9 +204,7 @@ def test_links_are_replaced_and_never_written_through(
     assert summary_of(finished_run)["scans"] == 6
 
 
-def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
-    tmp_path: Path, small_recording: Path, whole_run: Path
-) -> None:
+def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(tmp_path, small_recording, whole_run):
     shutil.copytree(whole_run, tmp_path, dirs_exist_ok=True)
     out = Path(shutil.copytree(whole_run, tmp_path / "merged"))
     elsewhere = [{"directory": name} for name in ("..", ".", "", "/", "../run", 3, None)]
@@ -241,7 +216,7 @@ def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
     assert {"config.yaml", "map.ply", "summary.json"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_a_second_writer_is_turned_away(tmp_path: Path, small_recording: Path, finished_run: Path) -> None:
+def test_a_second_writer_is_turned_away(tmp_path, small_recording, finished_run):
     before, compared = {path.name: path.read_bytes() for path in finished_run.iterdir()}, tmp_path / "compared"
     compared.mkdir()
     with only_writer(finished_run), only_writer(compared):
@@ -256,11 +231,11 @@ def test_a_second_writer_is_turned_away(tmp_path: Path, small_recording: Path, f
 
 @pytest.mark.slow  # a process of its own for each
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[object], sent: signal.Signals) -> None:
+def test_a_request_to_end_leaves_what_there_is(tmp_path, room_scans, sent):
     """The recording is a minute long; the request comes in its first seconds."""
     source, out = tmp_path / "room", tmp_path / "run"
     source.mkdir()
-    points: FloatArray = room_scans[0].points  # type: ignore[attr-defined]
+    points: FloatArray = room_scans[0].points
     for index in range(2):  # a scan with the points of the one before would be left out
         np.save(source / f"{index:06d}.npy", points[index:])
     for index in range(2, 3_000):
@@ -288,9 +263,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     ("redirected", "status"),
     [("| true", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0), ("> /dev/full", 1), ("| head -n 1", 0)],
 )
-def test_standard_streams_that_are_closed_or_full(
-    tmp_path: Path, small_recording: Path, redirected: str, status: int
-) -> None:
+def test_standard_streams_that_are_closed_or_full(tmp_path, small_recording, redirected, status):
     ended = in_shell(f"{COMMAND} run '{small_recording}' --out run --odometry constant-velocity {redirected}", tmp_path)
     assert ended.returncode == status
     assert "Traceback" not in ended.stderr
@@ -311,7 +284,7 @@ def test_standard_streams_that_are_closed_or_full(
     ],
     ids=" ".join,
 )
-def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, str | None]) -> None:
+def test_environments(tmp_path, small_recording, changed):
     source = shutil.copytree(small_recording, tmp_path / "Größe")
     ended = in_shell(f"{COMMAND} run '{source}' --out läuft {' '.join(FAST)} --pose-graph", tmp_path, **changed)
     assert (ended.returncode, ended.stderr) == (0, "")
@@ -326,7 +299,7 @@ def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, 
         ("ulimit -v 1000000", "the address space is limited to"),  # OpenBLAS would wait for memory, deaf to SIGTERM
     ],
 )
-def test_shells_in_which_nothing_can_be_done(tmp_path: Path, script: str, said: str) -> None:
+def test_shells_in_which_nothing_can_be_done(tmp_path, script, said):
     (tmp_path / "gone").mkdir()
     ended = in_shell(f"{script}; exec {COMMAND} info nothing", tmp_path)
     assert ended.returncode == 1

@@ -25,7 +25,7 @@ def _filled(path: Path, data: Path | None = None) -> CompareRequest:
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
-def test_every_shipped_file_loads_and_fills_a_request(path: Path) -> None:
+def test_every_shipped_file_loads_and_fills_a_request(path):
     request = _filled(path, Path("data"))
     assert request.title
     assert request.tables
@@ -37,7 +37,7 @@ def test_every_shipped_file_loads_and_fills_a_request(path: Path) -> None:
     assert {simulate.motion for simulate in made} <= set(CARRIERS)
 
 
-def test_the_published_figures_stand_in_their_columns() -> None:
+def test_the_published_figures_stand_in_their_columns():
     kitti = next(path for path in SHIPPED if path.name == "kitti.yaml")
     overall, _ = _filled(kitti).tables
     (delora,) = [row for row in overall.published if row.method == "DeLORA"]
@@ -45,7 +45,7 @@ def test_the_published_figures_stand_in_their_columns() -> None:
     assert list(overall.groups) == ["00-08", "09", "10"]
 
 
-def test_paths_are_relative_to_the_data(tmp_path: Path) -> None:
+def test_paths_are_relative_to_the_data(tmp_path):
     (tmp_path / "loam.tum").touch()
     benchmark = Benchmark.model_validate(
         {
@@ -86,7 +86,7 @@ def test_paths_are_relative_to_the_data(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_are_named_with_the_file(tmp_path: Path, text: str, message: str) -> None:
+def test_mistakes_are_named_with_the_file(tmp_path, text, message):
     file = tmp_path / "benchmark.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=r"benchmark\.yaml: ") as error:
@@ -95,7 +95,7 @@ def test_mistakes_are_named_with_the_file(tmp_path: Path, text: str, message: st
 
 
 @pytest.mark.slow
-def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
+def test_recordings_are_made_and_missing_ones_said(tmp_path):
     file = tmp_path / "small.yaml"
     file.write_text(
         "title: small\nmethods: [kiss-icp@0.5]\n"
@@ -121,7 +121,7 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("before", ["surfels", "loam", "off"])
-def test_the_name_decides_the_mapping(name: str, method: str, closes_loops: bool, before: str) -> None:
+def test_the_name_decides_the_mapping(name, method, closes_loops, before):
     config = load_config(None, [f"mapping.method={before}", *parse_method(name).settings])
     assert (config.mapping.method, config.pose_graph.enabled) == (method, closes_loops)
 
@@ -140,7 +140,7 @@ SCENE = {"odometry.kiss_icp.voxel_size_m": None, "odometry.kiss_icp.max_range_m"
         ("kiss-icp@scene+map", SCENE),
     ],
 )
-def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> None:
+def test_the_name_decides_the_settings(name, values):
     method = parse_method(name)
     before = ("odometry.kiss_icp.voxel_size_m=0.7", "odometry.kiss_icp.max_range_m=70")
     config = load_config(None, [*before, *method.settings_at(13.5)])
@@ -161,18 +161,18 @@ def test_the_name_decides_the_settings(name: str, values: dict[str, object]) -> 
         ("learned+imu", r"with a map alone; compare learned\+imu\+map"),
     ],
 )
-def test_what_is_no_method_is_refused_in_words(name: str, message: str) -> None:
+def test_what_is_no_method_is_refused_in_words(name, message):
     with pytest.raises(ConfigError, match=message):
         parse_method(name)
 
 
 @pytest.mark.parametrize("size", ["fine", "nan", "-1"])
-def test_a_voxel_size_is_checked_like_the_setting(size: str) -> None:
+def test_a_voxel_size_is_checked_like_the_setting(size):
     with pytest.raises(ConfigError, match="voxel_size_m"):
         load_config(None, parse_method(f"kiss-icp@{size}").settings)
 
 
 @pytest.mark.parametrize(("names", "message"), [("kiss-icp,kiss-icp", "named twice"), (" , ", "no method is named")])
-def test_a_list_names_each_method_once(names: str, message: str) -> None:
+def test_a_list_names_each_method_once(names, message):
     with pytest.raises(ConfigError, match=message):
         parse_methods(names)

@@ -1,12 +1,13 @@
-"""When states are saved, who may be at work on a run, and where a resumed one goes on in its recording."""
+"""When states are saved, where a resumed run goes on in its recording, and what of a directory a run may replace."""
 
 import contextlib
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,18 +16,13 @@ from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State, read_state
-from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.interface import ConstantVelocity
-from lidarslam.odometry.methods.consistency import ConsistencyCheck
-from lidarslam.odometry.methods.external import ExternalOdometry
-from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run import checkpoints
 from lidarslam.run.checkpoints import Checkpoints, scans_left
 from lidarslam.run.results import TileWriter
 from lidarslam.run.summary import ScanLog
-from lidarslam.storage.directory import CONFIG, About, RunDirectory, Unfinished, require_whole
+from lidarslam.storage.directory import CONFIG, MAP_PLY, METRICS, RunDirectory, Unfinished, require_whole
 
 
 @dataclass
@@ -57,9 +53,7 @@ def unfinished(tmp_path: Path) -> Iterator[Unfinished]:
 
 
 @pytest.mark.parametrize(("cost_s", "pause_s"), [(0.01, 10.0), (0.2, 10.0), (1.0, 50.0)])
-def test_saving_takes_two_percent_of_the_time_at_most(
-    unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch, cost_s: float, pause_s: float
-) -> None:
+def test_saving_takes_two_percent_of_the_time_at_most(unfinished, monkeypatch, cost_s, pause_s):
     log = ScanLog()
     pipeline = Still(cost_s)
     monkeypatch.setattr(time, "monotonic", lambda: pipeline.now)
@@ -77,7 +71,7 @@ def test_saving_takes_two_percent_of_the_time_at_most(
     assert not log.warnings
 
 
-def test_a_disk_that_is_full_does_not_end_the_run(unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_full_does_not_end_the_run(unfinished, monkeypatch):
     log = ScanLog()
 
     def fail(path: Path, _: State) -> None:
@@ -92,64 +86,6 @@ def test_a_disk_that_is_full_does_not_end_the_run(unfinished: Unfinished, monkey
     assert "No space left" in log.warnings[0]
 
 
-@dataclass
-class Counting:
-    """Keeps every second scan's state in memory."""
-
-    states: list[tuple[int, State]] = field(default_factory=list)
-    out: int = 0
-    asked: int = 0
-
-    def is_due(self) -> bool:
-        self.asked += 1
-        return self.asked % 2 == 0
-
-    def save(self, pipeline: Pipeline) -> None:
-        assert pipeline.held is not None
-        self.states.append((self.out, pipeline.state()))
-
-
-def make_pipeline(odometry: ExternalOdometry, keeper: Counting | None = None) -> Pipeline:
-    localiser = OdometryAlone(ConsistencyCheck())
-    return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), checkpointer=keeper)
-
-
-def test_nothing_is_at_work_while_a_state_is_kept(
-    room_scans: list[Scan], room_truth: Trajectory, through_disk: Any
-) -> None:
-    """All results but that of the scan that is held are out, and the rest follows from the state."""
-    keeper = Counting()
-    whole = []
-    for result in make_pipeline(ExternalOdometry(room_truth), keeper).run(room_scans[:9]):
-        whole.append(result)
-        keeper.out = len(whole)
-    assert [out for out, _ in keeper.states] == [2, 4, 6, 8]
-    odometry = ExternalOdometry(room_truth)
-    pipeline = make_pipeline(odometry)
-    pipeline.restore(through_disk(keeper.states[1][1]))
-    assert pipeline.held.scan.stamp == room_scans[4].stamp
-    odometry.estimate(room_scans[4])
-    rest = list(pipeline.run(room_scans[5:9]))
-    assert len(rest) == 5
-    for found, expected in zip(rest, whole[4:], strict=True):
-        np.testing.assert_array_equal(found.T_world_lidar, expected.T_world_lidar)
-        np.testing.assert_array_equal(found.points, expected.points)
-        assert (found.status, found.residual_m) == (expected.status, expected.residual_m)
-
-
-class Deaf:
-    """An odometry without a state, and the stamps that it was given."""
-
-    def __init__(self) -> None:
-        self.heard: list[float] = []
-
-    def estimate(self, scan: Scan) -> None:
-        self.heard.append(scan.stamp)
-
-    def restore(self, _: Saved) -> None:
-        pass
-
-
 def scan_at(stamp: float) -> Scan:
     return Scan(np.full((1, 3), 1.0 + stamp), stamp)
 
@@ -158,28 +94,19 @@ STAMPS = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
 @pytest.mark.parametrize("done", [0, 4])
-def test_a_run_goes_on_after_the_scan_that_was_read_last(done: int) -> None:
+def test_a_run_goes_on_after_the_scan_that_was_read_last(done):
     for saved in (Saved({"odometry": {}}), Saved({"odometry": None})):
-        odometry: Any = Deaf()
+        odometry = Mock()
         left = scans_left(map(scan_at, STAMPS), scan_at(STAMPS[done]), odometry, saved)
         assert [scan.stamp for scan in left] == STAMPS[done + 1 :]
-        assert odometry.heard == ([] if saved.has("odometry") else STAMPS[: done + 1])
+        heard = [call.args[0].stamp for call in odometry.estimate.call_args_list]
+        assert heard == ([] if saved.has("odometry") else STAMPS[: done + 1])
 
 
 @pytest.mark.parametrize("held", [Scan(np.full((1, 3), 3.5), 2.0), Scan(np.full((1, 3), 3.0), 2.1)])
-def test_another_scan_than_the_one_that_was_read_is_noticed(held: Scan) -> None:
-    odometry: Any = Deaf()
+def test_another_scan_than_the_one_that_was_read_is_noticed(held):
     with pytest.raises(InputError, match="the recording has changed"):
-        scans_left(map(scan_at, STAMPS), held, odometry, Saved({"odometry": {}}))
-
-
-def test_two_are_not_at_work_on_one_run(tmp_path: Path) -> None:
-    with claim(tmp_path, {"a": 1}) as first:
-        first.begin(0)
-        for resume in (False, True):
-            with pytest.raises(OutputError, match="another lidarslam"), claim(tmp_path, {"a": 1}, resume):
-                pass
-        assert About.read(tmp_path) is not None
+        scans_left(map(scan_at, STAMPS), held, Mock(), Saved({"odometry": {}}))
 
 
 def refuse_as_unfinished(path: Path) -> None:
@@ -187,7 +114,7 @@ def refuse_as_unfinished(path: Path) -> None:
         require_whole(path)
 
 
-def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> None:
+def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path):
     with claim(tmp_path, {"a": 1}) as unfinished:
         unfinished.begin(0)
         refuse_as_unfinished(tmp_path)
@@ -204,14 +131,14 @@ def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> N
     assert not (tmp_path / "unfinished").exists()
 
 
-def replace_first_file(directory: RunDirectory) -> None:
-    directory.write_text(CONFIG, "run:\n  version: 1\n")
-
-
-@pytest.mark.parametrize("change", [replace_first_file, lambda directory: TileWriter(directory)._begin()])
-def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: Callable[[RunDirectory], None]
-) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda directory: directory.write_text(CONFIG, "run:\n  version: 1\n"),
+        lambda directory: TileWriter(directory)._begin(),
+    ],
+)
+def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(tmp_path, caplog, change):
     """What lies there at an instant is what a run leaves that is killed then."""
     run, killed = tmp_path / "run", tmp_path / "killed"
     with RunDirectory.create(run) as directory:
@@ -239,3 +166,51 @@ def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(
         with claim(mixed, {"a": 3}) as unfinished:
             unfinished.begin(0)
             refuse_as_unfinished(mixed)
+
+
+def names(path: Path) -> list[str]:
+    return sorted(entry.name for entry in path.iterdir())
+
+
+@pytest.fixture
+def earlier(tmp_path: Path) -> Path:
+    """A directory with an earlier run and a file of the user's."""
+    with RunDirectory.create(tmp_path / "run") as directory:
+        directory.write_text(CONFIG, "run:\n  version: 0\n")
+        directory.write_json(METRICS, {"ate": 1.0})
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    return tmp_path / "run"
+
+
+def test_a_new_directory_is_gone_when_nothing_came_of_the_run(tmp_path):
+    with pytest.raises(RuntimeError), RunDirectory.create(tmp_path / "run"):
+        raise RuntimeError
+    assert names(tmp_path) == []
+
+
+def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier):
+    with pytest.raises(OutputError, match="--overwrite"), RunDirectory.create(earlier):
+        pass
+    with pytest.raises(RuntimeError), RunDirectory.create(earlier, overwrite=True):
+        raise RuntimeError
+    with RunDirectory.create(earlier, overwrite=True) as directory:
+        assert names(earlier) == [CONFIG, METRICS, "notes.txt"], "it stays until the new files are there"
+        directory.write_text(CONFIG, "run:\n  version: 1\n")
+    assert names(earlier) == [CONFIG, "notes.txt"], "no metrics of the run before"
+    assert "version: 1" in (earlier / CONFIG).read_text()
+
+
+def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path):
+    (tmp_path / MAP_PLY).write_text("somebody's map")
+    (tmp_path / CONFIG).write_text("somebody: config\n")
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="not those of a run"), RunDirectory.create(tmp_path, overwrite):
+            pass
+    assert (tmp_path / MAP_PLY).read_text() == "somebody's map"
+
+
+def test_a_directory_with_foreign_files_only_is_used_as_it_is(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with RunDirectory.create(tmp_path) as directory:
+        directory.write_text(CONFIG, "run:\n")
+    assert (tmp_path / "notes.txt").read_text() == "mine"

@@ -3,17 +3,15 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from lidarslam.config.settings import load_config
-from lidarslam.core.geometry import FloatArray
 from lidarslam.pipeline import compile_ahead
 from lidarslam.pipeline.compile_ahead import PARTS, CompileAhead, parts_of
 
-from ..conftest import Room, write_recording
+from ..conftest import write_recording
 
 REPOSITORY = Path(__file__).parents[2]
 # Loops that only some runs need, and that take no more than a second to compile.
@@ -53,9 +51,7 @@ for loop, types in called().items():
 
 
 @pytest.mark.long
-def test_a_rehearsal_compiles_all_that_a_run_calls(
-    tmp_path: Path, room: Room, drive: Callable[[FloatArray], FloatArray]
-) -> None:
+def test_a_rehearsal_compiles_all_that_a_run_calls(tmp_path, room, drive):
     folder = write_recording(tmp_path / "scans", [room.ring_sweep(drive, 0.1 * number) for number in range(1, 5)])
     command = [sys.executable, "-c", REHEARSE_AND_RUN, str(folder), str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
@@ -63,7 +59,7 @@ def test_a_rehearsal_compiles_all_that_a_run_calls(
     assert not done.stdout
 
 
-def test_every_file_with_compiled_loops_belongs_to_a_part() -> None:
+def test_every_file_with_compiled_loops_belongs_to_a_part():
     sources = [path for top in ("odometry", "mapping", "lidarslam") for path in (REPOSITORY / top).rglob("*.py")]
     with_loops = {path for path in sources if "\n@compiled\n" in path.read_text(encoding="utf-8")}
     paths = [path.relative_to(REPOSITORY).with_suffix("").parts for path in with_loops]
@@ -80,7 +76,7 @@ def test_every_file_with_compiled_loops_belongs_to_a_part() -> None:
         (["mapping.method=off", "odometry.method=kiss-icp"], ["reading", "map", "checks"]),
     ],
 )
-def test_a_run_compiles_the_parts_that_it_uses(settings: list[str], parts: list[str]) -> None:
+def test_a_run_compiles_the_parts_that_it_uses(settings, parts):
     assert parts_of(load_config(None, settings)) == parts
 
 
@@ -90,7 +86,7 @@ class Popen(subprocess.Popen[bytes]):
     code = "import time; time.sleep(60)"
 
     def __init__(self, command: list[str], **options: object) -> None:
-        super().__init__([command[0], "-c", self.code], **options)  # type: ignore[call-overload]
+        super().__init__([command[0], "-c", self.code], **options)
 
 
 @pytest.fixture
@@ -100,7 +96,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("uncompiled")
-def test_an_interruption_ends_the_processes() -> None:
+def test_an_interruption_ends_the_processes():
     def interrupt(_: str) -> None:
         raise KeyboardInterrupt
 
@@ -113,7 +109,7 @@ def test_an_interruption_ends_the_processes() -> None:
 
 
 @pytest.mark.usefixtures("uncompiled")
-def test_a_process_that_fails_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_fails_is_not_waited_for(monkeypatch):
     monkeypatch.setattr(Popen, "code", "raise SystemExit(1)")
     lines: list[str] = []
     with CompileAhead(parts_of(load_config(None, []))) as compiling:
@@ -121,7 +117,7 @@ def test_a_process_that_fails_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     assert lines[0] == "compiling loops, once on this machine (0 of 6)"
 
 
-def test_nothing_is_waited_for_once_all_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_waited_for_once_all_is_compiled(monkeypatch):
     monkeypatch.setattr(compile_ahead, "is_compiled", lambda _: True)
     with CompileAhead(parts_of(load_config(None, []))) as compiling:
         compiling.wait(pytest.fail)

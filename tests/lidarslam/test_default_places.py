@@ -44,7 +44,7 @@ def unfinished(name: str, source: Path, sequence: str | None = None, **others: s
     return run
 
 
-def test_a_run_is_written_to_a_place_of_its_own_which_is_named_first_and_last(small_recording: Path) -> None:
+def test_a_run_is_written_to_a_place_of_its_own_which_is_named_first_and_last(small_recording):
     ran = lidarslam("run", small_recording, *FAST)
     assert ran.exit_code == 0
     out = only("runs")
@@ -71,7 +71,7 @@ def test_a_run_is_written_to_a_place_of_its_own_which_is_named_first_and_last(sm
         ("/", None, "recording"),
     ],
 )
-def test_results_bear_the_name_of_the_recording(source: str, sequence: str | None, name: str) -> None:
+def test_results_bear_the_name_of_the_recording(source, sequence, name):
     for marker in ("KITTI/sequences/04/a.txt", "nuscenes/v1.0-mini/scene.json", "area/MathildaAVE/poses/gt_poses.txt"):
         Path(marker).parent.mkdir(parents=True)
         Path(marker).touch()
@@ -81,7 +81,7 @@ def test_results_bear_the_name_of_the_recording(source: str, sequence: str | Non
 
 
 @pytest.mark.slow  # four commands
-def test_the_other_commands_have_a_place_too(small_recording: Path) -> None:
+def test_the_other_commands_have_a_place_too(small_recording):
     made = succeeds("simulate", "--world", "hall", "--scans", 2, "--format", "ply")
     recording = only("recordings")
     assert re.fullmatch(f"hall_{TIME}", recording.name)
@@ -93,7 +93,7 @@ def test_the_other_commands_have_a_place_too(small_recording: Path) -> None:
     assert re.fullmatch(f"room_{TIME}", only("merged").name)
 
 
-def test_a_killed_run_is_resumed_without_its_name(small_recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_is_resumed_without_its_name(small_recording, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(Unfinished, "end", lambda *_, **__: None)  # as if it was killed before
         lidarslam("run", small_recording, *FAST)
@@ -108,7 +108,7 @@ def test_a_killed_run_is_resumed_without_its_name(small_recording: Path, monkeyp
     assert f"runs: holds no unfinished run of {small_recording}; name one with --out" in again
 
 
-def test_the_run_to_resume_is_one_of_the_same_recording(empty_folder: Path) -> None:
+def test_the_run_to_resume_is_one_of_the_same_recording(empty_folder):
     (empty_folder / "runs").mkdir()
     (empty_folder / "runs" / "notes.txt").touch()
     unfinished("other", empty_folder / "other.mcap")
@@ -126,7 +126,7 @@ def test_the_run_to_resume_is_one_of_the_same_recording(empty_folder: Path) -> N
         unfinished_run(Path("site.mcap"))
 
 
-def test_the_latest_run_is_the_one_written_last() -> None:
+def test_the_latest_run_is_the_one_written_last():
     assert latest_run() is None
     late, _ = finished("a", 2_000), finished("b", 1_000)
     killed = finished("c", 3_000)
@@ -137,7 +137,7 @@ def test_the_latest_run_is_the_one_written_last() -> None:
     assert latest_run() == killed
 
 
-def test_evaluate_and_view_take_the_latest_run(whole_run: Path) -> None:
+def test_evaluate_and_view_take_the_latest_run(whole_run):
     for command in (["evaluate"], ["view", "--save", "run.rrd"]):
         refused = lidarslam(*command)
         assert refused.exit_code == 2

@@ -1,7 +1,6 @@
 """Evaluation from files to figures: runs, recordings, trajectory files, maps."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +8,13 @@ import numpy as np
 import pytest
 
 from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform, write_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+
+from ..conftest import write_run
 
 # Where the run's world lies in the recording's.
 T_TRUTH_RUN = exp([0.0, 0.0, 2.0, 5.0, -3.0, 0.5])
@@ -47,18 +47,15 @@ def recording(tmp_path: Path, surfaces: FloatArray) -> Path:
 @pytest.fixture
 def run(tmp_path: Path, recording: Path, surfaces: FloatArray) -> Path:
     """A run without error but for its map, of which every point is 3 cm too high."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_tum(folder / "trajectory.tum", Trajectory(STAMPS, T))
-    (folder / "trajectory.kitti").write_text(format_kitti(T))
     points = transform_points(inverse(T_TRUTH_RUN), surfaces + np.array([0.0, 0.0, 0.03]))
-    write_cloud(folder / "map.ply", PointCloud(points, np.zeros_like(points)))
-    (folder / "config.yaml").write_text(dump_yaml(Config(), {"source": str(recording)}))
+    cloud = PointCloud(points, np.zeros_like(points))
+    folder = write_run(tmp_path / "run", Trajectory(STAMPS, T), cloud, source=str(recording))
+    (folder / "trajectory.kitti").write_text(format_kitti(T))
     (folder / "metrics.json").write_text("{}")
     return folder
 
 
-def test_a_simulated_recording_brings_truth_and_map(run: Path, recording: Path) -> None:
+def test_a_simulated_recording_brings_truth_and_map(run, recording):
     evaluation = evaluate(EvaluateRequest(run, map_options=MapOptions(refine=False)))
     written = json.loads((run / "metrics.json").read_text())
     assert written["association"] == {"matched": 60, "estimate": 60, "reference": 60}
@@ -75,12 +72,12 @@ def test_a_simulated_recording_brings_truth_and_map(run: Path, recording: Path) 
     assert f"written to {run / 'metrics.json'}" in text
     refined = evaluate(EvaluateRequest(run))
     assert refined.map.alignment.moved_m == pytest.approx(0.03, abs=0.01)
-    assert refined.map.json["chamfer_m"] < evaluation.map.json["chamfer_m"]  # type: ignore[operator]
+    assert refined.map.json["chamfer_m"] < evaluation.map.json["chamfer_m"]
     assert "ICP, which moved it by 0.03" in format_evaluation(refined)
 
 
 @pytest.mark.parametrize("alignment", ["trajectory", "none", "FILE"])
-def test_every_alignment_is_told(run: Path, tmp_path: Path, alignment: str) -> None:
+def test_every_alignment_is_told(run, tmp_path, alignment):
     np.savetxt(tmp_path / "T.txt", T_TRUTH_RUN)
     chosen = str(tmp_path / "T.txt") if alignment == "FILE" else alignment
     evaluation = evaluate(EvaluateRequest(run, map_options=MapOptions(alignment=chosen)))
@@ -91,11 +88,11 @@ def test_every_alignment_is_told(run: Path, tmp_path: Path, alignment: str) -> N
         assert not found.is_trustworthy
         assert any("its alignment is wrong" in note for note in evaluation.notes)
     else:
-        assert evaluation.map.json["accuracy_mean_m"] < 0.02  # type: ignore[operator]
+        assert evaluation.map.json["accuracy_mean_m"] < 0.02
 
 
 @pytest.mark.long
-def test_the_map_alone_of_a_run_without_truth(run: Path, recording: Path, surfaces: FloatArray) -> None:
+def test_the_map_alone_of_a_run_without_truth(run, recording, surfaces):
     write_cloud(run.parent / "site.ply", PointCloud(surfaces, np.zeros_like(surfaces)))
     (recording / "ground_truth.tum").unlink()
     (recording / "map.ply").unlink()
@@ -107,7 +104,7 @@ def test_the_map_alone_of_a_run_without_truth(run: Path, recording: Path, surfac
     assert any("the trajectory is not evaluated" in note for note in evaluation.notes)
 
 
-def test_nothing_to_compare_with(run: Path, recording: Path) -> None:
+def test_nothing_to_compare_with(run, recording):
     (recording / "ground_truth.tum").unlink()
     with pytest.raises(InputError, match="came with no ground truth; name a trajectory with --reference"):
         evaluate(EvaluateRequest(run))
@@ -122,7 +119,7 @@ def test_nothing_to_compare_with(run: Path, recording: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["truth.tum", "truth.kitti", "folder", "run"])
-def test_references_of_every_kind(run: Path, recording: Path, tmp_path: Path, name: str) -> None:
+def test_references_of_every_kind(run, recording, tmp_path, name):
     write_tum(tmp_path / "truth.tum", Trajectory(STAMPS, T))
     (tmp_path / "truth.kitti").write_text(format_kitti(T))
     reference = {"folder": recording, "run": run}.get(name, tmp_path / name)
@@ -132,7 +129,7 @@ def test_references_of_every_kind(run: Path, recording: Path, tmp_path: Path, na
     assert (run / "metrics.json").read_text() == "{}"
 
 
-def test_kitti_files_are_matched_by_number(tmp_path: Path) -> None:
+def test_kitti_files_are_matched_by_number(tmp_path):
     (tmp_path / "a.txt").write_text(format_kitti(T))
     (tmp_path / "b.txt").write_text(format_kitti(T[:-1]))
     evaluation = evaluate(EvaluateRequest(tmp_path / "a.txt", reference=tmp_path / "a.txt"))
@@ -141,7 +138,7 @@ def test_kitti_files_are_matched_by_number(tmp_path: Path) -> None:
         evaluate(EvaluateRequest(tmp_path / "a.txt", reference=tmp_path / "b.txt"))
 
 
-def test_a_kitti_estimate_meets_the_truth_in_the_cameras_frame(tmp_path: Path) -> None:
+def test_a_kitti_estimate_meets_the_truth_in_the_cameras_frame(tmp_path):
     folder = tmp_path / "sequences" / "00"
     (folder / "velodyne").mkdir(parents=True)
     (tmp_path / "poses").mkdir()
@@ -154,10 +151,10 @@ def test_a_kitti_estimate_meets_the_truth_in_the_cameras_frame(tmp_path: Path) -
     (tmp_path / "estimate.txt").write_text(format_kitti(poses))
     evaluation = evaluate(EvaluateRequest(tmp_path / "estimate.txt", reference=folder))
     assert evaluation.metrics.errors.ate_rmse_m < 1e-6
-    assert evaluation.metrics.errors.rpe_translation_rmse_m < 1e-6  # type: ignore[operator]
+    assert evaluation.metrics.errors.rpe_translation_rmse_m < 1e-6
 
 
-def test_errors_are_written_as_coloured_points(run: Path, tmp_path: Path) -> None:
+def test_errors_are_written_as_coloured_points(run, tmp_path):
     ply, rrd = tmp_path / "errors.ply", tmp_path / "errors.rrd"
     evaluation = evaluate(EvaluateRequest(run, errors=[ply, rrd], map_options=MapOptions(refine=False)))
     vertices = read_ply(ply)
@@ -180,9 +177,7 @@ def test_errors_are_written_as_coloured_points(run: Path, tmp_path: Path) -> Non
         ({"map_file": "recording/README.md"}, InputError, "not a point cloud"),
     ],
 )
-def test_mistakes_are_named(
-    run: Path, tmp_path: Path, change: dict[str, str], kind: type[Exception], message: str
-) -> None:
+def test_mistakes_are_named(run, tmp_path, change, kind, message):
     places: dict[str, Any] = {key: tmp_path / name for key, name in change.items()}
     if "errors" in places:
         places["errors"] = [places["errors"]]
@@ -191,13 +186,13 @@ def test_mistakes_are_named(
     assert (run / "metrics.json").read_text() == "{}"
 
 
-def test_a_global_search_needs_icp() -> None:
+def test_a_global_search_needs_icp():
     with pytest.raises(ConfigError, match="let --refine follow it"):
         MapOptions(alignment="global", refine=False)
 
 
 @pytest.mark.parametrize("spoil", [lambda T: T[:3], lambda T: 2.0 * T, lambda T: T[:, :3]])
-def test_a_file_that_is_no_pose(tmp_path: Path, spoil: Callable[[FloatArray], FloatArray]) -> None:
+def test_a_file_that_is_no_pose(tmp_path, spoil):
     np.savetxt(tmp_path / "T.txt", T_TRUTH_RUN)
     np.testing.assert_allclose(read_transform(tmp_path / "T.txt"), T_TRUTH_RUN, atol=1e-12)
     np.savetxt(tmp_path / "T.txt", spoil(T_TRUTH_RUN))

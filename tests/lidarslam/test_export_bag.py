@@ -9,15 +9,14 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.exports.source import read_run_scans
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 from .conftest import refused
 
 SCANS = 6
@@ -35,9 +34,8 @@ def landmarks(rng: np.random.Generator) -> FloatArray:
 @pytest.fixture
 def run(tmp_path: Path, landmarks: FloatArray) -> Path:
     """A run of constant velocity over sweeps of 0.1 s; the odometry drifts, and the last scan is lost."""
-    recording, folder = tmp_path / "recording", tmp_path / "run"
+    recording = tmp_path / "recording"
     recording.mkdir()
-    folder.mkdir()
     stamps = FIRST_STAMP + 0.1 * np.arange(SCANS)
     offsets = np.linspace(0.0, 0.1, len(landmarks))
     for number in range(SCANS):
@@ -49,12 +47,11 @@ def run(tmp_path: Path, landmarks: FloatArray) -> Path:
         np.save(recording / f"{number:06d}.npy", table)
     np.savetxt(recording / "timestamps.txt", stamps, fmt="%.9f")
     T = exp(np.multiply.outer(0.1 * np.arange(SCANS), VELOCITY))
-    write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
+    about = {"source": str(recording), "start": 0, "stop": None, "step": 1}
+    cloud = PointCloud(landmarks, np.zeros((500, 3)))
+    folder = write_run(tmp_path / "run", Trajectory(stamps, T), cloud, **about)
     drift = exp(np.multiply.outer(np.arange(SCANS), [0.0, 0.0, 0.01, 0.02, 0.0, 0.0]))
     write_tum(folder / "odometry.tum", Trajectory(stamps, T @ drift))
-    write_cloud(folder / "map.ply", PointCloud(landmarks, np.zeros((500, 3))))
-    about = {"source": str(recording), "start": 0, "stop": None, "step": 1}
-    (folder / "config.yaml").write_text(dump_yaml(Config(), about))
     names = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
     rows = [["ok", *map(str, SIGMAS)]] * (SCANS - 1) + [["lost", *[""] * 6]]
     (folder / "scans.csv").write_text("\n".join(",".join(row) for row in [["status", *names], *rows]) + "\n")
@@ -105,7 +102,7 @@ BAGS = [(name, read_with_rosbags) for name in ("slam.mcap", "slam.bag", "slam.db
 
 
 @pytest.mark.parametrize(("name", "read"), [*BAGS, ("slam.mcap", read_with_mcap)])
-def test_poses_and_points_come_back(run: Path, landmarks: FloatArray, tmp_path: Path, name: str, read: Any) -> None:
+def test_poses_and_points_come_back(run, landmarks, tmp_path, name, read):
     succeeds("export-bag", run, "--out", tmp_path / name)
     messages = read(tmp_path / name)
     scans = read_run_scans(run)
@@ -131,7 +128,7 @@ def test_poses_and_points_come_back(run: Path, landmarks: FloatArray, tmp_path: 
     np.testing.assert_allclose(xyz(messages["/map_points"][0][1]), landmarks, atol=1e-5)
 
 
-def test_covariance_and_velocity_are_in_the_frames_of_ros(run: Path, tmp_path: Path) -> None:
+def test_covariance_and_velocity_are_in_the_frames_of_ros(run, tmp_path):
     succeeds("export-bag", run, "--out", tmp_path / "slam.mcap", "--no-clouds")
     messages = read_with_rosbags(tmp_path / "slam.mcap")
     assert "/points" not in messages
@@ -146,7 +143,7 @@ def test_covariance_and_velocity_are_in_the_frames_of_ros(run: Path, tmp_path: P
     np.testing.assert_allclose(found, VELOCITY, atol=1e-6)
 
 
-def test_path_and_map_are_latched(run: Path, tmp_path: Path) -> None:
+def test_path_and_map_are_latched(run, tmp_path):
     latched = {}
     for name in ("slam.mcap", "slam.bag"):
         succeeds("export-bag", run, "--out", tmp_path / name, "--no-clouds")
@@ -158,7 +155,7 @@ def test_path_and_map_are_latched(run: Path, tmp_path: Path) -> None:
     assert durable == kinds
 
 
-def test_the_bag_is_a_recording(run: Path, landmarks: FloatArray, tmp_path: Path) -> None:
+def test_the_bag_is_a_recording(run, landmarks, tmp_path):
     succeeds("export-bag", run, "--out", tmp_path / "slam.mcap")
     scans = list(open_recording(tmp_path / "slam.mcap", ReaderConfig(topic="/points")).scans())
     trajectory = read_run_scans(run).trajectory
@@ -170,7 +167,7 @@ def test_the_bag_is_a_recording(run: Path, landmarks: FloatArray, tmp_path: Path
         np.testing.assert_array_equal(scan.rings, np.arange(len(landmarks)) % 16)
 
 
-def test_what_is_in_the_way(run: Path, tmp_path: Path) -> None:
+def test_what_is_in_the_way(run, tmp_path):
     out = tmp_path / "slam.mcap"
     out.write_text("mine")
     refused("export-bag", run, "--out", out)

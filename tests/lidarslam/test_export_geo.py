@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.trajectory import Trajectory, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.exports.bag import RosTopics
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 
-from ..conftest import Room, lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 from .conftest import FAST, refused
 
 pyproj = pytest.importorskip("pyproj")
@@ -49,12 +48,8 @@ def run(tmp_path_factory: pytest.TempPathFactory, truth: FloatArray) -> Path:
     T = np.linalg.inv(truth[0]) @ truth
     T[:, :3, 3] /= scale
     write_bag(folder / "drive.bag", stamps, truth)
-    out = folder / "run"
-    out.mkdir()
-    write_tum(out / "trajectory.tum", Trajectory(stamps, T))
-    write_cloud(out / "map.ply", PointCloud(T[:, :3, 3] + [0.0, 5.0, 0.0], np.tile([0.0, 1.0, 0.0], (SCANS, 1))))
-    (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(folder / "drive.bag")}))
-    return out
+    cloud = PointCloud(T[:, :3, 3] + [0.0, 5.0, 0.0], np.tile([0.0, 1.0, 0.0], (SCANS, 1)))
+    return write_run(folder / "run", Trajectory(stamps, T), cloud, source=str(folder / "drive.bag"))
 
 
 def write_bag(
@@ -83,7 +78,7 @@ def write_bag(
             topics.write("/fix", stamp, types["sensor_msgs/msg/NavSatFix"](header, status, *at, covariance, 2))
 
 
-def test_trajectory_and_map_are_in_utm(run: Path, truth: FloatArray, tmp_path: Path) -> None:
+def test_trajectory_and_map_are_in_utm(run, truth, tmp_path):
     import laspy
 
     assert "WGS 84 / UTM zone 56S, EPSG:32756" in succeeds("export-geo", run, "--out", tmp_path / "utm")
@@ -100,7 +95,7 @@ def test_trajectory_and_map_are_in_utm(run: Path, truth: FloatArray, tmp_path: P
     np.testing.assert_allclose(normals, np.tile(truth[0, :3, 1], (SCANS, 1)), atol=1e-3)
 
 
-def test_the_path_for_maps_on_the_web(run: Path, tmp_path: Path) -> None:
+def test_the_path_for_maps_on_the_web(run, tmp_path):
     succeeds("export-geo", run, "--out", tmp_path)
     (feature,) = json.loads((tmp_path / "trajectory.geojson").read_text())["features"]
     first = feature["geometry"]["coordinates"][0]
@@ -112,20 +107,18 @@ def test_the_path_for_maps_on_the_web(run: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(points, np.array(feature["geometry"]["coordinates"])[:, :2], atol=1e-9)
 
 
-def test_what_cannot_be_placed_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_placed_is_refused(run, tmp_path, monkeypatch):
     succeeds("export-geo", run, "--out", tmp_path / "utm")
     assert "--overwrite" in refused("export-geo", run, "--out", tmp_path / "utm")
-    short = tmp_path / "short"
-    short.mkdir()
-    (short / "config.yaml").write_text((run / "config.yaml").read_text())
-    write_tum(short / "trajectory.tum", read_tum(run / "trajectory.tum").select(slice(0, 12)))
+    few = read_tum(run / "trajectory.tum").select(slice(0, 12))
+    short = write_run(tmp_path / "short", few, source=str(run.parent / "drive.bag"))
     assert "too short to determine the heading" in refused("export-geo", short, "--out", tmp_path / "other")
     assert not (tmp_path / "other").exists()
     monkeypatch.setitem(sys.modules, "pyproj", None)
     assert "pip install 'lidarslam[geo]'" in refused("export-geo", run, "--out", tmp_path / "other")
 
 
-def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path: Path, room: Room) -> None:
+def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path, room):
     def walk(times: FloatArray) -> FloatArray:
         t = np.asarray(times, dtype=np.float64)
         places = np.stack([2.5 * np.sin(0.6 * t), 1.5 * np.cos(0.9 * t) - 1.5, 0.0 * t], axis=-1)
@@ -145,6 +138,6 @@ def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path: Path, room: Room) ->
     assert (out / "utm" / "map.laz").exists()
 
 
-def test_gnss_needs_positions_and_the_graph(small_recording: Path, tmp_path: Path) -> None:
+def test_gnss_needs_positions_and_the_graph(small_recording, tmp_path):
     assert "has no GNSS positions" in refused("run", small_recording, "--out", tmp_path / "run", "--gnss")
     assert lidarslam("run", small_recording, "--gnss", "--no-pose-graph").exit_code == 2

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.storage.finished_run import load_map, load_run
+
+from ..conftest import write_run
 
 
 @pytest.fixture
 def finished(tmp_path: Path) -> Path:
-    write_tum(tmp_path / "trajectory.tum", Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1))))
     (tmp_path / "scans.csv").write_text("index,status\n0,ok\n1,lost\n2,ok\n")
-    write_cloud(tmp_path / "map.ply", PointCloud(np.eye(3), np.eye(3)))
-    return tmp_path
+    still = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    return write_run(tmp_path, still, PointCloud(np.eye(3), np.eye(3)))
 
 
-def test_a_run_is_read_back(finished: Path) -> None:
+def test_a_run_is_read_back(finished):
     run = load_run(finished)
     np.testing.assert_array_equal(run.lost, [False, True, False])
     np.testing.assert_array_equal(run.map_points, np.eye(3))
@@ -32,14 +33,14 @@ def test_a_run_is_read_back(finished: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"), [(b"index,state\n0,ok\n", "'status' is missing"), (b"index,status\n0,\xff\n", "utf-8")]
 )
-def test_a_damaged_table_is_named(finished: Path, content: bytes, message: str) -> None:
+def test_a_damaged_table_is_named(finished, content, message):
     (finished / "scans.csv").write_bytes(content)
     with pytest.raises(InputError, match=rf"scans\.csv: .*{message}"):
         load_run(finished)
 
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd", "map.txt"])
-def test_a_file_that_is_no_cloud(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_no_cloud(tmp_path, name, capfd):
     with pytest.raises(InputError, match=f"{name}: no such file"):
         load_map(tmp_path / name)
     (tmp_path / name).write_bytes(b"no cloud at all" * 10)
@@ -48,7 +49,7 @@ def test_a_file_that_is_no_cloud(tmp_path: Path, name: str, capfd: pytest.Captur
     assert capfd.readouterr().err == ""
 
 
-def test_loops_are_those_that_were_closed(finished: Path) -> None:
+def test_loops_are_those_that_were_closed(finished):
     loops = [
         {"first_scan": 0, "second_scan": 2, "accepted": True},
         {"first_scan": 1, "second_scan": 2, "accepted": False},
@@ -64,7 +65,7 @@ def test_loops_are_those_that_were_closed(finished: Path) -> None:
             load_run(finished)
 
 
-def test_what_is_no_run_is_told(tmp_path: Path, whole_run: Path, small_recording: Path) -> None:
+def test_what_is_no_run_is_told(tmp_path, whole_run, small_recording):
     runs = tmp_path / "runs"
     shutil.copytree(whole_run, runs / "one")
     (tmp_path / "notes.txt").write_text("-")

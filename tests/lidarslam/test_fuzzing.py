@@ -6,6 +6,8 @@ import re
 import resource
 import shutil
 import struct
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -189,7 +191,7 @@ SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
 
 
 @pytest.mark.parametrize("kind", RECORDINGS)
-def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_a_damaged_recording(tmp_path, recordings, monkeypatch, kind):
     if kind == "pcap":
         pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
     _, source, patterns = RECORDINGS[kind]
@@ -221,11 +223,7 @@ def reference_maps(tmp_path_factory: pytest.TempPathFactory, whole_run: Path) ->
 
 
 @pytest.mark.parametrize("name", ["map.las", "map.laz", "map.ply", "map.pcd"])
-def test_a_damaged_reference_map(
-    tmp_path: Path, whole_run: Path, reference_maps: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    @fuzzed
-    @given(changes)
+def test_a_damaged_reference_map(tmp_path, whole_run, reference_maps, monkeypatch, name):
     def check(made: list[Change]) -> None:
         shutil.copytree(whole_run, tmp_path / "out", dirs_exist_ok=True)
         (tmp_path / name).write_bytes(changed((reference_maps / name).read_bytes(), made))
@@ -248,7 +246,7 @@ values = st.one_of(st.sampled_from(ODD), st.integers(), st.floats(), st.text(max
 
 @fuzzed
 @given(st.lists(st.tuples(st.sampled_from(list(keys(Config().model_dump()))), values), min_size=1, max_size=4))
-def test_settings_of_any_value(chosen: list[tuple[str, object]]) -> None:
+def test_settings_of_any_value(chosen):
     ends_well("config", *(word for key, value in chosen for word in ("--set", f"{key}={value}")))
 
 
@@ -256,6 +254,19 @@ def test_settings_of_any_value(chosen: list[tuple[str, object]]) -> None:
 @given(changes)
 @example(seed(DEEP))
 @example(seed("a: &a [*a, *a]\n"))
-def test_a_damaged_configuration(tmp_path: Path, made: list[Change]) -> None:
+def test_a_damaged_configuration(tmp_path, made):
     (tmp_path / "config.yaml").write_bytes(changed(dump_yaml(Config()).encode(), made))
     ends_well("config", "--config", tmp_path / "config.yaml")
+
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "fuzz_decoders.py"
+DECODERS = ("ply", "pcd", "npy", "mcap", "bag", "db3", "message", "tum", "yaml", "summary", "about")
+
+
+@pytest.mark.parametrize("decoder", DECODERS)
+def test_no_input_of_a_decoder_ends_otherwise(decoder):
+    pytest.importorskip("atheris", reason="needs the extra fuzz")
+    command = [sys.executable, str(SCRIPT), decoder, "--runs", "2000", "--seconds", "60"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert "DONE" in ended.stderr

@@ -73,7 +73,7 @@ def rotation_error_deg(out: Path, source: Path) -> float:
 
 
 @pytest.mark.long
-def test_shaken_sweeps_are_straightened(recording: Path, tmp_path: Path) -> None:
+def test_shaken_sweeps_are_straightened(recording, tmp_path):
     errors = {}
     for method in ("constant-velocity", "imu"):
         out = tmp_path / method
@@ -86,7 +86,7 @@ def test_shaken_sweeps_are_straightened(recording: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.long
-def test_an_imu_that_nobody_asks_for_changes_nothing(recording: Path, tmp_path: Path) -> None:
+def test_an_imu_that_nobody_asks_for_changes_nothing(recording, tmp_path):
     bare = Path(shutil.copytree(recording, tmp_path / "room", ignore=shutil.ignore_patterns("imu.csv")))
     texts = []
     for source, out in ((recording, tmp_path / "with"), (bare, tmp_path / "without")):
@@ -96,26 +96,26 @@ def test_an_imu_that_nobody_asks_for_changes_nothing(recording: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("method", ["imu", "learned+imu"])
-def test_a_recording_without_an_imu_is_refused_in_one_line(method: str, small_recording: Path, tmp_path: Path) -> None:
+def test_a_recording_without_an_imu_is_refused_in_one_line(method, small_recording, tmp_path):
     said = refused(*run(small_recording, tmp_path / "run", odometry=method))
     assert f"has no IMU, for --odometry {method}; choose --odometry learned" in said
     assert not (tmp_path / "run").exists()
 
 
-def test_an_imu_needs_a_map(recording: Path, tmp_path: Path) -> None:
+def test_an_imu_needs_a_map(recording, tmp_path):
     said = refused(*run(recording, tmp_path / "run", "--no-mapping"))
     assert "odometry.method=imu needs scan-to-map registration" in said
 
 
 @pytest.mark.long
-def test_the_mounting_is_found_where_the_recording_has_none(room: Any, tmp_path: Path) -> None:
+def test_the_mounting_is_found_where_the_recording_has_none(room, tmp_path):
     source = record(tmp_path / "room", room, scans=115, mounting=False)
     succeeds(*run(source, tmp_path / "run"))
     assert rotation_error_deg(tmp_path / "run", source) < 0.2
 
 
 @pytest.mark.long
-def test_an_unknown_mounting_is_not_guessed_but_may_be_given(room: Any, tmp_path: Path) -> None:
+def test_an_unknown_mounting_is_not_guessed_but_may_be_given(room, tmp_path):
     source = record(tmp_path / "room", room, mounting=False)
     said = refused(*run(source, tmp_path / "guess"))
     assert "the extrinsic rotation of its IMU is not recorded, and not observable (only 15 turns could be" in said
@@ -138,7 +138,7 @@ def late(recording: Path, folder: Path) -> Path:
 
 
 @pytest.mark.long
-def test_a_late_clock_is_corrected(longer: Path, tmp_path: Path) -> None:
+def test_a_late_clock_is_corrected(longer, tmp_path):
     said = succeeds(*run(late(longer, tmp_path / "late"), tmp_path / "run"))
     assert re.search(r"the IMU's stamps are (1[7-9]|2[0-3]) ms late; corrected", said), said
     assert rotation_error_deg(tmp_path / "run", longer) < 0.15
@@ -151,13 +151,11 @@ def test_a_late_clock_is_corrected(longer: Path, tmp_path: Path) -> None:
         (lambda rows: rows * [1e3, 1, 1, 1, 1, 1, 1], "check the unit of its stamps"),
     ],
 )
-def test_samples_of_another_time_are_refused_in_one_line(
-    recording: Path, tmp_path: Path, flaw: Any, words: str
-) -> None:
+def test_samples_of_another_time_are_refused_in_one_line(recording, tmp_path, flaw, words):
     assert words in refused(*run(flawed(recording, tmp_path / "other", flaw), tmp_path / "run"))
 
 
-def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Path) -> None:
+def test_a_reversed_gyroscope_is_refused_in_one_line(longer, tmp_path):
     reversed_ = flawed(longer, tmp_path / "reversed", lambda rows: rows * [1, -1, -1, -1, 1, 1, 1])
     said = refused(*run(reversed_, tmp_path / "run"))
     assert "turns of the LiDAR about x, y, z are -x, -y, -z of the gyroscope" in said
@@ -165,7 +163,7 @@ def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_in_a_finished_map_the_imu_takes_part(longer: Path, tmp_path: Path) -> None:
+def test_in_a_finished_map_the_imu_takes_part(longer, tmp_path):
     out, found = tmp_path / "run", tmp_path / "found"
     succeeds(*run(longer, out))
     succeeds("localise", longer, "--map", out, "--out", found, "--odometry", "imu", "--guess", 0, 0, 0, *FAST)
@@ -184,7 +182,7 @@ def register_all(slam: Any, source: Path, has_samples: bool = True) -> None:
 
 
 @pytest.mark.parametrize("is_given", [True, False])
-def test_a_programs_own_loop_takes_the_samples_as_they_come(longer: Path, is_given: bool) -> None:
+def test_a_programs_own_loop_takes_the_samples_as_they_come(longer, is_given):
     given = {"imu_rotation_deg": ANGLES_DEG, "imu_position_m": MODEL.T_lidar_imu[:3, 3].tolist()} if is_given else {}
     with lidarslam.Slam({"odometry": {"method": "imu", **given}, "mapping.keypoints": 800}) as slam:
         register_all(slam, longer)
@@ -195,7 +193,7 @@ def test_a_programs_own_loop_takes_the_samples_as_they_come(longer: Path, is_giv
 
 
 @pytest.mark.long
-def test_a_late_clock_is_corrected_on_the_way(longer: Path, tmp_path: Path) -> None:
+def test_a_late_clock_is_corrected_on_the_way(longer, tmp_path):
     odometry = {"method": "imu", "imu_rotation_deg": ANGLES_DEG}
     with lidarslam.Slam({"odometry": odometry, "mapping.keypoints": 800}) as slam:
         register_all(slam, late(longer, tmp_path / "late"))
@@ -204,7 +202,7 @@ def test_a_late_clock_is_corrected_on_the_way(longer: Path, tmp_path: Path) -> N
     assert any(re.search(r"stamps are (1[6-9]|2[0-4]) ms late; corrected", warning) for warning in warnings), warnings
 
 
-def test_samples_are_checked(tmp_path: Path) -> None:
+def test_samples_are_checked(tmp_path):
     with lidarslam.Slam({"odometry.method": "imu"}) as slam:
         slam.register_imu(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
         for stamp, rates, why in (
@@ -222,7 +220,7 @@ def test_samples_are_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_without_samples_scans_are_registered_all_the_same(longer: Path, tmp_path: Path) -> None:
+def test_without_samples_scans_are_registered_all_the_same(longer, tmp_path):
     with lidarslam.Slam({"odometry.method": "imu", "mapping.keypoints": 800}) as slam:
         register_all(slam, longer, has_samples=False)
         slam.save(tmp_path / "run")

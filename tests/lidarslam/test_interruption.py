@@ -62,7 +62,7 @@ def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     add = ScanLog.add
 
     def pressing(self: ScanLog, *given: object) -> None:
-        add(self, *given)  # type: ignore[arg-type]
+        add(self, *given)
         if len(self) == number:
             press()
 
@@ -70,9 +70,7 @@ def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
 
 
 @pytest.mark.usefixtures("hasty")
-def test_the_second_and_third_wait_for_the_results(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_second_and_third_wait_for_the_results(run, tmp_path, monkeypatch, caplog):
     at_scan(monkeypatch, 4)
     pressed_at(monkeypatch, "lidarslam.run.run.write_results", 2)
     assert run().exit_code == 1
@@ -83,9 +81,7 @@ def test_the_second_and_third_wait_for_the_results(
 
 
 @pytest.mark.usefixtures("hasty")
-def test_the_last_scan_is_done_and_ctrl_c_only_waits(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_last_scan_is_done_and_ctrl_c_only_waits(run, tmp_path, monkeypatch, caplog):
     pressed_at(monkeypatch, "lidarslam.run.results.corrected_map", 1)
     assert run().exit_code == 0
     assert sum(WRITING in record.message for record in caplog.records) == 1
@@ -93,9 +89,7 @@ def test_the_last_scan_is_done_and_ctrl_c_only_waits(
 
 
 @pytest.mark.usefixtures("hasty")
-def test_who_insists_abandons_the_results_and_can_resume(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_insists_abandons_the_results_and_can_resume(run, tmp_path, monkeypatch):
     at_scan(monkeypatch, 4)
     pressed_at(monkeypatch, "lidarslam.run.run.write_results", 3)
     result = run("--set", "checkpoints.every_scans=2")
@@ -115,9 +109,7 @@ def test_who_insists_abandons_the_results_and_can_resume(
         (1, [], "no checkpoint to continue from; --overwrite begins again"),
     ],
 )
-def test_resuming_is_promised_where_there_is_a_checkpoint(
-    run: Run, monkeypatch: pytest.MonkeyPatch, scans: int, options: list[str], told: str
-) -> None:
+def test_resuming_is_promised_where_there_is_a_checkpoint(run, monkeypatch, scans, options, told):
     at_scan(monkeypatch, scans)
     result = run(*options)
     assert result.exit_code == 1
@@ -125,7 +117,7 @@ def test_resuming_is_promised_where_there_is_a_checkpoint(
     assert ("--resume" in result.output) == bool(options)
 
 
-def test_before_the_first_scan_nothing_is_kept(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_before_the_first_scan_nothing_is_kept(run, tmp_path, monkeypatch):
     for place in ("lidarslam.run.run.open_odometry", "lidarslam.run.run.prefetch"):
         with monkeypatch.context() as patch:
             pressed_at(patch, place, 1)
@@ -136,7 +128,7 @@ def test_before_the_first_scan_nothing_is_kept(run: Run, tmp_path: Path, monkeyp
         assert not (tmp_path / "run").exists()
 
 
-def test_presses_in_quick_succession_are_one(caplog: pytest.LogCaptureFixture) -> None:
+def test_presses_in_quick_succession_are_one(caplog):
     with Interruptions() as interruptions:
         interruptions.protect_results()
         for _ in range(20):
@@ -151,7 +143,7 @@ class _InterruptedWhenDropped:
 
 @pytest.mark.parametrize("is_weak", [False, True], ids=["finaliser", "weak reference"])
 @pytest.mark.parametrize("is_run", [False, True], ids=["command", "run"])
-def test_a_request_in_a_finaliser_is_not_lost(is_weak: bool, is_run: bool) -> None:
+def test_a_request_in_a_finaliser_is_not_lost(is_weak, is_run):
     with ended_like_interrupted(), Interruptions() if is_run else contextlib.nullcontext():
         if is_weak:
             ended: object = np.zeros(3)
@@ -163,7 +155,7 @@ def test_a_request_in_a_finaliser_is_not_lost(is_weak: bool, is_run: bool) -> No
             time.sleep(60)
 
 
-def test_the_handlers_are_as_before() -> None:
+def test_the_handlers_are_as_before():
     def handlers() -> list[object]:
         return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 

@@ -96,9 +96,7 @@ def position(odometry: Any) -> list[float]:
 
 
 @pytest.mark.long
-def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
-    bag: Path, tmp_path: Path, domain: int, started: Start
-) -> None:
+def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(bag, tmp_path, domain, started):
     """With constant velocity a run knows no more of a scan than a live one: the poses are the same, bit for bit."""
     from lidarslam.live.dds import DdsNode
 
@@ -133,7 +131,7 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     np.testing.assert_allclose([one.transform.translation.x for one in sent], trajectory.positions[:, 0], atol=1e-8)
 
 
-def test_scans_wait_for_nothing() -> None:
+def test_scans_wait_for_nothing():
     assert bounded(Config()).mapping.budget_ms == "auto"
     assert not bounded(Config()).pose_graph.corrects_local_map
     given = Config(mapping=MappingConfig(budget_ms=80.0))
@@ -142,7 +140,7 @@ def test_scans_wait_for_nothing() -> None:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("interruptible")
-def test_interrupted_it_writes_what_came(bag: Path, tmp_path: Path, domain: int, started: Start) -> None:
+def test_interrupted_it_writes_what_came(bag, tmp_path, domain, started):
     """The poses until then are those of the robot, whose static transforms were published before."""
     from lidarslam.live.dds import DdsNode
 
@@ -188,7 +186,7 @@ def decoder() -> CloudDecoder:
     return CloudDecoder(ReaderConfig(), CLOUD, Faults())
 
 
-def test_point_times_are_inferred_and_they_and_elevations_corrected_as_set(decoder: CloudDecoder) -> None:
+def test_point_times_are_inferred_and_they_and_elevations_corrected_as_set(decoder):
     as_set = CloudDecoder(ReaderConfig(time_scale=-0.5, elevation_correction_deg=0.2), CLOUD, Faults())
     as_sent, corrected = (each.scan(message_at(1000.5, "os"), NOW) for each in (decoder, as_set))
     assert (as_sent.stamp_ns, as_sent.frame_id, as_sent.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
@@ -197,7 +195,7 @@ def test_point_times_are_inferred_and_they_and_elevations_corrected_as_set(decod
     np.testing.assert_array_equal(corrected.scan.points, correct_elevation(as_sent.scan.points, 0.2))
 
 
-def test_a_time_field_without_times_is_a_warning() -> None:
+def test_a_time_field_without_times_is_a_warning():
     faults = Faults()
     decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
     for number in range(12):
@@ -206,7 +204,7 @@ def test_a_time_field_without_times_is_a_warning() -> None:
     assert [warning for warning in faults.warnings() if "holds one value alone (0)" in warning]
 
 
-def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() -> None:
+def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted():
     faults = Faults()
     decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
     messages = [message_at(100.0), message_at(99.0), message_at(100.1, "rear"), message_at(100.2)[:200], b"\0\1"]
@@ -217,7 +215,7 @@ def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() 
     assert "another sensor" in faults.warnings()[1]
 
 
-def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few() -> None:
+def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few():
     """Clouds are published every tenth of a second, and after a pause of ten seconds."""
     faults = Faults()
     decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
@@ -234,19 +232,19 @@ def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few() -> None:
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 37.0])
-def test_a_stray_stamp_at_the_very_beginning_costs_one_scan(decoder: CloudDecoder, ahead_s: float) -> None:
+def test_a_stray_stamp_at_the_very_beginning_costs_one_scan(decoder, ahead_s):
     """Also where the sensor's clock is ahead, as that of TAI; there the first scan decides nothing by itself."""
     stamps = [2.1e9, *(NOW / 1e9 + ahead_s + 0.1 * number for number in range(1, 5))]
     scans = [decoder.scan(message_at(stamp), NOW + number * 10**8) for number, stamp in enumerate(stamps)]
     assert [scan is not None for scan in scans] == [False, ahead_s == 0.0, True, True, True]
 
 
-def test_headers_without_stamps_have_the_time_of_publication(decoder: CloudDecoder) -> None:
+def test_headers_without_stamps_have_the_time_of_publication(decoder):
     scans = [decoder.scan(message_at(0.0), published_ns) for published_ns in (10**18, 10**18 + 10**8)]
     assert [scan.stamp_ns for scan in scans if scan is not None] == [10**18, 10**18 + 10**8]
 
 
-def test_a_full_queue_drops_every_second_message_rather_than_a_stretch() -> None:
+def test_a_full_queue_drops_every_second_message_rather_than_a_stretch():
     batches = iter([[Received(bytes([n]), 10 * n) for n in range(1, 17)]])
     queue = IncomingQueue(lambda _: next(batches, []), longest=8)
     with queue:
@@ -258,7 +256,7 @@ def test_a_full_queue_drops_every_second_message_rather_than_a_stretch() -> None
     assert np.diff([0, *taken]).max() <= 30
 
 
-def test_an_error_of_receiving_is_raised_where_messages_are_taken() -> None:
+def test_an_error_of_receiving_is_raised_where_messages_are_taken():
     def receive(_: float) -> list[Received]:
         raise InputError("gone")
 
@@ -267,7 +265,7 @@ def test_an_error_of_receiving_is_raised_where_messages_are_taken() -> None:
             pass
 
 
-def test_missing_scans_are_counted_by_the_gaps_between_stamps() -> None:
+def test_missing_scans_are_counted_by_the_gaps_between_stamps():
     stamps = 1e9 + 0.1 * np.arange(50) + 0.005 * np.random.default_rng(0).standard_normal(50)
     assert count_missing(stamps) == 0
     assert count_missing(np.delete(stamps, [7, 20, 21, 22])) == 4
@@ -276,7 +274,7 @@ def test_missing_scans_are_counted_by_the_gaps_between_stamps() -> None:
     assert count_missing(late) == 0
 
 
-def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock() -> None:
+def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock():
     now, statistics = time.time(), LiveStatistics()
     statistics.arrived(now - 0.2, now - 0.1)
     statistics.registered(now - 0.2, now - 0.1)
@@ -289,7 +287,7 @@ def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock() -> None
     assert "3 scans dropped" in other.counts(dropped=3).warnings()[0]
 
 
-def test_the_only_topic_of_a_type_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_only_topic_of_a_type_is_taken_once_discovery_has_settled(monkeypatch):
     monkeypatch.setattr("lidarslam.live.receiving._SETTLED_S", 0.0)
     clouds, other = PublishedTopic("/points", CLOUD), PublishedTopic("/scan", "sensor_msgs/msg/LaserScan")
     several = [PublishedTopic("/a", CLOUD), PublishedTopic("/b", CLOUD), other]
@@ -311,7 +309,7 @@ def localised(T: np.ndarray, status: Status = Status.OK) -> ScanEstimate:
     return scan_estimate(0.0, T, status, covariance=COVARIANCE, motion=SweepMotion(VELOCITY, VELOCITY))
 
 
-def test_the_pose_of_the_body_follows_from_that_of_the_lidar() -> None:
+def test_the_pose_of_the_body_follows_from_that_of_the_lidar():
     """A body that turns about itself: its LiDAR, one metre ahead, moves sideways, and the body does not."""
     T_body_lidar = make_transform(np.eye(3), [1.0, 0.0, 0.0])
     turn = exp(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0]))
@@ -332,7 +330,7 @@ def test_the_pose_of_the_body_follows_from_that_of_the_lidar() -> None:
     assert len(sent) == 2
 
 
-def test_covariances_are_those_of_errors_along_the_fixed_axes(rng: np.random.Generator) -> None:
+def test_covariances_are_those_of_errors_along_the_fixed_axes(rng):
     """Against the spread of poses with random errors in the frame of the body."""
     T = exp(np.array([0.3, -0.8, 1.2, 4.0, 5.0, 6.0]))
     poses = T @ exp(rng.multivariate_normal(np.zeros(6), COVARIANCE, 200_000))
@@ -344,7 +342,7 @@ def test_covariances_are_those_of_errors_along_the_fixed_axes(rng: np.random.Gen
     np.testing.assert_allclose(covariance, np.cov(np.hstack([moved, turned]).T), atol=5e-6)
 
 
-def test_static_transforms_are_chained_in_both_directions() -> None:
+def test_static_transforms_are_chained_in_both_directions():
     a, b = exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])), exp(np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0]))
     edges: Edges = {}
     for parent, child, T in (("/base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", a)):
@@ -354,7 +352,7 @@ def test_static_transforms_are_chained_in_both_directions() -> None:
     assert chain(edges, "base_link", "camera") is None
 
 
-def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:
+def test_without_the_extra_one_line_names_it(tmp_path):
     (tmp_path / "cyclonedds.py").write_text("raise ModuleNotFoundError('hidden', name='cyclonedds')\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     command = [*LIDARSLAM, "live", "-o", str(tmp_path / "run")]
@@ -389,7 +387,7 @@ def play(bag: Path, domain: int) -> None:
 
 
 @pytest.mark.long
-def test_an_imu_beside_the_clouds_takes_part(tmp_path: Path, domain: int, started: Start) -> None:
+def test_an_imu_beside_the_clouds_takes_part(tmp_path, domain, started):
     """Its place on the LiDAR comes from /tf_static."""
     walk, errors = simulate(tmp_path / "walk", 30, "--imu"), {}
     for method in ("imu", "constant-velocity"):

@@ -1,33 +1,37 @@
-"""From odometry to a pose: what the motion during a sweep is taken for, and the way through the whole pipeline."""
+"""From odometry to a pose: when it is asked, the motion during a sweep, and the way through the whole pipeline."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate, pairwise
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from lidarslam.config.settings import Config
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
+from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
-from lidarslam.odometry.interface import ConstantVelocity, Motion, Odometry
+from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanEstimate, ScanOdometry, SweepMotion
 from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap, make_localiser
+from lidarslam.pipeline.odometry_gate import OdometryGate
 from lidarslam.pipeline.pipeline import Pipeline
+
+from ..mapping.runs import errors
+from .conftest import scan_estimate
 
 BEFORE, AFTER = np.arange(6.0), np.arange(6.0) ** 2 - 3.0
 
@@ -42,21 +46,19 @@ def sweep(begin: float, end: float) -> Scan:
     [(0.0, 0.1, 1.0), (-0.1, 0.0, 0.0), (-0.05, 0.05, 0.5), (-0.075, 0.025, 0.25), (0.02, 0.1, 1.0)],
     ids=["stamped at the start", "at the end", "in the middle", "late", "before its start"],
 )
-def test_the_mean_motion_counts_how_much_of_the_sweep_lies_after_the_stamp(
-    begin: float, end: float, share_after: float
-) -> None:
+def test_the_mean_motion_counts_how_much_of_the_sweep_lies_after_the_stamp(begin, end, share_after):
     mean = SweepMotion(BEFORE, AFTER).mean(sweep(begin, end))
     np.testing.assert_allclose(mean, share_after * AFTER + (1.0 - share_after) * BEFORE, atol=1e-12)
 
 
-def test_a_motion_known_on_one_side_only_serves_for_the_other() -> None:
+def test_a_motion_known_on_one_side_only_serves_for_the_other():
     scan = sweep(-0.05, 0.05)
     np.testing.assert_array_equal(SweepMotion(BEFORE, None).mean(scan), BEFORE)
     np.testing.assert_array_equal(SweepMotion(None, AFTER).mean(scan), AFTER)
     assert SweepMotion(None, None).mean(scan) is None
 
 
-def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> None:
+def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too():
     """Standing still in a corner, of which the odometry says that it leaves nothing open, and that it leaves x open."""
     rng = np.random.default_rng(0)
     corner = np.concatenate([np.insert(rng.uniform(1.0, 6.0, (800, 2)), axis, 1.0, axis=1) for axis in range(3)])
@@ -67,20 +69,6 @@ def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> N
     assert (seen.status, seen.message) == (Status.OK, "")
     assert (open_.status, open_.message) == (Status.DEGRADED, "degenerate along x, yaw")
     assert open_.degenerate == ("x", "yaw")
-
-
-def test_a_sweep_that_was_compensated_already_is_left_alone() -> None:
-    scan = Scan(np.ones((5, 3)), 0.0)
-    np.testing.assert_array_equal(SweepMotion(BEFORE, AFTER).compensate(scan), scan.points)
-
-
-def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> None:
-    scan = sweep(-0.05, 0.05)
-    expected = [
-        transform_points(exp(t * (BEFORE if t < 0.0 else AFTER)), p[None])[0]
-        for t, p in zip(scan.time_offsets, scan.points, strict=True)
-    ]
-    np.testing.assert_allclose(SweepMotion(BEFORE, AFTER).compensate(scan), expected, atol=1e-12)
 
 
 def localise_all(
@@ -98,14 +86,11 @@ def true_motions(truth: FloatArray, variance: float) -> list[Motion]:
 
 
 def errors_of(localised: list[ScanEstimate], truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances in metres and angles in degrees."""
-    errors = inverse(inverse(truth[0]) @ truth) @ np.array([result.T_world_lidar for result in localised])
-    return np.linalg.norm(errors[:, :3, 3], axis=1), np.rad2deg(rotation_angle(errors))
+    """Metres (N,) and degrees (N,), in the world of the first scan."""
+    return errors(np.array([result.T_world_lidar for result in localised]), inverse(truth[0]) @ truth)
 
 
-def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
-    room_scans: list[Scan], room_truth: Trajectory, rng: np.random.Generator
-) -> None:
+def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(room_scans, room_truth, rng):
     errors = exp(rng.normal(0.0, [0.01] * 3 + [0.02] * 3, (len(room_scans) - 1, 6)))
     wrong = [np.eye(4), *(room_truth.relative_motions() @ errors)]
     localised = localise_all(room_scans, [Motion(T, 100) for T in wrong])
@@ -114,9 +99,7 @@ def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
     assert np.linalg.norm(chained[-1][:3, 3] - localised[-1].T_world_lidar[:3, 3]) > 0.02, "but not the pose"
 
 
-def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(
-    room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(room_scans, room_truth):
     nothing = [Motion(np.eye(4), 0, "covered") for _ in room_scans]
     localised = localise_all(room_scans, nothing)
     moved = np.linalg.norm(localised[-1].T_odom_lidar[:3, 3])
@@ -125,7 +108,7 @@ def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_m
 
 
 @pytest.mark.long
-def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any) -> None:
+def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room):
     """From 20 to 180 deg/s around the first sweep: the odometry's motion to the second is not the first one's."""
 
     def turning(times: FloatArray) -> FloatArray:
@@ -144,7 +127,7 @@ def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room: Any
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.0, 1.0), (0.5e-3, 0.5), (1e-2, 0.0)])
-def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma: float, share: float) -> None:
+def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma, share):
     """The variances of both velocities, 100 sigma^2 each, add up."""
     change = np.full(6, 0.01)
     before, after = (
@@ -155,7 +138,7 @@ def test_a_turn_accelerates_as_far_as_noise_does_not_explain_it(sigma: float, sh
     assert before.turn_acceleration(None) is None
 
 
-def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> None:
+def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room):
     """Three degrees of pitch and roll at two steps a second: the rates change by 50 deg/s within a sweep."""
 
     def swaying(times: FloatArray) -> FloatArray:
@@ -173,12 +156,12 @@ def test_a_robot_that_sways_as_it_walks_is_not_seen_to_sway_more(room: Any) -> N
     assert distances_m[settled].max() < 0.01
 
 
-def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanEstimate], Pipeline]:
+def test_a_drifting_odometry_is_corrected_by_the_map(room, room_scans, room_truth):
+    """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
+    motions = room_truth.relative_motions() @ exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
+    odometry = ExternalOdometry(Trajectory(room_truth.stamps, chain(np.eye(4), motions)))
     pipeline = Pipeline(odometry, ScanToMap(Mapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
-    return list(pipeline.run(scans)), pipeline
-
-
-def check_poses_and_map(results: list[ScanEstimate], pipeline: Pipeline, room: Any, room_truth: Trajectory) -> None:
+    results = list(pipeline.run(room_scans))
     distances_m, angles_deg = errors_of(results, room_truth.T_world_lidar)
     assert distances_m.max() < 0.01
     assert angles_deg.max() < 0.1
@@ -189,29 +172,7 @@ def check_poses_and_map(results: list[ScanEstimate], pipeline: Pipeline, room: A
     assert np.percentile(distance, 99) < 0.06
 
 
-def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
-    """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
-    motions = room_truth.relative_motions() @ exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
-    poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
-    results, pipeline = run(ExternalOdometry(Trajectory(room_truth.stamps, poses)), room_scans)
-    check_poses_and_map(results, pipeline, room, room_truth)
-
-
-def test_without_any_odometry_a_sensor_that_begins_at_rest_has_true_poses_and_a_true_map(
-    room: Any, room_truth: Trajectory, drive: Callable[[FloatArray], FloatArray]
-) -> None:
-    """The first sweep is taken for one at rest: it is one here."""
-
-    def from_rest(time: FloatArray) -> FloatArray:
-        return drive(np.maximum(0.15, np.asarray(time)))
-
-    stamps = room_truth.stamps
-    scans = [room.sweep(from_rest, float(stamp)) for stamp in stamps]
-    results, pipeline = run(ConstantVelocity(), scans)
-    check_poses_and_map(results, pipeline, room, Trajectory(stamps, from_rest(stamps)))
-
-
-def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:
+def test_the_configuration_chooses_the_map(room_scans):
     for method, kind in (("surfels", SurfelMap), ("loam", FeatureMap)):
         mapper = make_localiser(Config(mapping=MappingConfig(method=method))).mapper
         mapper.process(mapper.sample(room_scans[0]), Prior())
@@ -227,9 +188,7 @@ def estimates(room_scans: list[Scan], room_truth: Trajectory) -> list[ScanOdomet
 
 
 @pytest.mark.parametrize("method", ["surfels", "loam"])
-def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
-    estimates: list[ScanOdometry], method: MappingName
-) -> None:
+def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(estimates, method):
     config = Config(mapping=MappingConfig(method=method))
     whole, resumed = make_localiser(config), make_localiser(config)
     for estimated in estimates[:5]:
@@ -241,7 +200,7 @@ def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
         np.testing.assert_array_equal(first.T_odom_lidar, second.T_odom_lidar)
 
 
-def test_scans_may_be_thinned_ahead_of_their_poses(estimates: list[ScanOdometry]) -> None:
+def test_scans_may_be_thinned_ahead_of_their_poses(estimates):
     """As many ahead as the pipeline has scans under way."""
     in_turn, ahead = make_localiser(Config()), make_localiser(Config())
     sampled = [replace(one, sampled=ahead.sample(one.scan)) for one in estimates]
@@ -250,3 +209,90 @@ def test_scans_may_be_thinned_ahead_of_their_poses(estimates: list[ScanOdometry]
         assert second.status is Status.OK
         np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
     assert make_localiser(Config(mapping=MappingConfig(method="off"))).sample(estimates[0].scan) is None
+
+
+CELL_M = 0.4
+VELOCITY = np.array([0.0, 0.0, 0.2, 5.0, 0.0, 0.0])
+
+
+def odometry_that_answers() -> Mock:
+    return Mock(**{"estimate.return_value": Motion(np.eye(4), 1), "state.return_value": {}})
+
+
+def stamps_of(method: Mock) -> list[float]:
+    """The stamps of the scans with which a method was called."""
+    return [call.args[0].stamp for call in method.call_args_list]
+
+
+def asked(
+    poses: Sequence[FloatArray],
+    statuses: dict[int, Status] | None = None,
+    stamps: FloatArray | None = None,
+    empty: int | None = None,
+    behind: int = 1,
+    cell_m: float | None = CELL_M,
+) -> list[int]:
+    """The indices of the scans that are asked for, where each pose comes so many scans late."""
+    times = 0.1 * np.arange(len(poses)) if stamps is None else stamps
+    odometry = odometry_that_answers()
+    gate = OdometryGate(odometry)
+    for index, stamp in enumerate(times):
+        motion = gate.estimate(Scan(np.ones((0 if index == empty else 5, 3)), float(stamp)))
+        assert motion.is_asked == (float(stamp) in stamps_of(odometry.estimate))
+        done = index - behind + 1
+        if done >= 0:
+            status = (statuses or {}).get(done, Status.OK)
+            result = scan_estimate(float(times[done]), poses[done], status, cell_m=cell_m)
+            gate.follow(lambda result=result: result)
+    asked, skipped = stamps_of(odometry.estimate), stamps_of(odometry.skip)
+    assert sorted(asked + skipped) == times.tolist()
+    return [times.tolist().index(stamp) for stamp in asked]
+
+
+def steady(scans: int = 40) -> list[FloatArray]:
+    return [exp(0.1 * index * VELOCITY) for index in range(scans)]
+
+
+@pytest.mark.parametrize("behind", [1, 2])
+def test_a_steady_motion_needs_the_odometry_for_the_first_scans_only(behind):
+    assert asked(steady(), behind=behind) == list(range(10 + behind))
+
+
+def test_a_change_of_velocity_needs_it_until_predictions_are_good_again():
+    poses = steady(20) + [exp(1.9 * VELOCITY) @ exp(0.1 * index * 1.6 * VELOCITY) for index in range(1, 61)]
+    later = [index for index in asked(poses) if index > 11]
+    assert later[0] == 21
+    assert later == list(range(21, later[-1] + 1))
+    assert 30 < later[-1] < 40
+
+
+@pytest.mark.parametrize("status", [Status.LOST, Status.DEGRADED])
+def test_it_is_asked_from_the_scan_after_one_that_is_not_ok(status):
+    assert [index for index in asked(steady(), {20: status}) if index > 11] == list(range(21, 32))
+
+
+def test_after_a_gap_and_at_an_empty_scan_it_is_asked():
+    stamps = 0.05 * np.arange(40)
+    stamps[25:] += 0.05
+    poses = [exp(stamp * VELOCITY) for stamp in stamps]
+    assert [index for index in asked(poses, stamps=stamps) if index > 10] == [25]
+    assert 30 in asked(steady(), empty=30)
+
+
+def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked():
+    assert asked(steady(), stamps=0.2 * np.arange(40)) == list(range(40))
+    assert asked(steady(), cell_m=None) == list(range(40))
+
+
+def test_only_results_that_can_matter_are_waited_for():
+    gate = OdometryGate(odometry_that_answers())
+    taken = []
+    for index, pose in enumerate(steady(12)):
+        stamp = 0.1 * index
+        gate.estimate(Scan(np.ones((5, 3)), stamp))
+        if index < 8:
+            assert not taken
+        result = scan_estimate(stamp, pose, cell_m=CELL_M)
+        gate.follow(lambda index=index, result=result: (taken.append(index), result)[1])
+    gate.state()
+    assert taken == list(range(12))

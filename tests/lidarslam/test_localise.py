@@ -45,7 +45,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory, recording: Path) -> Path:
     return out
 
 
-def test_poses_are_in_the_frame_of_the_map(tmp_path: Path, recording: Path, mapped: Path, drive: Drive) -> None:
+def test_poses_are_in_the_frame_of_the_map(tmp_path, recording, mapped, drive):
     before, out = (mapped / "map.ply").read_bytes(), tmp_path / "again"
     said = succeeds("localise", recording, "--map", mapped, "-o", out, "--start", FIRST, *WITHOUT_ODOMETRY)
     assert "found at scan" in said
@@ -66,7 +66,7 @@ def test_poses_are_in_the_frame_of_the_map(tmp_path: Path, recording: Path, mapp
 
 
 @pytest.mark.long
-def test_a_recording_of_another_place_is_refused(tmp_path: Path, room: Any, drive: Drive, mapped: Path) -> None:
+def test_a_recording_of_another_place_is_refused(tmp_path, room, drive, mapped):
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     elsewhere, out = record(tmp_path / "elsewhere", other, drive), tmp_path / "out"
     assert "not found in" in refused("localise", elsewhere, "--map", mapped, "-o", out, *WITHOUT_ODOMETRY)
@@ -76,7 +76,7 @@ def test_a_recording_of_another_place_is_refused(tmp_path: Path, room: Any, driv
     assert found["searches_refused"]
 
 
-def test_what_is_no_map_is_refused_before_anything_is_written(tmp_path: Path, recording: Path, mapped: Path) -> None:
+def test_what_is_no_map_is_refused_before_anything_is_written(tmp_path, recording, mapped):
     out = tmp_path / "out"
     refused("localise", recording, "--map", recording, "-o", out)
     assert "surfels" in refused("localise", recording, "--map", mapped, "-o", out, "--set", "mapping.method=off")

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.edits import moved
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import lidarslam, succeeds, write_run
 
 TILT = exp([np.deg2rad(7.0), 0.0, 0.0, 0.0, 0.0, 0.0])
 POSES = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
@@ -42,23 +41,18 @@ def hall() -> PointCloud:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run in it, tilted, 4 m along its middle, with an IMU in its recording."""
-    out, source = tmp_path / "run", tmp_path / "room"
-    out.mkdir()
+    stamps, source = np.arange(41) / 10.0, tmp_path / "room"
     source.mkdir()
-    stamps = np.arange(41) / 10.0
-    write_tum(out / "trajectory.tum", Trajectory(stamps, POSES))
-    write_cloud(out / "map.ply", moved(hall(), TILT))
-    (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(source)}))
     np.save(source / "000000.npy", np.eye(3))
     accelerations = np.gradient(np.gradient(POSES[:, :3, 3], 0.1, axis=0), 0.1, axis=0)
     force = np.einsum("nji,nj->ni", POSES[:, :3, :3], accelerations + TILT[:3, :3] @ [0.0, 0.0, 9.81])
     rows = np.column_stack([stamps, np.zeros((41, 3)), force])
     np.savetxt(source / "imu.csv", rows, delimiter=",", header="T_lidar_imu: 1 0 0 0 0 1 0 0 0 0 1 0")
-    return out
+    return write_run(tmp_path / "run", Trajectory(stamps, POSES), moved(hall(), TILT), source=str(source))
 
 
 @pytest.mark.parametrize("by", ["ground", "gravity"])
-def test_a_tilted_map_is_levelled(run: Path, tmp_path: Path, by: str) -> None:
+def test_a_tilted_map_is_levelled(run, tmp_path, by):
     cloud, said = edited(tmp_path / "level.ply", run, "--level", by, "--ground-at-zero")
     assert float(said.split()[2]) == pytest.approx(7.0, abs=0.03)
     assert "from z = -1.50 m to 0" in said
@@ -67,7 +61,7 @@ def test_a_tilted_map_is_levelled(run: Path, tmp_path: Path, by: str) -> None:
     np.testing.assert_allclose(cloud.normals, hall().normals, atol=2e-3)
 
 
-def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
+def test_crops_keep_exactly_what_lies_inside(run, tmp_path):
     whole = load_map(run / "map.ply").points
     box = np.array([[-2.05, 3.0], [-1.0, 1.05], [-3.0, 0.0]])
     cloud, said = edited(tmp_path / "box.ply", run, "--box", *box.ravel())
@@ -82,7 +76,7 @@ def test_crops_keep_exactly_what_lies_inside(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", [("--statistical", 8, 3.0), ("--radius", 3, 0.5)])
-def test_floaters_are_removed_and_nothing_else(tmp_path: Path, method: tuple[object, ...]) -> None:
+def test_floaters_are_removed_and_nothing_else(tmp_path, method):
     rng = np.random.default_rng(4)
     grid = np.stack(np.meshgrid(*[np.arange(-3.0, 3.0, 0.1)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     floaters = np.column_stack([3.0 * rng.permutation(FLOATERS), rng.uniform(5.0, 9.0, FLOATERS), np.full(FLOATERS, 8)])
@@ -107,7 +101,7 @@ def l_shaped(rng: np.random.Generator) -> PointCloud:
 
 
 @pytest.mark.long
-def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
+def test_clouds_are_joined_where_they_lie(tmp_path):
     room, T = l_shaped(np.random.default_rng(5)), exp([0.02, -0.03, 2.4, 2.0, -1.0, 0.3])
     write_cloud(tmp_path / "first.ply", room)
     write_cloud(tmp_path / "other.ply", moved(l_shaped(np.random.default_rng(6)), inverse(T)))
@@ -140,7 +134,7 @@ def test_clouds_are_joined_where_they_lie(tmp_path: Path) -> None:
         (["{run}", "{wall}", "-o", "{out}.ply", "--register"], 1, "wall.ply: could not be registered"),
     ],
 )
-def test_mistakes_get_one_line(run: Path, tmp_path: Path, arguments: list[str], status: int, said: str) -> None:
+def test_mistakes_get_one_line(run, tmp_path, arguments, status, said):
     wall: FloatArray = np.random.default_rng(0).uniform([40.0, 0.0, 0.0], [40.01, 9.0, 9.0], (2000, 3))
     write_cloud(tmp_path / "wall.ply", PointCloud(wall, np.tile([1.0, 0.0, 0.0], (len(wall), 1))))
     places = {"run": run, "out": tmp_path / "out", "wall": tmp_path / "wall.ply"}

@@ -1,11 +1,9 @@
 """Several recordings of one simulated office become one map; one of another office does not."""
 
 import json
-import os
 import re
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+import signal
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -29,15 +27,10 @@ from lidarslam.storage.directory import FILES
 from lidarslam.storage.finished_run import load_map, load_run
 
 from ..conftest import write_recording
+from .conftest import quiet
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 PARTS = ("01_first", "02_foreign", "03_second")
-
-
-@contextmanager
-def quiet(_name: str) -> Iterator[Progress]:
-    """No progress bar."""
-    yield lambda _number, _total, _result: None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +73,7 @@ def merged(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.long
-def test_all_that_find_one_another_are_in_the_frame_of_the_first(
-    merged: tuple[Path, MergeOutcome], places: dict[str, Path]
-) -> None:
+def test_all_that_find_one_another_are_in_the_frame_of_the_first(merged, places):
     out, outcome = merged
     assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
     T_office_common = read_tum(places["first"] / "ground_truth.tum").T_world_lidar[0]
@@ -101,7 +92,7 @@ def test_all_that_find_one_another_are_in_the_frame_of_the_first(
 
 
 @pytest.mark.long
-def test_the_common_map_holds_what_is_joined_and_nothing_else(merged: tuple[Path, MergeOutcome]) -> None:
+def test_the_common_map_holds_what_is_joined_and_nothing_else(merged):
     out, outcome = merged
     common = load_map(out).points
     assert len(common) == outcome.summary.map.points > 0
@@ -117,7 +108,7 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(merged: tuple[Path
 
 
 @pytest.mark.long
-def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
+def test_the_summary_tells_who_is_joined_by_what(merged, places):
     out, outcome = merged
     summary = json.loads((out / "summary.json").read_text())
     given = [places[name] for name in ("first", "foreign", "second")]
@@ -143,9 +134,7 @@ def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcom
 
 
 @pytest.mark.slow
-def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(
-    merged: tuple[Path, MergeOutcome], places: dict[str, Path], tmp_path: Path
-) -> None:
+def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(merged, places, tmp_path):
     for place in places.values():
         turned = tmp_path / place.name
         turned.mkdir()
@@ -171,7 +160,7 @@ def graph_keys(out: Path) -> tuple[list[int], int]:
 
 
 @pytest.mark.long
-def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) -> None:
+def test_each_recording_has_a_run_of_its_own(merged):
     out, _ = merged
     keyframes = []
     for name, scans in zip(PARTS, (90, 12, 75), strict=True):
@@ -205,7 +194,7 @@ def folders(out: Path) -> list[str]:
 
 
 @pytest.mark.long
-def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_path: Path) -> None:
+def test_an_earlier_merge_is_replaced_only_when_asked(rooms, tmp_path):
     out = tmp_path / "out"
     merge(request(out, *rooms, settings=FAST), quiet)
     assert folders(out) == ["01_in_room_0", "02_in_room_1", "03_in_room_2"]
@@ -219,7 +208,7 @@ def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_pat
 
 
 @pytest.mark.long
-def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: list[Path], tmp_path: Path) -> None:
+def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms, tmp_path):
     (rooms[0] / "000003.npy").write_bytes(b"not an array")
     for scan in rooms[1].glob("*.npy"):
         scan.write_bytes(b"not an array")
@@ -234,9 +223,7 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: l
 
 
 @pytest.mark.long
-def test_an_interrupted_merge_goes_on_where_it_was(
-    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_an_interrupted_merge_goes_on_where_it_was(rooms, tmp_path, timeless):
     """Neither the recording that was tracked is tracked again, nor the scans before the last checkpoint."""
     whole, out = tmp_path / "whole", tmp_path / "out"
     merge(request(whole, *rooms, settings=FAST), quiet)
@@ -266,58 +253,18 @@ def test_an_interrupted_merge_goes_on_where_it_was(
         merge(request(out, *rooms, settings=FAST, resume=True), quiet)
 
 
-KILLED_MERGE = """
-import os, signal, sys
-import lidarslam.merge.merge, mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
-from lidarslam.cli import main
-
-count = 0
-
-def see(event, args):
-    global count
-    if event in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") and str(args[0]).startswith(sys.argv[1]):
-        count += 1
-        if count == kill_at:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-pids, kills = [], [int(number) for number in sys.argv[2].split(",")]
-for kill_at in kills:
-    pid = os.fork()
-    if pid == 0:
-        sys.argv[1] = f"{sys.argv[1]}/{kill_at}"
-        sys.addaudithook(see)
-        try:
-            main(["merge", *sys.argv[3:], "--out", sys.argv[1]])
-        finally:
-            print(count)
-            sys.stdout.flush()
-            os._exit(0)
-    os.waitpid(pid, 0)
-"""
-
-
-def killed_merges(root: Path, kills: list[int], rooms: list[Path], *more: str) -> str:
-    """Merge into root/K for every K, each killed as it is about to do the Kth thing there; what was said."""
-    arguments = [argument for setting in (*SETTINGS, *FAST) for argument in ("--set", setting)]
-    kill = ",".join(map(str, kills))
-    command = [sys.executable, "-c", KILLED_MERGE, str(root), kill, *map(str, rooms), *arguments, *more]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
-
-
 @pytest.mark.slow
-def test_a_killed_merge_is_refused_and_resumed_or_made_again(
-    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_a_killed_merge_is_refused_and_resumed_or_made_again(rooms, tmp_path, killable, timeless):
     """Killed as it begins, halfway and among its results, it leaves no run and no map."""
     rooms = rooms[:2]
-    whole = tmp_path / "whole" / "1000000"
-    things = int(killed_merges(whole.parent, [1_000_000], rooms).splitlines()[-1])
+    whole, command = tmp_path / "whole", ["merge", *rooms]
+    command += [argument for setting in (*SETTINGS, *FAST) for argument in ("--set", setting)]
+    things = killable(*command, out=whole).events
     assert (whole / "map.ply").is_file(), "the merge that was not killed ended before its results"
     kills = [round(share * things) for share in (0.2, 0.5, 0.75)]
-    killed_merges(tmp_path / "killed", kills, rooms)
     for kill_at in kills:
         out = tmp_path / "killed" / str(kill_at)
+        assert killable(*command, out=out, kill_at=kill_at).status == -signal.SIGKILL
         again = f"this merge did not finish; resume it with lidarslam merge {rooms[0]} {rooms[1]} --out {out} --resume"
         with pytest.raises(InputError, match=re.escape(again)):
             load_map(out)
@@ -339,7 +286,7 @@ def test_a_killed_merge_is_refused_and_resumed_or_made_again(
 
 
 @pytest.mark.long
-def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms: list[Path], tmp_path: Path) -> None:
+def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(OutputError, match="is the recording itself"):
         merge(request(rooms[1], *rooms, overwrite=True), quiet)

@@ -65,7 +65,7 @@ def of_person(points: FloatArray) -> FloatArray:
 
 
 @pytest.mark.long
-def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
+def test_who_passed_is_not_in_the_map(source, tmp_path):
     said = run(source, tmp_path / "without")
     run(source, tmp_path / "with", "--set", "global_map.leave_out_moved=false")
     all_points, points = (written(tmp_path / name / "map.ply") for name in ("with", "without"))
@@ -81,7 +81,7 @@ def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_last_map_that_rerun_shows_is_the_written_one(source: Path, tmp_path: Path) -> None:
+def test_the_last_map_that_rerun_shows_is_the_written_one(source, tmp_path):
     from rerun.chunk import RrdReader
 
     run(source, tmp_path / "run", "--rerun", "save")
@@ -97,7 +97,7 @@ def test_the_last_map_that_rerun_shows_is_the_written_one(source: Path, tmp_path
     np.testing.assert_allclose(np.sort(np.stack(list(shown[-1])), axis=0), np.sort(expected, axis=0), atol=1e-4)
 
 
-def test_views_have_the_numbers_of_their_scans(scans: list[Scan]) -> None:
+def test_views_have_the_numbers_of_their_scans(scans):
     """Also after a scan that shows nothing."""
     given = [scan.select(np.arange(0)) if 20 <= number < 25 else scan for number, scan in enumerate(scans)]
     odometry, localiser = ExternalOdometry(truth()), OdometryAlone(ConsistencyCheck())
@@ -116,7 +116,7 @@ def test_views_have_the_numbers_of_their_scans(scans: list[Scan]) -> None:
 
 
 @pytest.mark.long
-def test_moved_points_are_removed_again_with_other_settings(source: Path, tmp_path: Path) -> None:
+def test_moved_points_are_removed_again_with_other_settings(source, tmp_path):
     run(source, tmp_path / "run")
     kept = {}
     for views in (0, 3, 1000):

@@ -1,7 +1,6 @@
 """Pictures: everything is in the frame, at its place and to scale; what is in front hides what is behind."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,7 +77,7 @@ def is_like(colours: NDArray[np.int64], colour: tuple[int, int, int]) -> bool:
 
 @pytest.mark.parametrize("elevation_deg", [TOP, OBLIQUE])
 @pytest.mark.parametrize("scale", [0.3, 30.0, 3_000.0])
-def test_every_point_is_drawn_at_its_pixel(rng: np.random.Generator, scale: float, elevation_deg: float) -> None:
+def test_every_point_is_drawn_at_its_pixel(rng, scale, elevation_deg):
     points = scale * rng.uniform(-1.0, 1.0, (60, 3)) * [1.0, 0.5, 0.2] + 5.0 * scale
     picture = draw([DrawnRun("", cloud(points))], elevation_deg)
     pixels = picture.view.project(points)
@@ -91,7 +90,7 @@ def test_every_point_is_drawn_at_its_pixel(rng: np.random.Generator, scale: floa
     assert covered.sum() <= len(points) * 8**2
 
 
-def test_pixels_are_to_scale() -> None:
+def test_pixels_are_to_scale():
     corners = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 10.0, 0.0], [0.0, 10.0, 0.0]])
     for elevation_deg in (OBLIQUE, TOP):
         view = draw([DrawnRun("", cloud(corners))], elevation_deg).view
@@ -102,7 +101,7 @@ def test_pixels_are_to_scale() -> None:
 
 
 @pytest.mark.parametrize("size_m", [3.0, 47.0, 800.0])
-def test_the_scale_bar_is_as_long_as_it_says(size_m: float) -> None:
+def test_the_scale_bar_is_as_long_as_it_says(size_m):
     pixels, view = draw([DrawnRun("", cloud(np.array([[0.0, 0.0, 0.0], [size_m, 0.3 * size_m, 0.0]])))], width=1600)
     ink = (pixels[view.height :] == INK).all(axis=2)
     longest = max(len(run) for row in ink for run in "".join("x" if dark else " " for dark in row).split())
@@ -110,7 +109,7 @@ def test_the_scale_bar_is_as_long_as_it_says(size_m: float) -> None:
     assert 0.07 * 1600 < longest <= 0.2 * 1600
 
 
-def test_the_frame_holds_the_thin_ends_of_a_long_drive_but_no_stray_point(rng: np.random.Generator) -> None:
+def test_the_frame_holds_the_thin_ends_of_a_long_drive_but_no_stray_point(rng):
     dense = rng.normal(0.0, 5.0, (50_000, 3)) * [1.0, 1.0, 0.1]
     thin = np.column_stack([np.linspace(-300.0, 300.0, 2_000), np.zeros((2_000, 2))])
     columns = fit_view(np.concatenate([dense, thin]), np.empty((0, 3)), width=WIDTH).project(thin)[:, 0]
@@ -120,7 +119,7 @@ def test_the_frame_holds_the_thin_ends_of_a_long_drive_but_no_stray_point(rng: n
     assert view.size_m[0] < 3 * 20.0
 
 
-def test_the_path_is_drawn_above_everything_with_its_ends_and_its_lost_stretch() -> None:
+def test_the_path_is_drawn_above_everything_with_its_ends_and_its_lost_stretch():
     positions = np.column_stack([np.linspace(-8.0, 8.0, 41), np.zeros((41, 2))])
     statuses = [Status.OK] * 14 + [Status.DEGRADED] * 13 + [Status.LOST] * 14
     picture = draw([DrawnRun("", cloud(plane(5.0)), positions, statuses)], width=800)
@@ -130,7 +129,7 @@ def test_the_path_is_drawn_above_everything_with_its_ends_and_its_lost_stretch()
     assert not is_like(near(picture, np.array([0.0, 3.0, 0.0])), (255, 140, 0))
 
 
-def test_what_is_in_front_hides_what_is_behind_unless_it_is_a_ceiling_seen_from_its_back() -> None:
+def test_what_is_in_front_hides_what_is_behind_unless_it_is_a_ceiling_seen_from_its_back():
     low, high = plane(0.0), plane(1.0)[20_000:]
     picture = draw([DrawnRun("", cloud(np.concatenate([low, high])))])
     assert near(picture, np.array([0.0, -5.0, 0.0])).mean() > near(picture, np.array([0.0, 5.0, 1.0])).mean() + 50.0
@@ -140,7 +139,7 @@ def test_what_is_in_front_hides_what_is_behind_unless_it_is_a_ceiling_seen_from_
 
 
 @pytest.mark.parametrize("elevation_deg", [TOP, OBLIQUE])
-def test_a_plane_is_closed_and_evenly_lit(elevation_deg: float) -> None:
+def test_a_plane_is_closed_and_evenly_lit(elevation_deg):
     floor = cloud(plane(0.0, count=120))
     layer = draw_layer(floor.points, floor.normals, view := fit_view(floor.points, np.empty((0, 3)), elevation_deg))
     covered = np.zeros(view.height * view.width, dtype=bool)
@@ -151,7 +150,7 @@ def test_a_plane_is_closed_and_evenly_lit(elevation_deg: float) -> None:
     assert (np.abs(layer.brightness - np.median(layer.brightness)) < 0.15).mean() > 0.9
 
 
-def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:
+def test_several_runs_have_a_colour_each_and_mix_where_they_agree():
     shifted = plane(0.0) + np.array([10.0, 0.0, 0.0])
     runs = [DrawnRun("a", cloud(plane(0.0))), DrawnRun("b", cloud(shifted))]
     picture = draw(runs)
@@ -161,7 +160,7 @@ def test_several_runs_have_a_colour_each_and_mix_where_they_agree() -> None:
     np.testing.assert_allclose(both, (first + second) / 2, atol=6)
 
 
-def test_a_picture_is_written_as_png(tmp_path: Path) -> None:
+def test_a_picture_is_written_as_png(tmp_path):
     pixels = draw([DrawnRun("", cloud(np.eye(3)))]).pixels
     save_picture(tmp_path / "map.png", pixels)
     np.testing.assert_array_equal(np.asarray(o3d.io.read_image(str(tmp_path / "map.png"))), pixels)
@@ -169,7 +168,7 @@ def test_a_picture_is_written_as_png(tmp_path: Path) -> None:
         save_picture(tmp_path / "map.tiff", pixels)
 
 
-def test_paths_that_coincide_are_all_seen_and_have_no_gaps() -> None:
+def test_paths_that_coincide_are_all_seen_and_have_no_gaps():
     arc = np.column_stack([9.0 * np.sin(a := np.linspace(-1.0, 1.0, 700)), 9.0 * np.cos(a), np.zeros(700)])
     picture = draw([DrawnRun(name, NOTHING, arc) for name in "abc"], width=1600)
     colours = [(0, 114, 178), (213, 94, 0), (0, 158, 115)]
@@ -182,7 +181,7 @@ def test_paths_that_coincide_are_all_seen_and_have_no_gaps() -> None:
     assert not any(np.abs(np.subtract(START, colour)).max() < 60 for colour in colours)
 
 
-def test_a_run_that_diverges_leaves_the_picture_and_is_named() -> None:
+def test_a_run_that_diverges_leaves_the_picture_and_is_named():
     good, also = line(0.0), line(1.0)
     wild = np.column_stack([np.linspace(-9.0, 300.0, 400), np.zeros((400, 2))])
     runs = [DrawnRun("good", cloud(plane(0.0)), good), DrawnRun("also", NOTHING, also), DrawnRun("wild", NOTHING, wild)]
@@ -194,7 +193,7 @@ def test_a_run_that_diverges_leaves_the_picture_and_is_named() -> None:
     assert draw([DrawnRun("wild", NOTHING, wild)], reference=good).view.size_m[0] < 25.0
 
 
-def test_pictures_of_one_frame_are_the_same_but_for_the_run(tmp_path: Path) -> None:
+def test_pictures_of_one_frame_are_the_same_but_for_the_run(tmp_path):
     street = np.column_stack([a := np.linspace(0.0, 50.0, 500), a, 0.02 * a])
     runs = [DrawnRun("a", cloud(street), street), DrawnRun("b", cloud(0.5 * street), street[:250])]
     frame = fit_frame(runs, width=WIDTH)
@@ -209,7 +208,7 @@ def test_pictures_of_one_frame_are_the_same_but_for_the_run(tmp_path: Path) -> N
         draw_apart([runs[0], runs[0]], tmp_path, frame)
 
 
-def test_the_map_is_coloured_by_intensity_rgb_or_error_where_it_is_known() -> None:
+def test_the_map_is_coloured_by_intensity_rgb_or_error_where_it_is_known():
     points, left = plane(0.0), plane(0.0)[:, 0] < 0.0
     intensity, rgb = np.where(left, 0.1, 0.9).astype(np.float32), np.where(left[:, None], (200, 0, 0), (0, 0, 200))
     known = replace(cloud(points), attributes=PointAttributes(intensity, rgb.astype(np.uint8)))
@@ -229,7 +228,7 @@ def test_the_map_is_coloured_by_intensity_rgb_or_error_where_it_is_known() -> No
             require_quantity(unknown, quantity)
 
 
-def test_the_path_is_coloured_by_its_error_and_grey_without_one() -> None:
+def test_the_path_is_coloured_by_its_error_and_grey_without_one():
     errors_m = np.concatenate([np.zeros(150), np.full(150, 0.4), np.full(100, np.nan)])
     run = DrawnRun("", cloud(plane(0.0)), line(0.0), errors_m=errors_m)
     picture = draw([run], quantity="error", width=800)
@@ -237,7 +236,7 @@ def test_the_path_is_coloured_by_its_error_and_grey_without_one() -> None:
         assert is_like(near(picture, np.array([x, 0.0, 0.0]), 0), colour), x
 
 
-def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path: Path) -> None:
+def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path):
     pole = np.array([[3.0, 1.0, 0.0]]) + np.column_stack([np.zeros((50, 2)), np.linspace(0.0, 2.0, 50)])
     run = DrawnRun("", cloud(np.concatenate([plane(0.0, count=50), pole])), line(0.0))
     counted: list[tuple[int, int]] = []
@@ -258,7 +257,7 @@ def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path: Path) -> None
         assert np.abs(np.asarray(video.convert("RGB")).astype(int) - frames[0]).mean() < 4.0
 
 
-def test_an_mp4_file_is_written_by_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_mp4_file_is_written_by_ffmpeg(tmp_path, monkeypatch):
     program = tmp_path / "ffmpeg"
     program.write_text('#!/bin/sh\ncat > "$(eval echo \\${$#})"\n')
     program.chmod(0o755)

@@ -1,8 +1,8 @@
-"""Scans of known truth through the pipeline: poses, map, and what happens when tracking is lost."""
+"""Scans of known truth through the pipeline: poses, map, and what happens when tracking is lost; its threads."""
 
 import ctypes
+import itertools
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.pipeline.localisation import OdometryAlone, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.threads import EVERY_SCANS
+from lidarslam.pipeline.threads import EVERY_SCANS, BackgroundWorker, prefetch
 from lidarslam.simulation.record import RecordRequest, make_simulation
 
 
@@ -42,16 +42,13 @@ def true_odometry(room_truth: Trajectory) -> ExternalOdometry:
     return ExternalOdometry(room_truth)
 
 
-def test_true_motions_give_true_poses_and_a_true_map(
-    true_odometry: ExternalOdometry, room: Any, room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_true_motions_give_true_poses_and_a_true_map(true_odometry, room, room_scans, room_truth):
     pipeline = make_pipeline(true_odometry)
     results = list(pipeline.run(room_scans))
     truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
     np.testing.assert_allclose([result.T_world_lidar for result in results], truth, atol=1e-9)
     assert all(result.status is Status.OK for result in results)
     assert all(set(result.stage_ms) == set(STAGES) for result in results)
-    assert pipeline.map.global_map is not None
     in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     # A voxel's mean may lie off a corner by a part of the voxel; nothing else may lie off a surface.
     distance = room.distance_to_surface(in_room)
@@ -60,7 +57,7 @@ def test_true_motions_give_true_poses_and_a_true_map(
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
-def test_free_memory_is_returned(true_odometry: ExternalOdometry, room_scans: list[Scan]) -> None:
+def test_free_memory_is_returned(true_odometry, room_scans):
     """Blocks that are kept between others hold what is freed around them."""
     blocks = [b"x" * 60_000 for _ in range(4_000)]
     kept = blocks[::50]
@@ -89,37 +86,6 @@ class _Astray:
         pass
 
 
-@pytest.mark.parametrize("failure", [None, "the sensor was covered"])
-def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(
-    room: Any, room_scans: list[Scan], room_truth: Trajectory, failure: str | None
-) -> None:
-    error = [0.0] * 6 if failure else [0.0, 0.0, 0.4, 0.0, 0.0, 0.0]
-    pipeline = make_pipeline(_Astray(room_truth, 19, error, failure))
-    results = list(pipeline.run(room_scans))
-    # The scan before the last is compensated with the wrong motion, and may show it.
-    statuses = [result.status for result in results]
-    assert statuses[:18] == [Status.OK] * 18
-    assert statuses[18:] in ([Status.OK, Status.LOST], [Status.DEGRADED, Status.LOST])
-    assert failure is None or results[19].message == failure
-    assert pipeline.map.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
-    assert room.distance_to_surface(in_room).max() < 0.06, "no wall is drawn twice"
-
-
-def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(
-    true_odometry: ExternalOdometry, room_scans: list[Scan]
-) -> None:
-    def scans() -> Any:
-        yield from room_scans[:3]
-        raise InputError("disk")
-
-    results = []
-    with pytest.raises(InputError, match="disk"):
-        for result in make_pipeline(true_odometry).run(scans()):
-            results.append(result)
-    assert len(results) == 3
-
-
 class _Notes:
     """A follower that writes down what it is told."""
 
@@ -139,9 +105,36 @@ class _Notes:
         return [one for one in self.told if isinstance(one, GraphScan)]
 
 
-def test_a_follower_sees_what_a_scan_showed_before_the_next(
-    true_odometry: ExternalOdometry, room_scans: list[Scan]
-) -> None:
+@pytest.mark.parametrize("failure", [None, "the sensor was covered"])
+def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(room, room_scans, room_truth, failure):
+    error = [0.0] * 6 if failure else [0.0, 0.0, 0.4, 0.0, 0.0, 0.0]
+    pipeline = make_pipeline(_Astray(room_truth, 19, error, failure), notes := _Notes())
+    results = list(pipeline.run(room_scans))
+    # The scan before the last is compensated with the wrong motion, and may show it.
+    statuses = [result.status for result in results]
+    assert statuses[:18] == [Status.OK] * 18
+    assert statuses[18:] in ([Status.OK, Status.LOST], [Status.DEGRADED, Status.LOST])
+    assert failure is None or results[19].message == failure
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
+    assert room.distance_to_surface(in_room).max() < 0.06, "no wall is drawn twice"
+    assert [scan.lost for scan in notes.scans] == [status is Status.LOST for status in statuses]
+    assert failure is None or notes.scans[19].T_prev_curr is None
+    assert isinstance(notes.told[-1], GraphScan), "which is not drawn"
+
+
+def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(true_odometry, room_scans):
+    def scans() -> Any:
+        yield from room_scans[:3]
+        raise InputError("disk")
+
+    results = []
+    with pytest.raises(InputError, match="disk"):
+        for result in make_pipeline(true_odometry).run(scans()):
+            results.append(result)
+    assert len(results) == 3
+
+
+def test_a_follower_sees_what_a_scan_showed_before_the_next(true_odometry, room_scans):
     notes = _Notes()
     results = list(make_pipeline(true_odometry, notes).run(room_scans))
     assert [isinstance(one, GraphScan) for one in notes.told] == [True, *([False, True] * 19), False]
@@ -156,17 +149,7 @@ def test_a_follower_sees_what_a_scan_showed_before_the_next(
     np.testing.assert_allclose(motions, inverse(poses[:-1]) @ poses[1:], atol=1e-12)
 
 
-def test_a_follower_hears_of_a_lost_scan_and_does_not_draw_it(room_scans: list[Scan], room_truth: Trajectory) -> None:
-    notes = _Notes()
-    list(make_pipeline(_Astray(room_truth, 19, [0.0] * 6, "the sensor was covered"), notes).run(room_scans))
-    assert [scan.lost for scan in notes.scans] == [False] * 19 + [True]
-    assert notes.scans[19].T_prev_curr is None
-    assert isinstance(notes.told[-1], GraphScan)
-
-
-def test_a_follower_is_up_to_date_when_a_run_is_broken_off(
-    true_odometry: ExternalOdometry, room_scans: list[Scan]
-) -> None:
+def test_a_follower_is_up_to_date_when_a_run_is_broken_off(true_odometry, room_scans):
     notes = _Notes()
     results = make_pipeline(true_odometry, notes).run(room_scans)
     for _ in range(5):
@@ -176,7 +159,7 @@ def test_a_follower_is_up_to_date_when_a_run_is_broken_off(
     assert not any(thread.name.startswith("graph") for thread in threading.enumerate())
 
 
-def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: Trajectory) -> None:
+def test_a_sweep_is_compensated_with_the_motion_after_it(room, room_truth):
     """A robot that stands still for a second and then turns: stamps at the sweeps' starts, as drivers put them."""
 
     def turning(time: FloatArray) -> FloatArray:
@@ -192,7 +175,7 @@ def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: 
     assert all(result.status is Status.OK for result in results)
 
 
-def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows() -> None:
+def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows():
     """A car at speed, without an odometry: nothing is known of the first sweep's motion until the second."""
     simulation = make_simulation(RecordRequest(Path(), "street", "vlp-16", "car-fast", "upright", 2, 0, ""))
     first, second = simulation.scans()
@@ -203,16 +186,71 @@ def test_the_first_sweep_enters_the_map_with_the_velocity_that_the_second_shows(
     T_map_lidar = simulation.ground_truth.at(np.array([first.stamp, second.stamp]), 0.2)
     velocity = log(inverse(T_map_lidar[0]) @ T_map_lidar[1]) / (second.stamp - first.stamp)
     assert np.linalg.norm(velocity[3:]) > 9.0
-    assert first.time_offsets is not None
     true = move(first.points, first.time_offsets, velocity)
-    assert pipeline.map.global_map is not None
     distance, _ = cKDTree(pipeline.map.global_map.points()).query(true[np.linalg.norm(true, axis=1) < 30.0])
     assert np.quantile(distance, 0.99) < 0.2, "a voxel; the sweep moves by a metre"
 
 
-def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive: Callable[..., FloatArray]) -> None:
+def test_the_range_is_cropped(true_odometry, room, drive):
     scans = [room.sweep(drive, float(stamp)) for stamp in (0.1, 0.2)]
     for result in make_pipeline(true_odometry, min_range_m=2.0, max_range_m=4.0).run(scans):
         ranges = np.linalg.norm(result.points, axis=1)
         assert ranges.min() > 1.9  # compensation moves points by centimetres after the crop
         assert ranges.max() < 4.1
+
+
+def test_reads_no_further_ahead_than_it_may_and_leaving_early_ends_the_thread():
+    made = []
+    reader = prefetch((made.append(item) for item in itertools.count()), ahead=2)
+    next(reader)
+    reader.close()
+    assert len(made) <= 5
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
+
+
+class Slow:
+    """Goes on when it may, and notes its calls."""
+
+    def __init__(self) -> None:
+        self.may = threading.Event()
+        self.calls: list[int] = []
+        self.threads: set[str] = set()
+
+    def call(self, number: int) -> None:
+        assert self.may.wait(10.0)
+        self.calls.append(number)
+        self.threads.add(threading.current_thread().name)
+
+
+def test_calls_are_carried_out_in_order_on_a_thread_of_their_own():
+    slow, worker = Slow(), BackgroundWorker("graph", max_pending=20)
+    for number in range(10):
+        worker.submit(slow.call, number)
+    assert not slow.calls
+    slow.may.set()
+    worker.close()
+    assert slow.calls == list(range(10))
+    assert slow.threads == {"graph_0"}
+
+
+def test_the_caller_waits_when_too_many_calls_are_pending():
+    slow, worker = Slow(), BackgroundWorker("graph", max_pending=2)
+    worker.submit(slow.call, 0)
+    worker.submit(slow.call, 1)
+    third = threading.Thread(target=worker.submit, args=(slow.call, 2))
+    third.start()
+    third.join(0.2)
+    assert third.is_alive()
+    slow.may.set()
+    third.join(10.0)
+    assert not third.is_alive()
+    worker.close()
+    assert slow.calls == [0, 1, 2]
+
+
+@pytest.mark.parametrize("wait", ["wait", "close"])
+def test_an_error_is_raised(wait):
+    worker = BackgroundWorker("graph", max_pending=2)
+    worker.submit(int, "no number")
+    with pytest.raises(ValueError, match="no number"):
+        getattr(worker, wait)()

@@ -17,7 +17,6 @@ from lidarslam.commands.runs import run
 from lidarslam.compare.plan import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.registry import choose_reader
 
@@ -76,7 +75,7 @@ def broken(example: Path, tmp_path: Path) -> Iterator[Path]:
         yield folder
 
 
-def test_a_run_takes_odometry_mapping_and_metric(example: Path, recording: Path, tmp_path: Path) -> None:
+def test_a_run_takes_odometry_mapping_and_metric(example, recording, tmp_path):
     out = tmp_path / "run"
     chosen = ("--odometry", "still", "--mapping", "chain", "--set", "checkpoints.every_scans=1", "--no-report")
     result = lidarslam("run", recording, "--out", out, *chosen)
@@ -88,7 +87,7 @@ def test_a_run_takes_odometry_mapping_and_metric(example: Path, recording: Path,
     assert any("the mapping cannot save its state" in warning for warning in warnings)
 
 
-def test_a_mapping_corrects_an_added_odometry(example: Path, recording: Path, tmp_path: Path) -> None:
+def test_a_mapping_corrects_an_added_odometry(example, recording, tmp_path):
     out = tmp_path / "run"
     succeeds("run", recording, "--out", out, "--odometry", "still", "--no-report")
     truth = read_tum(recording / "ground_truth.tum").positions[:5]
@@ -97,7 +96,7 @@ def test_a_mapping_corrects_an_added_odometry(example: Path, recording: Path, tm
     np.testing.assert_allclose(far, expected, atol=0.02)
 
 
-def test_a_source_is_recognised(example: Path, room_scans: list[Scan], tmp_path: Path) -> None:
+def test_a_source_is_recognised(example, room_scans, tmp_path):
     source = tmp_path / "sweeps"
     source.mkdir()
     for index, scan in enumerate(room_scans[:3]):
@@ -110,7 +109,7 @@ def test_a_source_is_recognised(example: Path, room_scans: list[Scan], tmp_path:
 
 
 @pytest.mark.long
-def test_a_peer_is_compared(example: Path, recording: Path, tmp_path: Path) -> None:
+def test_a_peer_is_compared(example, recording, tmp_path):
     result = lidarslam("compare", recording, "--out", tmp_path / "compared", "--methods", "origin,still")
     methods = json.loads((tmp_path / "compared" / "comparison.json").read_text())["methods"]
     assert methods["origin"]["status"] == "lost", result.output  # for the same reason
@@ -119,7 +118,7 @@ def test_a_peer_is_compared(example: Path, recording: Path, tmp_path: Path) -> N
     assert [method.peer for method in parse_methods("origin,still+map+graph")] == ["origin", None]
 
 
-def test_evaluate_has_the_metric_and_gates_of_it(example: Path, recording: Path, tmp_path: Path) -> None:
+def test_evaluate_has_the_metric_and_gates_of_it(example, recording, tmp_path):
     truth = recording / "ground_truth.tum"
     files = (truth, "--reference", truth, "--out", tmp_path / "metrics.json")
     said = succeeds("evaluate", *files, "--max", "plugins.height.mean_m=1e-6")
@@ -128,7 +127,7 @@ def test_evaluate_has_the_metric_and_gates_of_it(example: Path, recording: Path,
     assert lidarslam("evaluate", *files, "--min", "plugins.height.mean_m=1").exit_code == 4
 
 
-def test_without_the_package_nothing_is_added(recording: Path, tmp_path: Path) -> None:
+def test_without_the_package_nothing_is_added(recording, tmp_path):
     assert lidarslam("run", recording, "--odometry", "still").exit_code == 2
     with pytest.raises(ConfigError, match="there are: learned"):
         parse_methods("still")
@@ -136,9 +135,7 @@ def test_without_the_package_nothing_is_added(recording: Path, tmp_path: Path) -
     assert "plugins" not in json.loads((tmp_path / "m.json").read_text())
 
 
-def test_what_cannot_be_imported_is_one_line_with_the_package(
-    broken: Path, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_cannot_be_imported_is_one_line_with_the_package(broken, recording, tmp_path, caplog):
     cannot = "'broken' of the package lidarslam-broken cannot be loaded"
     for option in ("odometry", "mapping", "reader"):
         result = lidarslam("run", recording, "--out", tmp_path / "run", f"--{option}", "broken")
@@ -153,16 +150,14 @@ def test_what_cannot_be_imported_is_one_line_with_the_package(
     assert f"the metric {cannot}" in caplog.text
 
 
-def test_names_are_listed_and_a_built_in_one_is_not_taken(
-    broken: Path, recording: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_names_are_listed_and_a_built_in_one_is_not_taken(broken, recording, caplog):
     assert "|learned+imu|broken|still]" in "".join(lidarslam("run", "--help").output.split())
     assert "the odometry 'kiss-icp' of lidarslam-broken is ignored: the name is taken" in caplog.text
     result = lidarslam("run", recording, "--set", "odometry.method=loam")
     assert "there are: learned, kiss-icp, constant-velocity, imu, learned+imu, external, broken, still" in result.stderr
 
 
-def test_names_that_are_built_in_need_no_search(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_are_built_in_need_no_search(recording, monkeypatch):
     def search(point: plugins.PlugPoint) -> None:
         raise AssertionError(point)
 

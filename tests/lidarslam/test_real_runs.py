@@ -30,15 +30,13 @@ METHODS = ("learned", "constant-velocity")
         *[("sim_office_spin", "learned", step) for step in (3, 5)],  # 36 and 60 degrees a scan
     ],
 )
-def test_scans_do_not_slide_at_any_rate(real_data: Path, tmp_path: Path, name: str, odometry: str, step: int) -> None:
+def test_scans_do_not_slide_at_any_rate(real_data, tmp_path, name, odometry, step):
     assert error_m(real_data / name, tmp_path / "run", "--odometry", odometry, "--step", str(step)) < 0.015
 
 
 @pytest.mark.parametrize("odometry", METHODS)
 @pytest.mark.parametrize("yaw_deg", [30, 80, 135])
-def test_the_direction_of_the_axes_does_not_matter(
-    real_data: Path, tmp_path: Path, odometry: str, yaw_deg: int
-) -> None:
+def test_the_direction_of_the_axes_does_not_matter(real_data, tmp_path, odometry, yaw_deg):
     """The same sweeps fall into other cells, as any small change would have it."""
     options = "--odometry", odometry, "--set", f"reader.mounting=[0, 0, {yaw_deg}]"
     assert error_m(real_data / "sim_office_spin", tmp_path / "run", *options) < 0.015
@@ -46,14 +44,14 @@ def test_the_direction_of_the_axes_does_not_matter(
 
 @pytest.mark.parametrize("odometry", METHODS)
 @pytest.mark.parametrize("step", [1, 2, 3, 5])
-def test_a_real_drive_at_speed_from_its_first_scan(real_data: Path, tmp_path: Path, odometry: str, step: int) -> None:
+def test_a_real_drive_at_speed_from_its_first_scan(real_data, tmp_path, odometry, step):
     """Sequence 04 is at 13 m/s when it begins; KISS-ICP is off by 19 m at every fifth scan."""
     source = real_data / "kitti_odometry_04" / "sequences" / "04"
     assert error_m(source, tmp_path / "run", "--odometry", odometry, "--step", str(step)) < 0.05
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 1e-5])
-def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noise_m: float) -> None:
+def test_rounding_decides_nothing_on_stairs(real_data, tmp_path, noise_m):
     """Few points constrain the height: the odometry's motion has to hold it, on any processor."""
     stairs = shutil.copytree(real_data / "sim_stairs", tmp_path / "stairs")
     rng = np.random.default_rng(2)
@@ -66,13 +64,13 @@ def test_rounding_decides_nothing_on_stairs(real_data: Path, tmp_path: Path, noi
 
 
 @pytest.mark.parametrize("step", [3, 4])
-def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data: Path, tmp_path: Path, step: int) -> None:
+def test_no_flight_of_stairs_is_mistaken_for_another_at_lower_rates(real_data, tmp_path, step):
     """The map grows with degraded scans that the odometry confirms, without which the next flight fits none."""
     assert error_m(real_data / "sim_stairs", tmp_path / "run", "--step", str(step)) < 0.3
 
 
 @pytest.mark.parametrize(("start", "step"), [(0, 1), (20, 1), (40, 1), (80, 1), (0, 5)])
-def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, start: int, step: int) -> None:
+def test_a_start_within_a_corridor_with_an_imu(real_data, tmp_path, start, step):
     """Hardly any surface constrains the first velocity, 2.2 m/s; the run is right, and reports that."""
     out = tmp_path / "run"
     options = "--odometry", "learned+imu", "--start", str(start), "--stop", str(start + 40 * step)
@@ -81,7 +79,7 @@ def test_a_start_within_a_corridor_with_an_imu(real_data: Path, tmp_path: Path, 
     assert json.loads((out / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.03
 
 
-def test_a_crowd_that_is_followed_is_reported(real_data: Path, tmp_path: Path) -> None:
+def test_a_crowd_that_is_followed_is_reported(real_data, tmp_path):
     """Played backwards, half of 30 people walk along from the first scan on, and the path is too short."""
     crowd, backwards = real_data / "sim_office_crowd", tmp_path / "backwards"
     backwards.mkdir()

@@ -62,7 +62,7 @@ WRITERS: dict[str, Callable[[Path, FloatArray], None]] = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_large_coordinates_survive(tmp_path: Path, survey: FloatArray, name: str) -> None:
+def test_large_coordinates_survive(tmp_path, survey, name):
     WRITERS[name](tmp_path / name, survey)
     points = read_cloud(tmp_path / name)
     assert points.dtype == np.float64
@@ -72,7 +72,7 @@ def test_large_coordinates_survive(tmp_path: Path, survey: FloatArray, name: str
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("share", [0.02, 0.6])
-def test_a_truncated_file_gets_one_line(tmp_path: Path, survey: FloatArray, name: str, share: float) -> None:
+def test_a_truncated_file_gets_one_line(tmp_path, survey, name, share):
     WRITERS[name](tmp_path / name, survey)
     os.truncate(tmp_path / name, int(share * (tmp_path / name).stat().st_size))
     with pytest.raises(InputError, match=rf"{name}: not a readable") as caught:
@@ -81,7 +81,7 @@ def test_a_truncated_file_gets_one_line(tmp_path: Path, survey: FloatArray, name
 
 
 @pytest.mark.parametrize("at_end", [False, True])
-def test_a_laz_file_with_endless_chunks_is_refused(tmp_path: Path, survey: FloatArray, at_end: bool) -> None:
+def test_a_laz_file_with_endless_chunks_is_refused(tmp_path, survey, at_end):
     """In a process of its own, which lazrs ends otherwise."""
     _write_las(tmp_path / "cloud.laz", survey)
     content = bytearray((tmp_path / "cloud.laz").read_bytes())
@@ -97,7 +97,7 @@ def test_a_laz_file_with_endless_chunks_is_refused(tmp_path: Path, survey: Float
     assert "cloud.laz: not a readable LAZ file (4,294,967,295 chunks)" in done.stderr
 
 
-def test_a_header_that_promises_many_points_takes_no_memory(tmp_path: Path, survey: FloatArray) -> None:
+def test_a_header_that_promises_many_points_takes_no_memory(tmp_path, survey):
     _write_las(tmp_path / "cloud.las", survey)
     content = bytearray((tmp_path / "cloud.las").read_bytes())
     content[107:111] = (1 << 25).to_bytes(4, "little")  # of 34 bytes: a gigabyte
@@ -108,7 +108,7 @@ def test_a_header_that_promises_many_points_takes_no_memory(tmp_path: Path, surv
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 << 10
 
 
-def test_points_that_are_none_are_dropped(tmp_path: Path, survey: FloatArray) -> None:
+def test_points_that_are_none_are_dropped(tmp_path, survey):
     survey[::5, 1] = np.nan
     _write_pcd(tmp_path / "cloud.pcd", survey)
     assert len(read_cloud(tmp_path / "cloud.pcd")) == 400

@@ -1,18 +1,21 @@
-"""Finished runs in Rerun: files written through a pipe, windows and pages on this machine alone."""
+"""Runs in Rerun: files written through a pipe, windows and pages on this machine alone, served until told to end."""
 
 import ast
 import http.client
 import os
 import re
-import resource
 import signal
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
+from urllib.request import urlopen
 
 import numpy as np
+import psutil
 import pytest
 
 from lidarslam.config.settings import ViewerConfig, load_config
@@ -25,12 +28,15 @@ from lidarslam.viewer import rerun_environment, rerun_program
 from lidarslam.viewer.rerun_program import WebPage, is_taken, open_window, served_page
 from lidarslam.viewer.rerun_recording import (
     IncompleteRecordingError,
+    require_complete,
     rerun_viewer,
     save,
     show_file_in_window,
     show_in_window,
 )
 from lidarslam.viewer.rerun_scenes import show_runs
+
+from .conftest import files_no_longer_than
 
 LISTENER = """#!/usr/bin/env python3
 import os, socket, sys, time
@@ -56,25 +62,17 @@ def finished() -> FinishedRun:
 
 
 @pytest.mark.parametrize("size", [0, 1_000, 100_000])
-def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
-) -> None:
+def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(tmp_path, monkeypatch, size):
     """Rerun's own writer is never told, because it may wait without end then; the room it took is given back."""
     monkeypatch.setattr(rerun_environment, "abandoned", False)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     begun = time.monotonic()
-    try:
-        with (
-            pytest.raises(IncompleteRecordingError, match="is the disk full"),
-            rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
-        ):
-            for seed in range(20):
-                viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
+    with (
+        files_no_longer_than(size),
+        pytest.raises(IncompleteRecordingError, match="is the disk full"),
+        rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
+    ):
+        for seed in range(20):
+            viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
     assert time.monotonic() - begun < 10
     assert (tmp_path / "recording.rrd").stat().st_size == 0
     assert not rerun_environment.abandoned
@@ -89,9 +87,7 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_display")
-def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(
-    finished: FinishedRun, small_recording: Path, tmp_path: Path
-) -> None:
+def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(finished, small_recording, tmp_path):
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
         show_in_window(show_runs([finished], None, ViewerConfig()))
     save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
@@ -122,9 +118,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch, program: Path, text: str) -> None:
     monkeypatch.setattr("lidarslam.viewer.rerun_program._program", lambda: str(program))
 
 
-def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int
-) -> None:
+def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(tmp_path, monkeypatch, port):
     """It asks for a newer version by way of a proxy: one that is not there."""
     proxies = ("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy")
     for name in proxies[::2]:
@@ -143,7 +137,7 @@ def test_a_window_listens_on_this_machine_alone_and_is_kept_from_the_network(
     assert {environment[name] for name in proxies} == {"http://127.0.0.1:1"}
 
 
-def test_a_window_that_never_listens_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
+def test_a_window_that_never_listens_is_ended(tmp_path, monkeypatch, port):
     monkeypatch.setattr("lidarslam.viewer.rerun_program._START_S", 1.0)
     pretend(monkeypatch, tmp_path / "rerun", f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 60\n")
     begun = time.monotonic()
@@ -167,7 +161,7 @@ def get(page: WebPage, path: str, host: str | None = None) -> http.client.HTTPRe
     return connection.getresponse()
 
 
-def test_the_page_may_load_from_its_own_server_alone(page: WebPage) -> None:
+def test_the_page_may_load_from_its_own_server_alone(page):
     for path in ("/?url=there", "/re_viewer.js", "/"):
         policy = get(page, path).headers["Content-Security-Policy"]
         assert {"default-src 'none'", "connect-src 'self'"} <= {part.strip() for part in policy.split(";")}
@@ -181,7 +175,7 @@ def test_the_page_may_load_from_its_own_server_alone(page: WebPage) -> None:
     assert b"re_viewer.js" in body
 
 
-def test_the_viewer_is_reruns_own() -> None:
+def test_the_viewer_is_reruns_own():
     """Whatever its page names of elsewhere is not loaded, or only when clicked."""
     with served_page(lambda _: None) as page:
         body = get(page, "/?url=there").read().decode()
@@ -191,7 +185,7 @@ def test_the_viewer_is_reruns_own() -> None:
         assert get(page, "/re_viewer_bg.wasm").read(4) == b"\0asm"
 
 
-def test_a_recording_is_shown_while_it_is_written(page: WebPage, tmp_path: Path) -> None:
+def test_a_recording_is_shown_while_it_is_written(page, tmp_path):
     announced: list[str] = []
     page._announce = announced.append
     path = tmp_path / "recording.rrd"
@@ -208,7 +202,7 @@ def test_a_recording_is_shown_while_it_is_written(page: WebPage, tmp_path: Path)
     assert get(page, "/recording.rrd").read() == b"begun, continued, ended"
 
 
-def test_the_recording_is_found_at_the_end_of_a_tunnel_but_not_by_a_name_made_to_point_here(page: WebPage) -> None:
+def test_the_recording_is_found_at_the_end_of_a_tunnel_but_not_by_a_name_made_to_point_here(page):
     """Otherwise any page in the browser could read the recording."""
     response = get(page, "/", "localhost:1234")
     assert response.status == 302
@@ -218,7 +212,7 @@ def test_the_recording_is_found_at_the_end_of_a_tunnel_but_not_by_a_name_made_to
     assert get(page, "/", "elsewhere.example").status == 403
 
 
-def test_this_machine_alone_is_served_from_a_port_that_is_free(page: WebPage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_this_machine_alone_is_served_from_a_port_that_is_free(page, monkeypatch):
     taken = urlsplit(page.address).port
     assert_on_this_machine_alone(taken or 0)
     other = WebPage({"/": INDEX})
@@ -227,3 +221,70 @@ def test_this_machine_alone_is_served_from_a_port_that_is_free(page: WebPage, mo
     monkeypatch.setattr(rerun_program, "_PORTS", [taken])
     with pytest.raises(OutputError, match=f"{taken}.* in use"):
         WebPage({"/": INDEX})
+
+
+Serve = Callable[..., "tuple[subprocess.Popen[str], str]"]
+
+
+@pytest.fixture
+def serve() -> "Iterator[Serve]":
+    """Starts a command; it and the address that it prints."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: object) -> "tuple[subprocess.Popen[str], str]":
+        command = [sys.executable, "-m", "lidarslam", *map(str, arguments)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        started.append(process)
+        address = process.stdout.readline().strip()
+        assert address.startswith("http://127.0.0.1:"), address
+        return process, address
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("request_to_end", [signal.SIGINT, signal.SIGTERM])
+def test_a_view_ends_well(serve, finished_run, request_to_end):
+    process, address = serve("view", finished_run, "--web")
+    with urlopen(f"{address}/recording.rrd", timeout=120) as recording:
+        assert recording.read(4) == b"RRF2"
+    assert psutil.Process(process.pid).children(recursive=True) == []  # nothing to leave behind, however it ends
+    process.send_signal(request_to_end)
+    out, err = process.communicate(timeout=300)
+    assert (process.returncode, err) == (0, "")
+    assert "Aborted" not in out
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("interruptible")
+def test_a_run_is_served_while_it_goes_on_and_afterwards(serve, small_recording, tmp_path):
+    out = tmp_path / "run"
+    process, address = serve("run", small_recording, "--out", out, "--odometry", "constant-velocity", "--rerun", "web")
+    with urlopen(f"{address}/recording.rrd", timeout=300) as recording:
+        seen = recording.read()
+    lines = []
+    while "until Ctrl-C; later" not in (line := process.stdout.readline()):
+        assert line or process.poll() is None, "ended early"
+        lines.append(line)
+    assert "written to" in "".join(lines)
+    require_complete(out / "recording.rrd")
+    assert seen == (out / "recording.rrd").read_bytes()
+    assert f"lidarslam view {out / 'recording.rrd'} --web" in line
+    with urlopen(f"{address}/?url=there", timeout=120) as page:
+        assert page.status == 200
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=300)
+    assert (process.returncode, err) == (0, "")
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("interruptible")
+def test_a_run_that_is_interrupted_does_not_stay(serve, small_recording, tmp_path):
+    process, _ = serve("run", small_recording, "--out", tmp_path / "run", "--rerun", "web")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=300)
+    assert process.returncode == 1

@@ -2,14 +2,10 @@
 
 import hashlib
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,124 +21,18 @@ from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 from lidarslam.storage.finished_run import load_run
 
 from ..conftest import lidarslam
+from .killable import Ended
 
-ROOT = Path(__file__).parents[2]
-KILL = signal.SIGKILL
-KILLED = -KILL
-
-# Loads the program once, and for every line forks a run of it; told to, that kills itself without further notice as it
-# is about to do something to its directory, or at some time. It counts what it does there, and may keep what lies there
-# before each of these things, which is what a run that is killed then leaves.
-SERVER = """
-import json, os, shutil, signal, sys, threading
-from pathlib import Path
-import lidarslam.viewer.rerun_recording, lidarslam.run.run
-import mapping.global_map.point_cloud, mapping.pose_graph.slam_graph
-import lidarslam.odometry.methods.learned
-from lidarslam.cli import main
-
-EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fsync"}
-
-def run(order):
-    log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
-    count, busy = 0, threading.local()
-
-    def see(event, args):
-        nonlocal count
-        if event not in EVENTS or not (event == "fsync" or str(args[0]).startswith(order["out"])):
-            return
-        if hasattr(busy, "copying"):
-            return
-        count += 1
-        if order["keep_in"] is not None and os.path.isdir(order["out"]):
-            busy.copying = True
-            shutil.copytree(order["out"], os.path.join(order["keep_in"], str(count)))
-            del busy.copying
-        if count == order["kill_at"]:
-            os.kill(os.getpid(), order["signal"])
-
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.addaudithook(see)
-    fsync = os.fsync
-    os.fsync = lambda handle: (see("fsync", ()), fsync(handle))[1]
-    if order["kill_after_s"] is not None:
-        threading.Timer(order["kill_after_s"], lambda: os.kill(os.getpid(), signal.SIGKILL)).start()
-    status = 0
-    try:
-        main(order["arguments"])
-    except SystemExit as end:
-        status = end.code or 0
-    Path(order["log"] + ".count").write_text(str(count))
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
-
-print("ready", flush=True)
-for line in sys.stdin:
-    pid = os.fork()
-    if pid == 0:
-        run(json.loads(line))
-    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
-"""
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How a command ended."""
-
-    status: int
-    said: str
-    events: int
-    seconds: float
-
+KILLED = -signal.SIGKILL
 
 Run = Callable[..., Ended]
 Timeless = Callable[[Path], dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(killable: Run) -> Run:
     """Runs `lidarslam run SOURCE --out OUT ...`."""
-    log = tmp_path_factory.mktemp("log") / "log"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command, pipe = [sys.executable, "-c", SERVER], subprocess.PIPE
-    server = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=ROOT)
-    assert server.stdin is not None
-    assert server.stdout is not None
-    assert server.stdout.readline() == "ready\n"
-
-    def run(
-        source: Path,
-        out: Path,
-        *arguments: str,
-        kill_at: int | None = None,
-        kill_after_s: float | None = None,
-        signal: int = KILL,
-        keep_in: Path | None = None,
-    ) -> Ended:
-        order = {
-            "arguments": ["run", str(source), "--out", str(out), *arguments],
-            "out": str(out),
-            "log": str(log),
-            "kill_at": kill_at,
-            "kill_after_s": kill_after_s,
-            "signal": int(signal),
-            "keep_in": None if keep_in is None else str(keep_in),
-        }
-        count = Path(f"{log}.count")
-        count.unlink(missing_ok=True)
-        server.stdin.write(json.dumps(order) + "\n")
-        server.stdin.flush()
-        started = time.monotonic()
-        status = int(server.stdout.readline())
-        events = int(count.read_text()) if count.is_file() else -1
-        return Ended(status, log.read_text(), events, time.monotonic() - started)
-
-    yield run
-    server.stdin.close()
-    server.wait()
+    return lambda source, out, *arguments, **kill: killable("run", source, *arguments, out=out, **kill)
 
 
 SCANS = 34
@@ -251,7 +141,7 @@ SLOW = ("learned", "odometry alone", "kiss-icp")  # for their odometry; those wi
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in METHODS])
-def test_a_killed_run_comes_to_the_same_results(whole: Callable[[str], Whole], tmp_path: Path, method: str) -> None:
+def test_a_killed_run_comes_to_the_same_results(whole, tmp_path, method):
     """Killed twice, at a third and at two thirds of all that is done on disk."""
     expected, out = whole(method), tmp_path / "run"
     events = expected.ended.events
@@ -284,9 +174,7 @@ def go_on(expected: Whole, out: Path, *more: str) -> None:
 
 @pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
 @pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10), ("tiles", 5)])
-def test_a_run_may_be_killed_before_anything_it_does_on_disk(
-    whole: Callable[[str], Whole], tmp_path: Path, method: str, every_scans: int
-) -> None:
+def test_a_run_may_be_killed_before_anything_it_does_on_disk(whole, tmp_path, method, every_scans):
     """What lies there before each of these things is kept of one run, as so many kills would leave it.
 
     A state is saved three times, each time by the same steps.
@@ -311,7 +199,7 @@ def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
 
 
 @pytest.mark.long
-def test_a_run_that_is_stopped_can_be_resumed_as_well(expected: Whole, tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_can_be_resumed_as_well(expected, tmp_path):
     """Ctrl-C comes just as a state is written; what there is can be looked at meanwhile."""
     out = tmp_path / "run"
     ended = expected.again(out, kill_at=expected.ended.events // 3, signal=signal.SIGINT)
@@ -357,13 +245,13 @@ def assert_refused(ended: Ended, told: str) -> None:
         (["--odometry", "learned"], "odometry.method constant-velocity (now learned)"),
     ],
 )
-def test_another_run_is_not_resumed(expected: Whole, killed: Path, arguments: list[str], told: str) -> None:
+def test_another_run_is_not_resumed(expected, killed, arguments, told):
     before = contents(killed)
     assert_refused(expected.again(killed, *arguments, "--resume"), told)
     assert contents(killed) == before
 
 
-def test_another_recording_is_not_taken_for_it(expected: Whole, source: Path, killed: Path, tmp_path: Path) -> None:
+def test_another_recording_is_not_taken_for_it(expected, source, killed, tmp_path):
     other = shutil.copytree(source, tmp_path / "other")
     assert_refused(expected.again(killed, "--resume", source=other), "was begun with source")
     about = killed / "unfinished" / "run.json"
@@ -378,7 +266,7 @@ def test_another_recording_is_not_taken_for_it(expected: Whole, source: Path, ki
 
 
 @pytest.mark.long
-def test_a_run_killed_before_its_first_state_begins_again(expected: Whole, tmp_path: Path) -> None:
+def test_a_run_killed_before_its_first_state_begins_again(expected, tmp_path):
     out, event = tmp_path / "run", 1
     while not (out / "unfinished" / "run.json").exists():
         shutil.rmtree(out, ignore_errors=True)
@@ -388,7 +276,7 @@ def test_a_run_killed_before_its_first_state_begins_again(expected: Whole, tmp_p
     assert "no checkpoint yet" in expected.assert_finishes(out, "--resume").said
 
 
-def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(expected: Whole, source: Path, killed: Path) -> None:
+def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(expected, source, killed):
     ended = expected.again(killed)
     assert ended.status == 1
     assert "holds an unfinished run or merge; replace it with --overwrite" in ended.said
@@ -402,9 +290,7 @@ def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(expected: Whole,
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", [0.5, 0.9])
-def test_what_a_killed_overwrite_was_to_replace_is_given_back(
-    expected: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture, part: float
-) -> None:
+def test_what_a_killed_overwrite_was_to_replace_is_given_back(expected, tmp_path, caplog, part):
     """Killed on its way, and among its final results."""
     out = tmp_path / "run"
     expected.again(out, "--stop", "6")
@@ -423,7 +309,7 @@ def test_what_a_killed_overwrite_was_to_replace_is_given_back(
     expected.assert_finishes(out, "--resume")
 
 
-def test_a_finished_run_is_left_as_it_is(expected: Whole) -> None:
+def test_a_finished_run_is_left_as_it_is(expected):
     before = contents(expected.out)
     ended = expected.again(expected.out, "--resume")
     assert ended.status == expected.ended.status
@@ -434,7 +320,7 @@ def test_a_finished_run_is_left_as_it_is(expected: Whole) -> None:
     assert contents(expected.out) == before
 
 
-def test_there_must_be_something_to_resume(run: Run, source: Path, tmp_path: Path) -> None:
+def test_there_must_be_something_to_resume(run, source, tmp_path):
     ended = run(source, tmp_path / "run", "--resume")
     assert ended.status == 1
     assert "holds no run to resume" in ended.said
@@ -443,7 +329,7 @@ def test_there_must_be_something_to_resume(run: Run, source: Path, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_a_rerun_recording_goes_on_in_a_new_file(expected: Whole, killed: Path) -> None:
+def test_a_rerun_recording_goes_on_in_a_new_file(expected, killed):
     ended = expected.again(killed, "--resume", "--rerun", "save")
     assert ended.status == expected.ended.status
     assert "warning: recording.rrd holds the scans from" in ended.said

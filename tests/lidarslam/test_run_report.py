@@ -33,7 +33,7 @@ def figures(html: str) -> list[str]:
     return re.findall(r"<figcaption><b>Figure \d+\. (.*?)\.</b>", html)
 
 
-def test_a_run_leaves_a_page_with_its_picture_its_errors_and_what_was_changed(whole_run: Path) -> None:
+def test_a_run_leaves_a_page_with_its_picture_its_errors_and_what_was_changed(whole_run):
     assert there(whole_run) == list(PAGE)
     for name in PAGE[1:]:
         pixels = np.asarray(o3d.io.read_image(str(whole_run / name)))
@@ -51,10 +51,9 @@ def test_a_run_leaves_a_page_with_its_picture_its_errors_and_what_was_changed(wh
     assert f"{metrics['trajectory']['ate_rmse_m']:.3f}" in text
 
 
-def test_the_page_runs_its_own_scripts_alone_and_fetches_nothing(whole_run: Path) -> None:
+def test_the_page_runs_its_own_scripts_alone_and_fetches_nothing(whole_run):
     html = (whole_run / "report.html").read_text()
     allowed = re.search(r"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src([^\"]*)", html)
-    assert allowed is not None
     scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
     hashes = {f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts}
     assert set(allowed[1].split()) == hashes
@@ -62,14 +61,12 @@ def test_the_page_runs_its_own_scripts_alone_and_fetches_nothing(whole_run: Path
     assert not re.findall(r"(?:src|href)=\"(?!data:|#)", outside)
 
 
-def test_a_run_can_do_without_and_takes_an_earlier_page_away(finished_run: Path, small_recording: Path) -> None:
+def test_a_run_can_do_without_and_takes_an_earlier_page_away(finished_run, small_recording):
     succeeds("run", small_recording, "--out", finished_run, *FAST, "--no-report", "--overwrite")
     assert there(finished_run) == []
 
 
-def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(
-    finished_run: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(finished_run, caplog):
     (finished_run / "report.html").unlink()
     (finished_run / "report.html").mkdir()
     succeeds("evaluate", finished_run)
@@ -78,7 +75,7 @@ def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(
     assert json.loads((finished_run / "metrics.json").read_text())["trajectory"] is not None
 
 
-def test_an_interruption_ends_the_drawing_alone(finished_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_ends_the_drawing_alone(finished_run, monkeypatch):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -86,7 +83,7 @@ def test_an_interruption_ends_the_drawing_alone(finished_run: Path, monkeypatch:
     assert leave_report(finished_run, NO_ERRORS) is False
 
 
-def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path) -> None:
+def test_evaluate_draws_the_page_again_with_the_errors(finished_run):
     (finished_run / "report.html").unlink()
     for option in ("--no-report", f"--out={finished_run.parent / 'elsewhere.json'}"):
         succeeds("evaluate", finished_run, option)
@@ -96,7 +93,7 @@ def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path) -> No
     assert {"Absolute errors", "Error components", "Map errors"} <= set(shown)
 
 
-def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_map(finished_run: Path) -> None:
+def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_map(finished_run):
     for name in ("map.ply", *PAGE):
         (finished_run / name).unlink()
     title, *rows = (finished_run / "scans.csv").read_text().splitlines()
@@ -114,7 +111,7 @@ def test_bands_show_where_tracking_was_degraded_and_lost_and_a_run_may_have_no_m
     np.testing.assert_allclose([[band["x0"], band["x1"]] for band in bands], [[0.1, 0.3], [0.4, 0.5]], atol=1e-6)
 
 
-def test_the_status_of_a_run_of_which_much_is_unconstrained_is_not_ok(finished_run: Path) -> None:
+def test_the_status_of_a_run_of_which_much_is_unconstrained_is_not_ok(finished_run):
     summary = json.loads((finished_run / "summary.json").read_text())
     (finished_run / "summary.json").write_text(json.dumps(summary | {"unconstrained_m": 0.9 * summary["length_m"] + 1}))
     assert leave_report(finished_run, NO_ERRORS)
@@ -123,7 +120,7 @@ def test_the_status_of_a_run_of_which_much_is_unconstrained_is_not_ok(finished_r
     assert "of its path are hardly constrained" in html
 
 
-def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path: Path, whole_run: Path) -> None:
+def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path, whole_run):
     methods = {"a": {"run": "room/a"}, "b": {"run": "room/b"}, "failed": {"run": None}}
     for name in "ab":
         shutil.copytree(whole_run, tmp_path / "room" / name)
@@ -146,7 +143,7 @@ def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path: Path, whol
         ("no json", "not a comparison"),
     ],
 )
-def test_a_comparison_that_cannot_be_drawn_says_why(tmp_path: Path, content: str, message: str) -> None:
+def test_a_comparison_that_cannot_be_drawn_says_why(tmp_path, content, message):
     (tmp_path / "comparison.json").write_text(content)
     with pytest.raises(InputError, match=message):
         run_directories(tmp_path)

@@ -1,14 +1,20 @@
-"""The log of a run: its table, its trajectories, its state, and its summary."""
+"""What is kept and said of a run: its log, its summary, what it was made with, and its progress bar."""
 
+import io
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lidarslam.compare import comparison as described
+from lidarslam.compare.comparison import versions
 from lidarslam.core.geometry import exp
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
+from lidarslam.run.progress import show_progress
 from lidarslam.run.results import format_times
 from lidarslam.run.summary import Milliseconds, ScanLog, SlowestScan, WrittenMap, summarise
 
@@ -35,14 +41,14 @@ def log() -> ScanLog:
     return log
 
 
-def test_the_table_has_a_row_a_scan(log: ScanLog) -> None:
+def test_the_table_has_a_row_a_scan(log):
     assert log.format_csv().splitlines()[1:] == [
         "0,1.000000000,ok,100,1,90,0.0123,,,0.001,0.002,0.003,0.01,0.02,1,1,1.23,0.00,0.00,0.00,0.00,2.00,",
         '1,2.500000000,lost,100,1,90,,,x yaw,,,,,,,1,1.23,0.00,0.00,0.00,0.00,2.00,"no points, none"',
     ]
 
 
-def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps_are_short() -> None:
+def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps_are_short():
     log = ScanLog()
     for stamp, total_ms in enumerate([0.0, 0.0, 0.0, 0.0, 400.0]):
         log.add(result(float(stamp), stage_ms={"odometry": 30.0, "refine": 50.0}), total_ms)
@@ -58,21 +64,21 @@ def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps
     assert json["slowest_scan"] == {"scan": 1, "stage": "refine", "ms": 50.0}
 
 
-def test_the_slowest_stage_is_not_that_of_the_first_scan_which_loads_loops() -> None:
+def test_the_slowest_stage_is_not_that_of_the_first_scan_which_loads_loops():
     stage_ms = np.full((4, len(STAGES)), 2.0)
     stage_ms[0], stage_ms[2, STAGES.index("refine")] = 900.0, 77.0
     assert SlowestScan.of(stage_ms) == SlowestScan(2, "refine", 77.0)
     assert SlowestScan.of(stage_ms[:1]) is None
 
 
-def test_a_warning_is_kept_once_and_a_correction_leaves_the_odometry(log: ScanLog) -> None:
+def test_a_warning_is_kept_once_and_a_correction_leaves_the_odometry(log):
     assert log.warnings == ["twice"]
     log.correct(np.tile(np.eye(4), (2, 1, 1)))
     np.testing.assert_array_equal(log.trajectory.positions, np.zeros((2, 3)))
     np.testing.assert_array_equal(log.odometry.T_world_lidar[1], exp(np.full(6, 0.5)))
 
 
-def test_a_restored_log_goes_on_alike(log: ScanLog) -> None:
+def test_a_restored_log_goes_on_alike(log):
     restored = ScanLog()
     restored.restore(Saved(log.state()))
     for one in (log, restored):
@@ -81,21 +87,15 @@ def test_a_restored_log_goes_on_alike(log: ScanLog) -> None:
     np.testing.assert_array_equal(restored.trajectory.T_world_lidar, log.trajectory.T_world_lidar)
 
 
-def corridor_log(open_scans: int) -> ScanLog:
+@pytest.mark.parametrize(("open_scans", "unknown"), [(0, False), (1, False), (4, True)])
+def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(open_scans, unknown):
     """Eleven scans a metre apart along x, the last of which hardly constrain it."""
     log = ScanLog()
     for scan in range(11):
         pose = exp([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]) @ exp([0.0, 0.0, 0.0, float(scan), 0.0, 0.0])
         degenerate = ("roll", "x") if scan > 10 - open_scans else ("yaw", "z")
         log.add(result(0.1 * scan, T_world_lidar=pose, degenerate=degenerate))
-    return log
-
-
-@pytest.mark.parametrize(("open_scans", "unknown"), [(0, False), (1, False), (4, True)])
-def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(
-    open_scans: int, unknown: bool
-) -> None:
-    summary = summarise(corridor_log(open_scans), WrittenMap(0, None, 0), skipped=0)
+    summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
     assert summary.to_json()["unconstrained_m"] == pytest.approx(open_scans, abs=1e-9)
     assert summary.went_astray == unknown
     assert any("is uncertain by" in warning for warning in summary.warnings) == unknown
@@ -104,9 +104,7 @@ def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_su
 @pytest.mark.parametrize(("interval_s", "status", "unknown"), [
     (0.5, Status.DEGRADED, True), (0.5, Status.OK, False), (0.05, Status.DEGRADED, False),
 ])  # fmt: skip
-def test_the_length_is_unknown_where_the_first_motion_of_a_slow_recording_is_degraded(
-    interval_s: float, status: Status, unknown: bool
-) -> None:
+def test_the_length_is_unknown_where_the_first_motion_of_a_slow_recording_is_degraded(interval_s, status, unknown):
     log = ScanLog()
     for scan in range(8):
         log.add(result(interval_s * scan, status=status if scan == 1 else Status.OK))
@@ -114,10 +112,48 @@ def test_the_length_is_unknown_where_the_first_motion_of_a_slow_recording_is_deg
 
 
 @pytest.mark.parametrize(("second_m", "unknown"), [(0.1, True), (1.7, False)])
-def test_a_first_motion_counts_as_unknown_where_no_vehicle_accelerates_to_the_second(
-    second_m: float, unknown: bool
-) -> None:
+def test_a_first_motion_counts_as_unknown_where_no_vehicle_accelerates_to_the_second(second_m, unknown):
     log = ScanLog()
     for scan, x_m in enumerate(np.cumsum([0.0, 2.0, second_m, 0.1, 0.1, 0.1])):
         log.add(result(0.3 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])))
     assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
+
+
+def test_the_programs_that_results_depend_on_are_named():
+    found = versions()
+    assert {"lidarslam", "kiss-icp", "numpy", "onnxruntime", "python"} <= set(found)
+    assert {"open3d", "open3d-cpu"} & set(found)
+    assert all(found.values())
+
+
+def _git(folder: Path, *arguments: str) -> None:
+    names = ("-c", "user.name=n", "-c", "user.email=e@example.org")
+    subprocess.run(["git", "-C", str(folder), *names, *arguments], check=True, capture_output=True)
+
+
+def test_a_checkout_has_a_commit_and_says_that_files_differ(tmp_path, monkeypatch):
+    monkeypatch.setattr(described, "__file__", str(tmp_path / "lidarslam" / "compare" / "comparison.py"))
+    assert "commit" not in versions()
+    _git(tmp_path, "init")
+    (tmp_path / "a").write_text("1")
+    _git(tmp_path, "add", "a")
+    _git(tmp_path, "commit", "-m", "first", "--no-verify")
+    commit = versions()["commit"]
+    assert len(commit) == 12
+    (tmp_path / "a").write_text("2")
+    assert versions()["commit"] == f"{commit}-dirty"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_before_the_first_scan_the_bar_says_what_goes_on(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with show_progress("a[red]b[/nothing]") as progress:
+        progress.phase("compiling loops")
+    assert "compiling loops" in terminal.getvalue()
+    assert "a[red]b[/nothing]" in terminal.getvalue()

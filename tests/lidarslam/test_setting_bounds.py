@@ -14,7 +14,7 @@ from lidarslam.config.settings import Config, bounds_of, bounds_text, load_confi
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory, read_tum
+from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.train.settings import TrainConfig
 
@@ -51,14 +51,14 @@ VECTORS = ("odometry.imu_rotation_deg", "odometry.imu_position_m", "reader.mount
 MAY_EMPTY = ("global_map.max_range_m",)
 
 
-def test_there_are_few_settings_and_each_is_described() -> None:
+def test_there_are_few_settings_and_each_is_described():
     assert len(SETTINGS) <= 60
     assert [name for name, field in SETTINGS.items() if not field.description] == []
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("value", ["true", "off"])
-def test_a_number_is_neither_true_nor_false(name: str, value: str) -> None:
+def test_a_number_is_neither_true_nor_false(name, value):
     if value in map(str, get_args(NUMBERS[name].annotation)):
         pytest.skip("off is one of its values")
     with pytest.raises(ConfigError, match=f"{name}.*: (expected|input should be)"):
@@ -74,7 +74,7 @@ def kinds(annotation: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_value_beyond_the_declared_bounds_is_refused_with_them(name: str) -> None:
+def test_a_value_beyond_the_declared_bounds_is_refused_with_them(name):
     field = SETTINGS[name]
     bounds = bounds_of(field)
     if bounds is None:
@@ -107,9 +107,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "bound"), EXTREMES, ids=lambda value: f"{value}")
-def test_at_its_bounds_a_run_is_right_or_says_that_it_is_not(
-    tmp_path: Path, recording: Path, room: Any, room_truth: Trajectory, name: str, bound: float
-) -> None:
+def test_at_its_bounds_a_run_is_right_or_says_that_it_is_not(tmp_path, recording, room, room_truth, name, bound):
     settings = ["odometry.method=constant-velocity", *needed(name, bound), f"{name}={text_of(name, bound)}"]
     words = [word for setting in settings for word in ("--set", setting)]
     result = lidarslam("run", recording, "--out", tmp_path / "run", "--no-report", *words)
@@ -136,7 +134,7 @@ def test_at_its_bounds_a_run_is_right_or_says_that_it_is_not(
     assert len(points) > (4 if edge_m > 1.0 else 100)
 
 
-def test_every_number_of_a_training_has_bounds() -> None:
+def test_every_number_of_a_training_has_bounds():
     numbers = {name: field for name, field in settings_of(TrainConfig) if {int, float} & set(kinds(field.annotation))}
     assert len(numbers) > 10
     assert [name for name, field in numbers.items() if bounds_of(field) is None] == []

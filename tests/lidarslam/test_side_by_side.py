@@ -3,9 +3,7 @@ a cluster that loses a node.
 """
 
 import contextlib
-import json
 import os
-import re
 import signal
 import sys
 import threading
@@ -26,16 +24,16 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tasks import SERIAL, Where
 from lidarslam.merge import merge as tracking
 from lidarslam.merge.merge import MergeOutcome, MergeRequest, merge
-from lidarslam.run.run import Progress
 
 from ..conftest import lidarslam
-from .conftest import Told
+from .conftest import Told, quiet
 
 pytest.importorskip("ray")
 
+Files = Callable[..., dict[str, Any]]
 METHODS = "constant-velocity+map,learned+map,prior"
-# The files of a run that hold times, or the memory that was taken.
-TIMED = {"summary.json", "scans.csv", "process.json", "process.log"}
+# The files of a comparison that hold times, or the memory that was taken, throughout.
+TIMED = ("process.json", "process.log", "report.html", "report.md")
 
 
 def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str, **changes: Any) -> CompareOutcome:
@@ -44,29 +42,12 @@ def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str
     return compare(request, told.narrator, *((command,) if command else ()))
 
 
-def _contents(out: Path) -> dict[str, Any]:
-    """Every file of a comparison, times apart."""
-    files: dict[str, Any] = {}
-    for path in (path for path in sorted(out.rglob("*")) if path.is_file()):
-        name = str(path.relative_to(out))
-        files[name] = None if path.name in TIMED or path.name.startswith("report") else path.read_bytes()
-    content = json.loads((out / "comparison.json").read_text())
-    for method in content["methods"].values():
-        for key in [key for key in method if "ms" in key.split("_") or key in ("peak_rss_mb", "wall_s")]:
-            method.pop(key)
-    files["comparison.json"] = content
-    rows = [row.split(",") for row in (out / "room" / "learned+map" / "scans.csv").read_text().splitlines()]
-    timed = [column for column, title in enumerate(rows[0]) if re.search(r"(^|_)ms($|_)", title)]
-    files["rows"] = [[cell for column, cell in enumerate(row) if column not in timed] for row in rows]
-    return files
-
-
 @pytest.fixture(scope="module")
-def serial(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def serial(small_recording: Path, tmp_path_factory: pytest.TempPathFactory, timeless: Files) -> dict[str, Any]:
     """The comparison of one method after another."""
     out = tmp_path_factory.mktemp("compared") / "serial"
     _compare(small_recording, out, SERIAL, Told())
-    return _contents(out)
+    return timeless(out, *TIMED)
 
 
 def _wait_for(condition: Any, seconds: float = 60.0) -> None:
@@ -92,22 +73,20 @@ def _two_nodes(doomed: Callable[[list[Any]], Any]) -> Iterator[Where]:
 
 
 @pytest.mark.slow
-def test_side_by_side_is_the_same_as_one_after_another(
-    small_recording: Path, tmp_path: Path, serial: dict[str, Any], told: Told
-) -> None:
+def test_side_by_side_is_the_same_as_one_after_another(small_recording, tmp_path, serial, timeless, told):
     _compare(small_recording, tmp_path / "out", Where(2), told)
-    assert _contents(tmp_path / "out") == serial
+    assert timeless(tmp_path / "out", *TIMED) == serial
     assert told.counts[-1][1:] == (18, 18)
     assert len(told.lines) == 3
     again = Told()
     none = (sys.executable, "-c", "raise SystemExit('was run again')")
     _compare(small_recording, tmp_path / "out", Where(2), again, *none, reuse=True)
     assert all("in an earlier comparison" in line for line in again.lines)
-    assert _contents(tmp_path / "out") == serial
+    assert timeless(tmp_path / "out", *TIMED) == serial
 
 
 @pytest.mark.slow
-def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
+def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path):
     for jobs in ("1", "2"):
         out = tmp_path / jobs / "walk"
         command = ["simulate", "--out", str(out), "--scans", "23", "--format", "ply", "--jobs", jobs]
@@ -123,13 +102,6 @@ def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
 
 MERGED = ["global_map.voxel_size_m=0.2", "odometry.method=constant-velocity", "checkpoints.every_scans=1"]
 TIMES = 4  # that the room is crossed, so that a recording takes some seconds
-Files = Callable[[Path], dict[str, Any]]
-
-
-@contextmanager
-def quiet(_name: str) -> Iterator[Progress]:
-    """No progress bar."""
-    yield lambda _number, _total, _result: None
 
 
 def _merge(sources: list[Path], out: Path, where: Where, resume: bool = False) -> MergeOutcome:
@@ -159,9 +131,7 @@ def serial_merge(crossings: list[Path], tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.mark.long
-def test_a_node_that_dies_costs_a_merge_only_its_recordings(
-    crossings: list[Path], tmp_path: Path, serial_merge: dict[str, Any], timeless: Files
-) -> None:
+def test_a_node_that_dies_costs_a_merge_only_its_recordings(crossings, tmp_path, serial_merge, timeless):
     """One of the nodes is killed in the middle of a recording, after a checkpoint."""
     out = tmp_path / "out"
 
@@ -189,9 +159,7 @@ def _has_submaps_open(node: Any) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(
-    crossings: list[Path], tmp_path: Path, serial_merge: dict[str, Any], timeless: Files
-) -> None:
+def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(crossings, tmp_path, serial_merge, timeless):
     out, whole = tmp_path / "out", TIMES * 20
 
     def interrupt() -> None:
@@ -208,7 +176,7 @@ def test_ctrl_c_ends_all_recordings_of_a_merge_and_resume_goes_on(
     assert timeless(out) == serial_merge
 
 
-def test_a_directory_that_other_machines_do_not_have_is_said(crossings: list[Path], tmp_path: Path) -> None:
+def test_a_directory_that_other_machines_do_not_have_is_said(crossings, tmp_path):
     config = load_config(None, MERGED)
     request = tracking.RunRequest(crossings[0], tmp_path / "out" / "01_crossing", config)
     with pytest.raises(OutputError, match="not shared by the nodes"):

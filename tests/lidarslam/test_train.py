@@ -1,4 +1,4 @@
-"""Training from a folder of scans to weights: the same seed, the same weights, however often it is interrupted."""
+"""Training from scans to weights: the same seed, the same weights, however often it is interrupted; what teaches."""
 
 import csv
 import pickle
@@ -18,16 +18,19 @@ import pytest
 import torch
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.geometry import inverse, log
 from lidarslam.core.scan import Scan
-from lidarslam.odometry.config import SimulatedConfig
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.odometry.config import ImageConfig, SimulatedConfig
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.training.losses import validate
 from lidarslam.odometry.training.pairs import AUGMENTATION, Pairs
-from lidarslam.odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.training.preparation import PreparedRecording, prepare
 from lidarslam.simulation.mixture import ingredients_of
+from lidarslam.simulation.record import RecordRequest, make_simulation
 from lidarslam.train import data as training_data
-from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
+from lidarslam.train.data import MapTeacher, Stretch, draw_weights, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
 from lidarslam.train.settings import load_train_config
 from lidarslam.train.train import TrainRequest, execute
@@ -288,25 +291,6 @@ def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     assert load_checkpoint(out / "weights.safetensors").images.columns == 96
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ((), "there is nothing to train on; name a SOURCE"),
-        (("--set", "training.geometric.robus=1"), "there is no training.geometric.robus; did you mean robust?"),
-        (("--resume",), "holds no training to go on with"),
-        (("--resume", "--overwrite"), "choose one"),
-        (("--resume", "--from", "shipped"), "leave --from out"),
-        (("--from", "nowhere.safetensors"), "nowhere.safetensors: no such file"),
-    ],
-)
-def test_mistakes_are_told_in_one_line(arguments, told, tmp_path):
-    result = lidarslam("train", *arguments, "--out", tmp_path / "out")
-    assert result.exit_code == 1
-    assert told in result.output
-    assert len(result.output.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_other_recordings_or_files_are_not_gone_on_with(room_folder, tmp_path, ready):
     out = tmp_path / "out"
     execute(request(room_folder, out, ready, "training.steps=1"), print)
@@ -349,3 +333,65 @@ def test_a_short_recording_is_learnt_by_heart(room_folder, tmp_path, ready, monk
     after = validate(network_of(trained), recording)
     assert after.rotation_rms_deg < 0.5 * before.rotation_rms_deg
     assert after.translation_rms_m < 0.8 * before.translation_rms_m  # 7 cm before, of cells of 50 cm
+
+
+SCANS = 14
+
+
+@pytest.fixture(scope="module")
+def at_speed() -> tuple[list[Scan], Trajectory]:
+    """A car that is at speed from the first scan on, half a metre from scan to scan."""
+    request = RecordRequest(Path(), "street", "vlp-16", "car-fast", "upright", SCANS, 5, "", speed_mps=6.0)
+    simulation = make_simulation(request)
+    return list(simulation.scans()), simulation.ground_truth
+
+
+@pytest.mark.long
+def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(at_speed):
+    scans, truth = at_speed
+    teacher = MapTeacher()
+    for scan in scans:
+        teacher.follow(scan)
+    taught = teacher.relabelled(prepare(iter(scans), ImageConfig()))
+    middles = np.array([scan.stamp + scan.middle_offset_s for scan in scans[:-1]])
+    poses = truth.at(middles, 0.1)
+    expected = inverse(poses[:-1]) @ poses[1:]
+    sure = taught.valid.numpy()[: SCANS - 2]
+    assert sure.mean() > 0.7
+    errors = log(inverse(taught.T_prev_curr.double().numpy()[: SCANS - 2]) @ expected)[sure]
+    assert np.linalg.norm(errors[:, 3:], axis=1).max() < 0.05
+    assert np.rad2deg(np.linalg.norm(errors[:, :3], axis=1)).max() < 0.3
+    assert np.linalg.norm(expected[:, :3, 3], axis=1).min() > 0.4
+
+
+def test_what_is_not_sure_is_not_taught(at_speed):
+    scans, _ = at_speed
+    teacher = MapTeacher()
+    strange = [*scans[:5], Scan(scans[5].points[:40], scans[5].stamp), *scans[6:9]]
+    for scan in strange:
+        teacher.follow(scan)
+    taught = teacher.relabelled(prepare(iter(strange), ImageConfig()))
+    assert taught.valid.dtype == torch.bool
+    assert not taught.valid[4]
+    assert not taught.valid[5]
+
+
+def stretch(scans: int, simulated: bool) -> Stretch:
+    identity = {"simulated": 1} if simulated else {"source": "somewhere"}
+    return Stretch("some", identity, lambda: pytest.fail("opened"), 0, scans)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "simulated", "weights"),
+    [
+        ([100, 300], [40, 40, 40], [0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3]),
+        ([1200], [40], [0.1, 0.1, 0.1, 0.7]),
+        ([10, 400], [], [1.0, 1.0]),
+        ([], [10, 400], [1.0, 1.0]),
+    ],
+)
+def test_recordings_have_their_share_of_the_pairs_by_their_lengths_and_long_ones_are_drawn_in_pieces(
+    recorded, simulated, weights
+):
+    given = [*(stretch(scans, False) for scans in recorded), *(stretch(scans, True) for scans in simulated)]
+    assert draw_weights(given) == pytest.approx(weights)

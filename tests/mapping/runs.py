@@ -53,8 +53,9 @@ def errors(found: FloatArray, true: FloatArray) -> tuple[FloatArray, FloatArray]
     return np.linalg.norm(off[..., :3, 3], axis=-1), np.rad2deg(rotation_angle(off))
 
 
-def assert_near(found: FloatArray, true: FloatArray, metres: float, degrees: float) -> None:
-    """No pose (4, 4) or (N, 4, 4) is off by more."""
+def assert_near(found: FloatArray, true: FloatArray, metres: float, degrees: float | None = None) -> None:
+    """No pose (4, 4) or (N, 4, 4) is off by more, by default as many radians as metres."""
+    assert np.shape(found) == np.shape(true) or np.ndim(true) == 2
     off_m, off_deg = errors(found, true)
     assert np.max(off_m) < metres
-    assert np.max(off_deg) < degrees
+    assert np.max(off_deg) < (np.rad2deg(metres) if degrees is None else degrees)

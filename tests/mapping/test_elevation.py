@@ -13,7 +13,7 @@ from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.elevation import ElevationBias, ElevationEstimator, PlacedPoints, combined, estimate_bias
 from lidarslam.mapping.motion.prediction import MotionState
-from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
+from lidarslam.mapping.registration.sampled_scan import Sampler
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 EDGE_M, SCANS, STEP_M, NOISE_M = 0.8, 10, 1.5, 0.02
@@ -72,19 +72,10 @@ def test_of_stretches_what_is_systematic_does_not_average_out_and_contradictions
     assert (apart.angle, apart.scatter) == pytest.approx((0.0, 0.005))
 
 
-def registered(T: FloatArray, status: Status = Status.OK) -> MappedScan:
-    return MappedScan(MotionState(0.0, T, np.zeros(6), np.eye(12)), T, status is not Status.LOST, status)
-
-
-@pytest.fixture(scope="module")
-def sampled(street: Any) -> list[SampledScan]:
-    sampler = Sampler(MappingConfig())
-    scans = [Scan(scan_at(street, number, T, TRUE_DEG), 0.1 * number) for number, T in enumerate(poses())]
-    return [sampler.sample(scan) for scan in scans]
-
-
-def test_a_stretch_ends_where_tracking_does(sampled):
-    estimator = ElevationEstimator()
-    for number, (scan, T) in enumerate(zip(sampled, poses(), strict=True)):
-        estimator.add(scan, registered(T, Status.LOST if number % 3 == 2 else Status.OK))
+def test_a_stretch_ends_where_tracking_does(street):
+    estimator, sampler = ElevationEstimator(), Sampler(MappingConfig())
+    for number, T in enumerate(poses()):
+        scan = sampler.sample(Scan(scan_at(street, number, T, TRUE_DEG), 0.1 * number))
+        state, status = MotionState(0.0, T, np.zeros(6), np.eye(12)), Status.LOST if number % 3 == 2 else Status.OK
+        estimator.add(scan, MappedScan(state, T, status is not Status.LOST, status))
     assert estimator.bias() is None

@@ -1,14 +1,20 @@
-"""How well scans at known poses lie on a box, and what is made of it."""
+"""How well scans at known poses lie on a box, and what tracking makes of it."""
+
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
+from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.fit import Fit, directional_support, translation_information
+from lidarslam.mapping.tracking.fit import NO_FIT, Fit, directional_support, translation_information
+from lidarslam.mapping.tracking.mapped_scan import Attempt
 from lidarslam.mapping.tracking.scan_matcher import measure_fit
+from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER, TrackingState
 
 from .shapes import across_x, on_sides, surfel_map_of
 
@@ -75,27 +81,29 @@ def test_a_scan_far_from_everything_does_not_meet_the_map(box_map, scan_points):
     assert "0 % of the scan overlaps the map" in fit.explain(CONFIG)
 
 
-@pytest.mark.parametrize(
-    ("inlier_ratio", "status"),
-    [(1.0, Status.OK), (0.6, Status.OK), (0.59, Status.DEGRADED), (0.45, Status.DEGRADED), (0.44, Status.LOST)],
-)
-def test_the_share_of_inliers_decides_on_the_status(inlier_ratio, status):
+HELD_IN_YOUNG_MAP = {"is_young": True, "is_held": True}
+
+
+@pytest.mark.parametrize(("fit", "circumstances", "status", "told"), [
+    (Fit(1_000, 0.9, 0.01, 1.0), {}, Status.OK, ""),
+    (Fit(1_000, 0.9, 0.01, 0.6), {}, Status.OK, ""),
+    (Fit(1_000, 0.9, 0.01, 0.59), {}, Status.DEGRADED, "fits the map"),
+    (Fit(1_000, 0.9, 0.01, 0.45), {}, Status.DEGRADED, "fits the map"),
+    (Fit(1_000, 0.9, 0.01, 0.44), {}, Status.LOST, "fits the map"),
+    (Fit(1_000, 0.9, 0.01, 0.95, 0.7), {}, Status.OK, ""),
+    (Fit(1_000, 0.9, 0.01, 0.95, 0.45), {}, Status.DEGRADED, "slide"),
+    (Fit(1_000, 0.9, 0.01, 0.95, 0.2), {}, Status.LOST, "slide"),
+    (Fit(50, 0.05, 0.001, 1.0), {}, Status.LOST, "5 %"),
+    (Fit(50, 0.05, 0.001, 1.0), HELD_IN_YOUNG_MAP, Status.LOST, "5 %"),
+    (Fit(1_000, 0.9, 0.01, 0.3, 0.2), HELD_IN_YOUNG_MAP, Status.DEGRADED, ""),
+    (Fit(1_000, 0.9, 0.01, 0.3, 0.2), {"is_young": True}, Status.LOST, ""),
+    (Fit(1_000, 0.9, 0.01, 0.3, 0.2), {"is_held": True}, Status.LOST, ""),
+])  # fmt: skip
+def test_overlap_inliers_and_support_decide_on_the_status(fit, circumstances, status, told):
     config = TrackingConfig(degraded_below=0.6, lost_below=0.45)
-    assert Fit(1_000, 0.9, 0.01, inlier_ratio).status(config) is status
-
-
-def test_in_a_young_map_a_scan_that_is_held_is_degraded_at_worst():
-    poor = Fit(1_000, 0.9, 0.01, 0.3, support=0.2)
-    assert poor.status(CONFIG, is_young=True, is_held=True) is Status.DEGRADED
-    assert poor.status(CONFIG, is_young=True) is Status.LOST
-    assert poor.status(CONFIG, is_held=True) is Status.LOST
-
-
-@pytest.mark.parametrize("is_young", [False, True])
-def test_a_scan_that_hardly_meets_the_map_is_lost_however_it_fits(is_young):
-    hardly = Fit(50, 0.05, 0.001, 1.0)
-    assert hardly.status(CONFIG, is_young=is_young, is_held=is_young) is Status.LOST
-    assert "5 %" in hardly.explain(CONFIG)
+    assert fit.status(config, **circumstances) is status
+    assert told in fit.explain(config)
+    assert (fit.explain(config) == "") == (fit.status(config) is Status.OK)
 
 
 def test_far_points_may_lie_farther_from_their_surface(rng):
@@ -134,8 +142,75 @@ def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supporte
     assert support_of(tunnel, np.full(len(tunnel), 0.1)) > 0.98
 
 
-@pytest.mark.parametrize(("support", "status"), [(0.7, Status.OK), (0.45, Status.DEGRADED), (0.2, Status.LOST)])
-def test_a_scan_that_may_slide_is_not_ok_however_much_of_it_lies_on_the_map(support, status):
-    fit = Fit(1_000, 0.9, 0.01, 0.95, support)
-    assert fit.status(CONFIG) is status
-    assert ("slide" in fit.explain(CONFIG)) == (status is not Status.OK)
+FOUND = TrackingState().registered(Status.OK, True, 0.8, 5.0)
+
+
+def registered(state: TrackingState, scans: int, status: Status, quality: float = 0.8, every_s: float = 0.0) -> Any:
+    """The state after so many scans more, from 5 s on."""
+    for number in range(1, scans + 1):
+        state = state.registered(status, False, quality, 5.0 + number * every_s)
+    return state
+
+
+def test_the_pose_is_uncertain_after_a_gap_and_after_a_lost_scan_until_one_is_registered():
+    assert not TrackingState().is_uncertain(0.1)
+    assert TrackingState().is_uncertain(1.5)
+    lost = TrackingState().lost(has_points=True)
+    assert lost.is_uncertain(0.1)
+    assert not registered(lost, 1, Status.OK).is_uncertain(0.1)
+
+
+def test_the_map_is_given_up_after_so_many_lost_scans_unless_they_saw_nothing():
+    state = TrackingState()
+    for _ in range(GIVE_UP_AFTER):
+        assert not state.gives_up
+        state = state.lost(has_points=True)
+    assert state.gives_up
+    state = TrackingState()
+    for _ in range(50):
+        state = state.lost(has_points=False)
+    assert not state.gives_up
+    assert state.is_uncertain(0.1)
+
+
+def test_searches_of_the_whole_map_become_rare():
+    state, searches = TrackingState(), []
+    for _ in range(100):
+        searches.append(state.searches_map)
+        state = state.lost(has_points=True)
+    assert searches[0]
+    assert sum(searches[:20]) == 6
+    assert sum(searches[20:]) == 4
+
+
+@pytest.mark.parametrize(("interval_s", "scans"), [(0.1, 10), (0.5, 3)], ids=["a second at 10 Hz", "three at 2 Hz"])
+def test_a_relocalisation_is_confirmed_by_the_next_second_and_three_scans(interval_s, scans):
+    assert registered(FOUND, scans - 1, Status.OK, every_s=interval_s).is_unconfirmed
+    assert not registered(FOUND, scans, Status.OK, every_s=interval_s).is_unconfirmed
+    assert registered(FOUND, 20, Status.DEGRADED, every_s=0.1).is_unconfirmed
+    lost = FOUND.lost(has_points=True)
+    assert lost.is_lost
+    assert not lost.is_unconfirmed
+
+
+def test_a_scan_fits_poorly_beside_what_is_usual():
+    """Which follows a scene that is harder, but not scans that are not believed."""
+    settled = registered(TrackingState(), 30, Status.OK)
+    assert not settled.fits_poorly(Status.OK, 0.75)
+    assert settled.fits_poorly(Status.OK, 0.7)
+    assert settled.fits_poorly(Status.DEGRADED, 0.8)
+    assert registered(settled, 30, Status.DEGRADED, 0.3).fits_poorly(Status.OK, 0.7)
+    assert not registered(settled, 30, Status.OK, 0.6).fits_poorly(Status.OK, 0.6)
+    for new in (TrackingState(), settled.in_new_map()):
+        assert not new.fits_poorly(Status.OK, 0.2)
+
+
+@pytest.mark.parametrize(("since_s", "away_m", "measured", "reachable"), [
+    (0.5, 1.5, False, True), (0.5, 3.0, False, False), (1.5, 30.0, False, True),
+    (0.5, 0.6, True, True), (0.5, 1.5, True, False), (1.5, 1.5, True, False), (3.5, 30.0, True, True),
+])  # fmt: skip
+def test_a_place_is_reachable_within_the_uncertainty_of_the_motion_since(since_s, away_m, measured, reachable):
+    prediction = Prediction(10.0 + since_s, np.eye(4), np.zeros(6), np.eye(12))
+    found = replace(prediction, T_world_lidar=make_transform(np.eye(3), np.array([0.0, 0.0, away_m])))
+    attempt = Attempt(prediction, cast(Any, None), cast(Any, found), NO_FIT, Status.OK, relocalised=True)
+    assert attempt.is_reachable(10.0, motion_is_measured=measured) == reachable

@@ -96,16 +96,6 @@ def test_scans_before_the_place_are_placed_by_the_recordings_own_map(localised):
 
 
 @pytest.mark.long
-def test_another_room_is_refused_with_a_reason(other_room, room_map):
-    localiser = MapLocaliser(MappingConfig(), room_map)
-    mapped = process(localiser, scan_along(other_room))
-    assert not localiser.found
-    assert {one.status for one in mapped} == {Status.LOST}
-    assert localiser.refusals
-    assert all(reason for _, reason in localiser.refusals)
-
-
-@pytest.mark.long
 def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room):
     empty = type(room)(pillars=())  # as it is, and turned by half a turn
     empty_map = draw_map(empty)

@@ -67,15 +67,19 @@ def test_equals_a_dictionary_of_voxels(rng, monkeypatch):
 
 def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng):
     poses = [exp([0.0, 0.0, 0.0, x, 0.0, 0.0]) for x in (0.0, 2.0, 4.0)]  # whole voxels, so that they are cut alike
-    direct, drawn = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
+    direct, drawn, without = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
     for number, (pose, names) in enumerate(zip(poses, ("", "intensity", "intensity rgb ring time"), strict=True)):
-        submap = GlobalMap(VOXEL_M)
+        submap, plain = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
         for half in range(2):
             points = rng.uniform(-3.0, 3.0, (1000, 3))
             known = some(rng, len(points), 2 * number + half, names)
             submap.add(points, np.eye(4), known)
+            plain.add(points, np.eye(4))
             direct.add(points, pose, known)
         drawn.add_means(submap.means(), pose)
+        without.add_means(plain.means(), pose)
+    np.testing.assert_array_equal(drawn.points(), without.points())
+    np.testing.assert_array_equal(drawn.cloud().normals, without.cloud().normals)
     np.testing.assert_allclose(drawn.points(), direct.points(), atol=1e-5)
     np.testing.assert_array_equal(drawn.means().rows[:, COUNT], direct.means().rows[:, COUNT])
     np.testing.assert_allclose(drawn.cloud().normals, direct.cloud().normals, atol=1e-3)

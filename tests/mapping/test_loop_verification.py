@@ -1,4 +1,4 @@
-"""Rooms of boxes, sampled as points, laid on themselves from wrong guesses; corridors and other rooms."""
+"""Closures of known rooms and corridors: laid on one another, registered finely, and in agreement or not."""
 
 from dataclasses import replace
 
@@ -7,6 +7,9 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, transform_points
 from lidarslam.mapping.config import LoopConfig
+from lidarslam.mapping.loops import refinement
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose, Track
+from lidarslam.mapping.loops.refinement import DenseSubmap
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap
 from lidarslam.mapping.loops.verification import SubmapCloud, evaluate, verify
 
@@ -168,3 +171,169 @@ def test_covariance_holds_what_drift_does_within_a_place(room):
     # What lies behind makes up for a submap that is drawn ahead; points are trusted as much either way.
     more = covariance(0.0, 1.0, 1.0) - covariance(0.0, 1.0, -1.0)
     assert more == pytest.approx(np.diag([1e-4 * 4 / 3] * 3 + [4e-4 * 4 / 3] * 3), abs=1e-12)
+
+
+RATES = LoopConfig().drift_rates
+SIGMAS = np.array([0.003] * 3 + [0.03] * 3)
+
+
+def agree(a: RelativePose, b: RelativePose, track: Track) -> bool:
+    """Whether the cycle of two links closes; links of other pairs of segments make none."""
+    cycle = track.close_cycle(a, b)
+    return cycle is not None and cycle[0] < CHI_SQUARED_99
+
+
+@pytest.fixture
+def round_trip() -> Track:
+    """Forty keyframes on a circle of 20 m, twice round, and one of another segment at the end."""
+    angles = np.linspace(0.0, 4.0 * np.pi, 80)
+    R = exp(np.stack([0 * angles, 0 * angles, angles, 0 * angles, 0 * angles, 0 * angles], axis=1))[:, :3, :3]
+    poses = make_transform(R, np.stack([20.0 * np.cos(angles), 20.0 * np.sin(angles), 0 * angles], axis=1))
+    return Track(poses, 20.0 * angles, np.zeros(80, dtype=np.int64), RATES)
+
+
+def link(track: Track, first: int, second: int, off=(0, 0, 0, 0, 0, 0)) -> RelativePose:
+    return RelativePose(first, second, track.between(first, second) @ exp(off), np.diag(SIGMAS**2))
+
+
+def test_true_links_agree_and_a_false_one_does_not(round_trip):
+    a, b = link(round_trip, 3, 43), link(round_trip, 8, 48)
+    false = link(round_trip, 6, 46, (0, 0, 0, 1.5, 0, 0))
+    turned = link(round_trip, 6, 46, (0, 0, np.deg2rad(8.0), 0, 0, 0))
+    assert agree(a, b, round_trip)
+    assert agree(b, a, round_trip)
+    assert not agree(a, false, round_trip)
+    assert not agree(false, b, round_trip)
+    assert not agree(a, turned, round_trip)
+
+
+def test_the_uncertainty_of_a_link_turns_with_it(round_trip):
+    """A link unsure along its own x, which differs by a quarter turn from the other's, excuses an error along it."""
+    quarter = 40 // 4
+    loose = np.diag(np.array([0.003] * 3 + [2.0, 0.03, 0.03]) ** 2)
+    a = RelativePose(3, 43, round_trip.between(3, 43) @ exp([0, 0, 0, 1.5, 0, 0]), loose)
+    across = RelativePose(3, 43, round_trip.between(3, 43) @ exp([0, 0, 0, 0, 1.5, 0]), loose)
+    other = link(round_trip, 3 + quarter, 43 + quarter)
+    near = link(round_trip, 4, 44)
+    assert agree(a, near, round_trip)
+    assert agree(near, a, round_trip)
+    assert not agree(across, near, round_trip)
+    assert agree(a, other, round_trip)
+
+
+def test_longer_ways_excuse_more(round_trip):
+    near, far = link(round_trip, 4, 44), link(round_trip, 30, 70)
+    off = link(round_trip, 3, 43, (0, 0, 0, 0.6, 0, 0))
+    assert not agree(off, near, round_trip)
+    assert agree(off, far, round_trip)
+
+
+def test_between_segments_only_ways_within_them_count(round_trip):
+    """The second is in a world of its own."""
+    segment, poses = np.arange(80) // 40, round_trip.T_world_lidar.copy()
+    poses[40:] = exp([0.0, 0.0, 2.0, 50.0, -9.0, 3.0]) @ poses[40:]
+    two = Track(poses, round_trip.way_m, segment, RATES)
+    assert agree(link(round_trip, 3, 43), link(round_trip, 8, 48), two)
+    assert not agree(link(round_trip, 3, 43), link(round_trip, 8, 48, (0, 0, 0, 0, 2.5, 0)), two)
+    assert not agree(link(two, 3, 23), link(two, 6, 46), two)
+
+
+def test_correction_is_counted_in_drift(round_trip):
+    way = round_trip.way_m[43] - round_trip.way_m[3]
+    assert round_trip.correction_sigmas(link(round_trip, 3, 43)) == pytest.approx(0.0, abs=1e-6)
+    one = link(round_trip, 3, 43, (0, 0, np.deg2rad(2.0) * way / 100.0, 0, 0, 0))
+    assert round_trip.correction_sigmas(one) == pytest.approx(1.0, rel=0.1)
+    assert round_trip.correction_sigmas(link(round_trip, 3, 43, (0, 0, 0, 12.0, 0, 0))) > 3.0
+
+
+def test_drift_grows_with_the_way_and_the_swing(round_trip):
+    rotation, translation = round_trip.drift(np.array([42, 33, 3]), 43)
+    assert (np.diff(rotation) > 0.0).all()
+    assert (np.diff(translation) > 0.0).all()
+    way = round_trip.way_m[43] - round_trip.way_m[3]
+    assert rotation[2] == pytest.approx(np.deg2rad(0.1 + 0.02 * way), rel=1e-6)
+    # The way round a circle lies, root mean square, sqrt(2) radii from a point of it.
+    swing = 0.5 * rotation[2] * np.sqrt(2.0) * 20.0
+    assert translation[2] == pytest.approx(np.hypot(0.02 + 0.01 * way, swing), rel=0.05)
+
+
+T_TARGET_SOURCE = exp([0.01, -0.02, 0.6, 3.0, -1.5, 0.1])
+OFF = exp([0.004, -0.003, 0.006, 0.05, -0.04, 0.03])
+PRIOR = np.diag(np.array([np.deg2rad(0.5)] * 3 + [0.05] * 3) ** 2)
+DRIFT = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
+CELL_M = 0.2
+PILLARS = ((-6.0, 2.0), (-1.0, -3.0), (5.0, 1.0))
+NOISE_M = 0.01
+
+
+def refine(
+    target: DenseSubmap, source: DenseSubmap, T: FloatArray, covariance: FloatArray, drift: FloatArray
+) -> LoopClosure | None:
+    closure = LoopClosure(0, 1, T, covariance, 0.9, 0.01, 0.9, False, 0, "")
+    return refinement.refine(target, source, closure, drift)
+
+
+def planes(rng: np.random.Generator, ends: bool) -> FloatArray:
+    """Points on floor, ceiling and walls of a hall of 20 x 8 x 3 m, and on its ends and some pillars."""
+    hall, pillars = ((0.0, 0.0, 1.5), (10.0, 4.0, 1.5)), [((x, y, 1.5), (0.4, 0.4, 1.5)) for x, y in PILLARS]
+    cloud = on_boxes([hall, *pillars] if ends else [hall], 1.0 / 60.0, rng)
+    if not ends:
+        cloud = cloud[np.abs(cloud[:, 0]) < 10.0]
+    return np.asarray(cloud + rng.normal(scale=NOISE_M, size=cloud.shape))
+
+
+def submaps(ends: bool = True, seed: int = 3) -> tuple[DenseSubmap, DenseSubmap]:
+    """Two of the same hall, each with points of its own, the target at the hall's middle."""
+    rng = np.random.default_rng(seed)
+    target = DenseSubmap.join([(np.eye(4), planes(rng, ends))], 60.0, CELL_M)
+    source = transform_points(inverse(T_TARGET_SOURCE), planes(rng, ends))
+    return target, DenseSubmap.join([(np.eye(4), source)], 60.0, CELL_M)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_pose_that_is_centimetres_off_comes_to_within_millimetres_and_its_covariance(seed):
+    refined = refine(*submaps(seed=seed), T_TARGET_SOURCE @ OFF, PRIOR, DRIFT)
+    assert_near(refined.T_first_second, T_TARGET_SOURCE, 0.003, 0.03)
+    xi = log(inverse(refined.T_first_second) @ T_TARGET_SOURCE)
+    assert xi @ np.linalg.solve(refined.covariance, xi) < 16.8
+    assert (np.diag(refined.covariance) < 0.1 * np.diag(PRIOR)).all()
+
+
+def test_neither_side_is_preferred():
+    target, source = submaps()
+    there = refine(target, source, T_TARGET_SOURCE @ OFF, PRIOR, DRIFT)
+    back = refine(source, target, inverse(T_TARGET_SOURCE @ OFF), PRIOR, DRIFT)
+    np.testing.assert_allclose(there.T_first_second @ back.T_first_second, np.eye(4), atol=1e-3)
+
+
+def test_along_a_corridor_little_is_known():
+    def sigma_m(ends: bool) -> float:
+        refined = refine(*submaps(ends), T_TARGET_SOURCE, PRIOR, DRIFT)
+        along = T_TARGET_SOURCE[0, :3]  # the hall's axis in the source's frame
+        return float(np.sqrt(along @ (refined.covariance - DRIFT)[3:, 3:] @ along))
+
+    assert sigma_m(ends=False) > max(3.0 * sigma_m(ends=True), 0.2 * np.sqrt(PRIOR[3, 3]))
+
+
+def test_what_contradicts_the_verified_pose_is_refused():
+    target, source = submaps()
+    assert refine(target, source, T_TARGET_SOURCE @ OFF, 1e-2 * PRIOR, DRIFT) is None
+
+
+@pytest.mark.parametrize("count", [0, 40])
+def test_next_to_nothing_is_not_registered(count):
+    target, _ = submaps()
+    few = DenseSubmap.join([(np.eye(4), np.random.default_rng(0).uniform(size=(count, 3)))], 60.0, CELL_M)
+    far = exp([0.0, 0.0, 0.0, 0.0, 0.0, 500.0])
+    assert refine(few, few, far, PRIOR, DRIFT) is None
+    assert refine(target, few, far, PRIOR, DRIFT) is None
+
+
+def test_neighbours_are_joined_where_they_lie():
+    points = planes(np.random.default_rng(1), ends=True)
+    left, right = points[points[:, 0] < 0.0], points[points[:, 0] >= 0.0]
+    T = exp([0.1, 0.2, -0.3, 4.0, 5.0, 0.6])
+    joined = DenseSubmap.join([(np.eye(4), left), (T, transform_points(inverse(T), right))], 60.0, CELL_M)
+    whole = DenseSubmap.join([(np.eye(4), np.concatenate([left, right]))], 60.0, CELL_M)
+    np.testing.assert_allclose(joined.points, whole.points, atol=1e-9)
+    assert np.linalg.norm(DenseSubmap.join([(np.eye(4), points)], 5.0, CELL_M).points, axis=1).max() <= 5.0

@@ -30,12 +30,6 @@ def submap(points_world: FloatArray, T_world_lidar: FloatArray):
     return SparseSubmap.of(transform_points(inverse(T_world_lidar), points_world), 60.0)
 
 
-def similarity(first, second) -> tuple[float, float]:
-    descriptor = BirdsEyeView.of(second).descriptor(RADIUS_M)
-    found, turn = compare(descriptor, BirdsEyeView.of(first).descriptor(RADIUS_M)[None])
-    return float(found[0]), float(turn[0])
-
-
 @pytest.fixture(scope="module")
 def hall() -> FloatArray:
     return scene(1)
@@ -58,8 +52,9 @@ def test_laid_over_one_another(hall, T_target_source):
     true = T_target_source.copy()
     true[2, 3] = 0.4
     target, source = submap(hall, HOME), submap(hall, HOME @ true)
-    _, turn = similarity(target, source)
-    T, score = align(BirdsEyeView.of(target), BirdsEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
+    target, source = BirdsEyeView.of(target), BirdsEyeView.of(source)
+    _, turn = compare(source.descriptor(RADIUS_M), target.descriptor(RADIUS_M)[None])
+    T, score = align(target, source, turn[0] + np.array([0.0, np.pi]), RADIUS_M)
     assert_near(T, true, 0.6, 4.0)
     assert 0.5 < score <= 1.0
 

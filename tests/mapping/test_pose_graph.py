@@ -1,15 +1,29 @@
-"""Pose graphs whose optimal poses and outlier closures are known."""
+"""Keyframes, the edges between them, pose graphs whose optimal poses are known, and trajectories corrected by them."""
 
 from collections.abc import Sequence
 
+import gtsam
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.core.trajectory import chain
+from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.pose_graph.edges import Attitude, first_connected
+from lidarslam.mapping.pose_graph import edges, keyframe_graph
+from lidarslam.mapping.pose_graph.correction import corrected, format_g2o
+from lidarslam.mapping.pose_graph.edges import (
+    Attitude,
+    GraphScan,
+    MotionSinceKeyframe,
+    drift_covariance,
+    first_connected,
+    trajectory_edges,
+)
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, RelaxSchedule, bounded, optimise, relax
+
+from .runs import assert_near
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2
 TIGHT = np.diag([0.002, 0.001, 0.003, 0.03, 0.02, 0.01]) ** 2
@@ -55,13 +69,6 @@ def drifted(edges: Sequence[RelativePose], count: int) -> FloatArray:
     """Poses from the chain alone."""
     steps = {e.first: e.T_first_second for e in edges if e.second == e.first + 1}
     return chain(np.eye(4), np.stack([steps[key] for key in range(count - 1)]))
-
-
-def assert_near(actual: FloatArray, expected: FloatArray, tolerance: float) -> None:
-    assert actual.shape == expected.shape
-    apart = inverse(actual) @ expected
-    assert float(np.linalg.norm(apart[:, :3, 3], axis=1).max()) < tolerance
-    assert float(rotation_angle(apart).max()) < tolerance
 
 
 def test_a_drifted_square_with_one_exact_closure_becomes_exact():
@@ -257,3 +264,197 @@ def test_a_closure_that_had_to_wait_is_not_forgotten():
     assert not schedule.is_due([closure(4000)], poses[:4001])
     due = [n for n in range(4002, 4100) if schedule.is_due([], poses[:n])]
     assert due == [4041]
+
+
+@pytest.fixture
+def hall(rng: np.random.Generator) -> FloatArray:
+    """Points on a circle of walls 8 m away."""
+    angle, height = rng.uniform(-np.pi, np.pi, 4000), rng.uniform(-1.0, 2.0, 4000)
+    return np.stack([8.0 * np.cos(angle), 8.0 * np.sin(angle), height], axis=1)
+
+
+def selector(points: FloatArray, **options: float | None) -> KeyframeSelector:
+    chosen = KeyframeSelector(KeyframeConfig.model_validate(options))
+    assert chosen.is_due(np.eye(4), points)
+    chosen.take(np.eye(4), points)
+    return chosen
+
+
+def moved(x: float = 0.0, turn_deg: float = 0.0) -> FloatArray:
+    return exp([0.0, 0.0, np.deg2rad(turn_deg), x, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("scale", "given_m", "distance_m"), [
+    (1.0, None, 2.05), (4.0, None, 4.0), (0.1, None, 0.5), (1.0, 3.0, 3.0),
+])  # fmt: skip
+def test_the_way_to_the_next_follows_the_scene_or_is_the_given_one(hall, monkeypatch, scale, given_m, distance_m):
+    """A quarter of 8 m; in a hall four times as large it would be 4 m at most, in a shaft 0.5 m at least."""
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.0)
+    chosen = selector(scale * hall, distance_m=given_m)
+    assert not chosen.is_due(moved(0.97 * distance_m), scale * hall)
+    assert chosen.is_due(moved(1.03 * distance_m), scale * hall)
+
+
+def test_a_turn_on_the_spot_makes_a_keyframe(hall):
+    chosen = selector(hall, turn_deg=30.0)
+    assert not chosen.is_due(moved(turn_deg=29.0), hall)
+    assert chosen.is_due(moved(turn_deg=-31.0), hall)
+
+
+@pytest.mark.parametrize(("least_overlap", "is_due"), [(0.6, True), (0.4, False)])
+def test_a_scan_that_sees_other_things_is_due(hall, monkeypatch, least_overlap, is_due):
+    """Half of it elsewhere: through a door, say."""
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", least_overlap)
+    beyond = hall + np.where(hall[:, :1] > 0.0, [[10.0, 0.0, 0.0]], 0.0)
+    assert not selector(hall).is_due(moved(0.1), hall)
+    assert selector(hall).is_due(moved(0.1), beyond) == is_due
+
+
+def test_noise_is_no_new_sight(hall, rng, monkeypatch):
+    monkeypatch.setattr(keyframe_graph, "_LEAST_OVERLAP", 0.95)
+    chosen = selector(hall)
+    assert not chosen.is_due(np.eye(4), hall + rng.normal(0.0, 0.05, hall.shape))
+
+
+STEP = exp([0.0, 0.1, 0.5, 2.0, -1.0, 0.3])
+SIGMA = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
+
+
+def scan(T_prev_curr: FloatArray | None, lost: bool = False) -> GraphScan:
+    covariance = None if T_prev_curr is None else SIGMA
+    return GraphScan(np.eye(4), np.zeros((1, 3)), SIGMA, T_prev_curr, covariance, lost=lost, belongs_in_map=True)
+
+
+def motion_of(*scans: GraphScan) -> MotionSinceKeyframe:
+    motion = MotionSinceKeyframe()
+    for one in scans:
+        motion = motion.then(one, 1.5)
+    return motion
+
+
+def test_drift_grows_with_the_way():
+    sigmas = np.sqrt(np.diag(drift_covariance(4.0)))
+    np.testing.assert_allclose(sigmas, [np.deg2rad(0.03 + 4.0 * 0.02)] * 3 + [0.005 + 4.0 * 0.003] * 3)
+    np.testing.assert_allclose(np.sqrt(np.diag(drift_covariance(4.0, registered=False))), 5.0 * sigmas)
+    assert drift_covariance(4.0, lost=True)[3, 3] == 9.0
+
+
+def test_motions_are_composed_and_their_covariances_propagated():
+    motion = motion_of(scan(STEP), scan(STEP))
+    A = adjoint(inverse(STEP))
+    np.testing.assert_allclose(motion.T_keyframe_lidar, STEP @ STEP, atol=1e-12)
+    np.testing.assert_allclose(motion.covariance, A @ SIGMA @ A.T + SIGMA, atol=1e-15)
+    assert (motion.length_m, motion.lost) == (3.0, False)
+
+
+def test_an_unknown_motion_leaves_none():
+    motion = motion_of(scan(STEP), scan(None, lost=True), scan(STEP))
+    assert motion.T_keyframe_lidar is None
+    assert (motion.length_m, motion.lost) == (4.5, True)
+
+
+def test_an_edge_is_as_precise_as_both_poses_and_the_drift_between():
+    before = 2.0 * SIGMA
+    refined, measured = trajectory_edges(7, STEP, motion_of(scan(STEP)), before, SIGMA)
+    assert [(e.first, e.second) for e in (refined, measured)] == [(6, 7), (6, 7)]
+    A = adjoint(inverse(STEP))
+    np.testing.assert_allclose(refined.covariance, drift_covariance(1.5) + SIGMA + A @ before @ A.T, rtol=1e-12)
+    np.testing.assert_allclose(measured.covariance, edges._ODOMETRY_CAUTION**2 * SIGMA, rtol=1e-12)
+
+
+def test_where_tracking_was_lost_the_edge_is_loose_whatever_the_covariances_of_the_poses():
+    [edge] = trajectory_edges(1, STEP, motion_of(scan(None, lost=True)), SIGMA, SIGMA)
+    np.testing.assert_array_equal(edge.covariance, drift_covariance(1.5, lost=True))
+
+
+def test_without_a_map_the_odometry_counts_once():
+    [edge] = trajectory_edges(1, STEP, motion_of(scan(STEP)), None, None)
+    np.testing.assert_array_equal(edge.covariance, drift_covariance(1.5, registered=False))
+
+
+def test_between_two_maps_the_edge_is_that_of_an_odometry():
+    """One of them was drawn anew, and surfaces lie elsewhere in it."""
+    [edge] = trajectory_edges(1, STEP, motion_of(scan(None)), SIGMA, SIGMA, one_map=False)
+    apart = edge.covariance - drift_covariance(1.5, registered=False)
+    assert np.linalg.eigvalsh(apart).min() > 0.0
+    assert len(trajectory_edges(1, STEP, motion_of(scan(STEP)), SIGMA, SIGMA, one_map=False)) == 2
+
+
+FAR = exp([0.2, -0.3, 2.0, 5e5, -3e5, 100.0])
+
+
+@pytest.fixture
+def trajectory(rng: np.random.Generator) -> FloatArray:
+    """Forty scans along a winding way."""
+    steps = rng.normal(size=(39, 6)) * [0.02, 0.02, 0.2, 0.1, 0.1, 0.05] + [0.0, 0.0, 0.0, 0.5, 0.0, 0.0]
+    return chain(exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]), exp(steps))
+
+
+def along_x(positions: list[float]) -> FloatArray:
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    T[:, 0, 3] = positions
+    return T
+
+
+def test_where_the_world_lies_does_not_matter(trajectory, rng):
+    keyframes = np.array([5, 12, 33])
+    poses = trajectory[keyframes] @ exp(rng.normal(size=(3, 6)) * 0.3)
+    here = corrected(trajectory, keyframes, poses)
+    there = corrected(FAR @ trajectory, keyframes, FAR @ poses)
+    np.testing.assert_allclose(there, FAR @ here, atol=1e-8)
+
+
+def test_a_rigid_move_of_all_keyframes_moves_everything(trajectory):
+    keyframes = np.array([5, 12, 33])
+    move = exp([0.4, -0.2, 1.5, 10.0, 20.0, -3.0])
+    np.testing.assert_allclose(
+        corrected(trajectory, keyframes, move @ trajectory[keyframes]), move @ trajectory, atol=1e-9
+    )
+
+
+def test_before_the_first_and_after_the_last_the_motion_to_them_is_kept(trajectory, rng):
+    keyframes = np.array([5, 33])
+    poses = trajectory[keyframes] @ exp(rng.normal(size=(2, 6)))
+    moved = corrected(trajectory, keyframes, poses)
+    for scans, key in ((slice(0, 5), 0), (slice(34, 40), 1)):
+        kept = inverse(trajectory[keyframes[key]]) @ trajectory[scans]
+        np.testing.assert_allclose(inverse(poses[key]) @ moved[scans], kept, atol=1e-12)
+
+
+def test_what_is_missing_is_spread_by_the_path_or_standing_still_by_the_scans():
+    """Still before the second keyframe, driving after it; a quarter of that way lies before the fourth scan."""
+    moved = corrected(along_x([0.0, 0.0, 0.0, 1.0, 4.0]), np.array([0, 2, 4]), along_x([0.0, 1.0, 7.0]))
+    np.testing.assert_allclose(moved, along_x([0.0, 0.5, 1.0, 2.5, 7.0]), atol=1e-12)
+
+
+def test_a_turn_that_was_missed_is_made_up_for_evenly():
+    """Half-way, a scan is as far from where the first keyframe has it as from where the second has it."""
+    before = along_x([0.0, 2.0, 4.0, 8.0])
+    poses = before[[0, 3]] @ exp([[0.0] * 6, [0.1, 0.0, 0.4, 0.0, 0.5, 0.0]])
+    moved = corrected(before, np.array([0, 3]), poses)
+    from_first = log(inverse(before) @ moved)
+    to_second = log(inverse(moved) @ poses[1] @ inverse(before[3]) @ before)
+    np.testing.assert_allclose(from_first[2], to_second[2], atol=1e-12)
+    np.testing.assert_allclose(from_first[1], to_second[1] / 3.0, atol=1e-12)
+    assert np.linalg.norm(from_first[2, :3]) == pytest.approx(0.5 * np.linalg.norm(log(poses[1])[:3]))
+
+
+def test_gtsam_reads_the_g2o_text_that_is_written(rng, tmp_path):
+    """Poses turned every way, kilometres from the origin, to the last digits."""
+    poses = exp(rng.normal(size=(5, 6)) * [1.0, 1.0, 1.0, 2000.0, 2000.0, 100.0])
+    motions = exp(rng.normal(size=(6, 6)) * [1.0, 1.0, 1.0, 5.0, 5.0, 5.0])
+    ends = [(0, 1), (1, 2), (2, 3), (4, 3), (4, 0), (2, 0)]
+    A = rng.normal(size=(6, 6, 6)) * np.array([0.01, 0.02, 0.03, 0.3, 0.2, 0.1])[:, None]
+    covariances = A @ A.swapaxes(1, 2) + np.diag([1e-5] * 3 + [1e-3] * 3)
+    edges = [RelativePose(*pair, T, P) for pair, T, P in zip(ends, motions, covariances, strict=True)]
+    path = tmp_path / "graph.g2o"
+    path.write_text(format_g2o(poses, edges), encoding="utf-8")
+    factors, values = gtsam.readG2o(str(path), True)
+    assert (factors.size(), values.size()) == (6, 5)
+    for key, pose in enumerate(poses):
+        np.testing.assert_allclose(values.atPose3(key).matrix(), pose, atol=1e-9)
+    for row, edge in enumerate(edges):
+        factor = factors.at(row)
+        assert list(factor.keys()) == [edge.first, edge.second]
+        np.testing.assert_allclose(factor.measured().matrix(), edge.T_first_second, atol=1e-9)
+        np.testing.assert_allclose(factor.noiseModel().covariance(), edge.covariance, rtol=1e-7, atol=1e-12)

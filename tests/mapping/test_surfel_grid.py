@@ -1,7 +1,10 @@
-"""Surfels of surfaces that have formulas: planes, lines, rings."""
+"""Surfels of surfaces that have formulas: planes, lines, rings; the eigenvalues and the hash table behind them."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.grid import (
@@ -14,7 +17,8 @@ from lidarslam.mapping.surfels.grid import (
     SPREADS,
     SurfelGrid,
 )
-from lidarslam.mapping.surfels.voxel_hash import ABSENT
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
+from lidarslam.mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps
 
 from .shapes import across_x
 
@@ -217,3 +221,136 @@ def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng):
     assert (grid.find(strays[strays[:, 2] > 1.8]) == ABSENT).all()
     assert (grid.find(once) != ABSENT).all()
     np.testing.assert_allclose(surfels_at(grid, inner)[:, MEAN], seen, atol=1e-3)
+
+
+def eigenvalues(M: FloatArray) -> FloatArray:
+    values = np.full((len(M), 3), np.nan)
+    for matrix, written in zip(M, values, strict=True):
+        write_eigenvalues(matrix, written)
+    return values
+
+
+def eigenvectors(M: FloatArray, values: FloatArray) -> FloatArray:
+    vectors = np.full((len(M), 3), np.nan)
+    for matrix, value, written in zip(M, values, vectors, strict=True):
+        write_eigenvector(matrix, value, written)
+    return vectors
+
+
+def entries(M: FloatArray) -> FloatArray:
+    return np.stack([M[:, i, j] for i, j in SYMMETRIC], axis=1)
+
+
+def with_spectrum(rng: np.random.Generator, values: list[float], count: int = 300) -> FloatArray:
+    Q = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    M = Q @ (np.array(values)[:, None] * np.swapaxes(Q, 1, 2))
+    return np.asarray(0.5 * (M + np.swapaxes(M, 1, 2)))
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e-4, 1.0, 1e6])
+def test_values_of_random_matrices_of_any_size(rng, scale):
+    A = rng.normal(size=(1000, 3, 3))
+    M = scale * (A + np.swapaxes(A, 1, 2))
+    np.testing.assert_allclose(eigenvalues(entries(M)), np.linalg.eigvalsh(M), rtol=0.0, atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize(
+    "spectrum",
+    [[0, 0, 0], [1, 1, 1], [0, 1, 1], [0, 0, 1], [1, 1, 3], [-2, -2, 5], [0, 1e-9, 1]],
+    ids=["zero", "ball", "disc", "needle", "long", "indefinite", "noisy needle"],
+)
+def test_values_of_special_spectra(rng, spectrum):
+    values = eigenvalues(entries(with_spectrum(rng, spectrum)))
+    np.testing.assert_allclose(values, np.tile(spectrum, (len(values), 1)), rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_vectors_are_lapacks_up_to_their_sign(rng, which, scale):
+    M = scale * with_spectrum(rng, [0.2, 1.0, 3.0])
+    vectors = eigenvectors(entries(M), eigenvalues(entries(M))[:, which])
+    expected = np.linalg.eigh(M)[1][:, :, which]
+    np.testing.assert_allclose(np.abs(np.einsum("ij,ij->i", vectors, expected)), 1.0, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("spectrum", "which"), [([0.0, 1.0, 1.0], 0), ([0.0, 0.0, 1.0], 2), ([0.0, 1e-4, 1.0], 0)])
+def test_vectors_of_simple_values_beside_repeated_ones(rng, spectrum, which):
+    """A disc's normal, a needle's direction, the normal of a narrow strip."""
+    M = with_spectrum(rng, spectrum)
+    vectors = eigenvectors(entries(M), eigenvalues(entries(M))[:, which])
+    residual = np.einsum("nij,nj->ni", M, vectors) - spectrum[which] * vectors
+    assert np.abs(residual).max() < 1e-7
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0])
+def test_where_every_direction_is_one_a_unit_vector_is_given(value):
+    M = value * np.eye(3)[None]
+    vectors = eigenvectors(entries(M), np.array([value]))
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=0.0, atol=1e-12)
+
+
+Cell = tuple[int, int, int]
+near = st.integers(-3, 3)
+anywhere = st.integers(-(1 << 19), (1 << 19) - 1)
+cells_anywhere = st.lists(st.tuples(anywhere, anywhere, anywhere), min_size=1, max_size=40)
+cells_near = st.lists(st.tuples(near, near, near), min_size=1, max_size=40)
+
+
+def keys_of(cells: list[Cell]) -> NDArray[np.int64]:
+    return cell_keys(np.array(cells, dtype=np.int64).reshape(-1, 3))
+
+
+def random_cells(rng: np.random.Generator, count: int, reach: int = 1000) -> NDArray[np.int64]:
+    return rng.integers(-reach, reach, (count, 3))
+
+
+@given(st.lists(st.one_of(cells_near, cells_anywhere), max_size=6), cells_near)
+def test_equals_a_dictionary_after_any_insertions(batches, asked):
+    table, oracle = VoxelHash(), {}
+    for batch in batches:
+        rows = table.insert(keys_of(batch))
+        for cell, row in zip(batch, rows.tolist(), strict=True):
+            assert oracle.setdefault(cell, row) == row
+    assert len(table) == len(oracle)
+    assert sorted(oracle.values()) == list(range(len(oracle)))
+    wanted = [*asked, *oracle]
+    assert table.find(keys_of(wanted)).tolist() == [oracle.get(cell, ABSENT) for cell in wanted]
+
+
+@given(cells_anywhere)
+def test_cells_come_back_from_their_keys(cells):
+    assert [tuple(cell) for cell in key_cells(keys_of(cells)).tolist()] == cells
+
+
+@given(cells_anywhere, cells_near)
+def test_a_step_leads_to_the_neighbours_key(cells, offsets):
+    inside = np.clip(np.array(cells), -(1 << 19) + 3, (1 << 19) - 4)
+    steps = np.array(offsets)
+    np.testing.assert_array_equal(
+        cell_keys(inside)[:, None] + key_steps(steps), cell_keys(inside[:, None] + steps[None])
+    )
+
+
+def test_rows_of_before_stay_while_the_table_grows(rng):
+    table = VoxelHash()
+    first = cell_keys(random_cells(rng, 3_000))
+    rows = table.insert(first)
+    for _ in range(4):
+        table.insert(cell_keys(random_cells(rng, 15_000)))
+    assert len(table) > 50_000
+    np.testing.assert_array_equal(table.find(first), rows)
+
+
+def test_rebuilt_it_holds_the_new_keys_only_in_their_order(rng):
+    table = VoxelHash()
+    before = np.unique(cell_keys(random_cells(rng, 20_000)))
+    table.insert(before)
+    kept, dropped = before[::3], np.setdiff1d(before, before[::3])
+    kept = rng.permutation(kept)
+    table.rebuild(kept)
+    assert len(table) == len(kept)
+    np.testing.assert_array_equal(table.find(kept), np.arange(len(kept)))
+    assert (table.find(dropped) == ABSENT).all()
+    back = [kept[1], dropped[0], kept[0]]
+    assert table.insert(np.array(back)).tolist() == [1, len(kept), 0], "it goes on counting"

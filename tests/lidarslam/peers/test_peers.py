@@ -3,8 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +56,7 @@ def _peer(exact: _Exact, needs_imu: bool = False) -> "replace":
     return replace(PEERS["small-gicp"], library="numpy", make=lambda *_: exact, needs_imu=needs_imu)
 
 
-def test_poses_are_interpolated_at_the_stamps_and_an_empty_scan_is_not_registered() -> None:
+def test_poses_are_interpolated_at_the_stamps_and_an_empty_scan_is_not_registered():
     found = estimate(_peer(_Exact()), _scans(8, empty=(3,)))
     np.testing.assert_allclose(found.trajectory.stamps, SWEEP_S * np.arange(8))
     expected = np.array([_at(stamp) for stamp in found.trajectory.stamps])
@@ -66,7 +64,7 @@ def test_poses_are_interpolated_at_the_stamps_and_an_empty_scan_is_not_registere
     assert len(found.register_ms) == 7
 
 
-def test_samples_of_the_imu_come_before_the_end_of_each_sweep_once_and_in_order() -> None:
+def test_samples_of_the_imu_come_before_the_end_of_each_sweep_once_and_in_order():
     exact = _Exact()
     stamps = np.arange(-5, 100) * 0.01 + 0.005
     samples = ImuSamples(stamps, np.zeros((105, 3)), np.zeros((105, 3)))
@@ -75,20 +73,20 @@ def test_samples_of_the_imu_come_before_the_end_of_each_sweep_once_and_in_order(
     assert exact.ends_at_samples == [15, 25, 35, 45]
 
 
-def test_scans_in_a_gap_or_far_outside_the_poses_have_none() -> None:
+def test_scans_in_a_gap_or_far_outside_the_poses_have_none():
     instants = np.array([0.0, 3.0, 3.1, 3.2, 3.3])
     stamps = np.array([-1.0, 0.0, 1.5, 2.9, 3.0, 3.35, 3.5, 4.0])
     np.testing.assert_array_equal(is_covered(instants, stamps), [False, False, False, False, True, True, True, False])
 
 
-def test_poses_that_are_none_are_an_error() -> None:
+def test_poses_that_are_none_are_an_error():
     exact = _Exact()
-    exact.finish = lambda: Poses(np.arange(2.0), np.full((2, 4, 4), np.nan))  # type: ignore[method-assign]
+    exact.finish = lambda: Poses(np.arange(2.0), np.full((2, 4, 4), np.nan))
     with pytest.raises(PeerError, match="not finite"):
         estimate(_peer(exact), _scans(3))
 
 
-def test_ct_icps_poses_stand_at_the_starts_but_for_the_first_and_the_second() -> None:
+def test_ct_icps_poses_stand_at_the_starts_but_for_the_first_and_the_second():
     pytest.importorskip("evalio", reason="needs the extra peers")
     from lidarslam.compare.peers.evalio_pipelines import elastic_instants
 
@@ -111,7 +109,7 @@ def _swaying(time: FloatArray) -> FloatArray:
 
 # Feature-based pipelines want rings, which the room does not have.
 @pytest.mark.parametrize("name", ["kiss-icp-evalio", "genz-icp", "mad-icp", SLOWEST, "kiss-slam", "small-gicp"])
-def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: Any) -> None:
+def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name, room):
     pytest.importorskip(PEERS[name].library, reason="needs the extra peers")
     stamps = SWEEP_S * np.arange(1, 26)
     found = estimate(PEERS[name], (room.sweep(_swaying, float(stamp)) for stamp in stamps)).trajectory
@@ -124,7 +122,7 @@ def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: A
 
 
 @pytest.mark.long
-def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recording: Path, tmp_path: Path) -> None:
+def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recording, tmp_path):
     pytest.importorskip("small_gicp", reason="needs the extra peers")
     out = tmp_path / "compared"
     arguments = ["compare", recording, "-o", out, "--methods", "small-gicp,rko-lio"]
@@ -156,7 +154,7 @@ class _Ranges:
         return [Scan(points[number], float(number)) for number in range(start, stop, step)]
 
 
-def test_the_range_of_a_scene_is_twice_that_of_nearly_all_points_of_the_first_scans_and_outdoors_the_default() -> None:
+def test_the_range_of_a_scene_is_twice_that_of_nearly_all_points_of_the_first_scans_and_outdoors_the_default():
     ranges = {scale: scene_range_m(_Ranges(scale), range(30)) for scale in (1.0, 0.1, 8.0)}
     assert ranges[1.0] == pytest.approx(14.0, abs=0.2)
     assert (ranges[0.1], ranges[8.0]) == (10.0, 100.0)
@@ -165,7 +163,7 @@ def test_the_range_of_a_scene_is_twice_that_of_nearly_all_points_of_the_first_sc
 
 
 @pytest.mark.slow
-def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: Path, tmp_path: Path) -> None:
+def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording, tmp_path):
     pytest.importorskip("small_gicp", reason="needs the extra peers")
     out = tmp_path / "compared"
     names = ["small-gicp", "small-gicp@scene", "kiss-icp@scene"]
@@ -188,7 +186,7 @@ def test_scene_behind_a_name_is_a_second_row_whose_run_has_the_range(recording: 
     "name",
     [SLOWEST if name == "ct-icp" else name for name, peer in PEERS.items() if peer.has_voxels and not peer.needs_imu],
 )
-def test_every_peer_with_voxels_registers_a_small_scene_with_fine_ones(name: str, room: Any) -> None:
+def test_every_peer_with_voxels_registers_a_small_scene_with_fine_ones(name, room):
     pytest.importorskip(PEERS[name].library, reason="needs the extra peers")
     sweeps = [room.sweep(_swaying, SWEEP_S * number) for number in range(1, 7)]
     coarse, fine = (estimate(PEERS[name], sweeps, range_m=range_m).trajectory for range_m in (None, 20.0))

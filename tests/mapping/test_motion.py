@@ -1,4 +1,4 @@
-"""Where a scan is expected, from what its odometry says and how far that is to be trusted."""
+"""Motion compensation, where a scan is expected and how far that is to be trusted, and the bias of velocities."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,6 +8,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.deskew import Sweep, body_velocity, deskew
 from lidarslam.mapping.motion.prediction import (
     LEAST_SIGMA,
     UNKNOWN_VELOCITY,
@@ -18,6 +19,8 @@ from lidarslam.mapping.motion.prediction import (
     ProcessNoise,
     predict,
 )
+from lidarslam.mapping.motion.velocity_bias import VelocityBias
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s
 MOVED = exp(0.1 * VELOCITY)
@@ -233,3 +236,106 @@ def test_the_likelihood_of_a_motion_falls_with_its_distance_from_a_proven_odomet
     noise = OdometryNoise(variance=4.0, agreed=20)
     assert noise.likelihood(prior, MOVED @ ahead(0.04), CONFIG) == pytest.approx(np.exp(-0.5))
     assert OdometryNoise().likelihood(prior, MOVED @ ahead(0.04), CONFIG) == 1.0, "not proven"
+
+
+def exponentials(points: FloatArray, offsets: FloatArray, velocity: FloatArray) -> FloatArray:
+    moved = [exp(offset * velocity)[:3] @ [*point, 1.0] for point, offset in zip(points, offsets, strict=True)]
+    return np.array(moved)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-7, 0.0])
+def test_equals_the_exponential_of_every_points_time(rng, scale):
+    points = rng.normal(0.0, 10.0, (200, 3))
+    offsets = rng.uniform(-0.1, 0.1, 200)
+    velocity = np.array([3.0 * scale, -2.0 * scale, 5.0 * scale, 10.0, 2.0, -1.0])
+    expected = exponentials(points, offsets, velocity)
+    np.testing.assert_allclose(deskew(points, offsets, velocity, velocity), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.05, 0.05), (0.0, 0.1)])
+def test_points_before_and_after_the_stamp_move_with_their_own_velocity(rng, low, high):
+    points, offsets = rng.normal(0.0, 10.0, (200, 3)), rng.uniform(low, high, 200)
+    before, after = rng.normal(size=(2, 6))
+    expected = np.where(
+        offsets[:, None] < 0.0, exponentials(points, offsets, before), exponentials(points, offsets, after)
+    )
+    np.testing.assert_allclose(deskew(points, offsets, before, after), expected, atol=1e-9)
+
+
+def test_a_velocity_makes_its_motion_in_its_time(rng):
+    velocity = rng.normal(size=6)
+    np.testing.assert_allclose(body_velocity(exp(0.3 * velocity), 0.3), velocity, atol=1e-9)
+
+
+@pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
+def test_a_sweep_of_a_sensor_that_turns_ever_faster_is_even_afterwards(room, stamp_at):
+    """As on a walking robot: 20 deg/s faster at the end of the sweep than at its beginning."""
+    velocity, acceleration = np.array([0.1, 0.5, 0.2, 1.0, 0.2, 0.0]), np.array([1.0, 3.5, -1.0, 0.0, 0.0, 0.0])
+
+    def T_room_lidar_at(times: FloatArray) -> FloatArray:
+        return exp(times[:, None] * velocity + 0.5 * times[:, None] ** 2 * acceleration)
+
+    scan, middle_s = room.sweep(T_room_lidar_at, 0.0, stamp_at), 0.1 * (0.5 - stamp_at)
+    sweep, mean = Sweep(scan.points, scan.time_offsets), velocity + middle_s * acceleration
+    assert room.distance_to_surface(sweep.evened(acceleration[:3], middle_s).compensated(mean)).max() < 0.002
+    assert room.distance_to_surface(sweep.compensated(mean)).max() > 0.02, "not so without"
+
+
+INTERVAL_S = 0.1
+STEADY = np.array([0.02, -0.01, 0.1, 5.0, 0.2, -0.1])  # rad/s, m/s
+MOTION = exp(INTERVAL_S * STEADY)
+BIAS = np.array([0.01, 0.0, -0.04, 0.1, -0.15, 0.05])
+GAINS = SurfelMap.velocity_gains
+COVARIANCE = np.diag(np.array([0.001] * 3 + [0.01] * 3 + [0.02] * 3 + [0.2] * 3) ** 2)
+
+
+def swept(number: int, velocity: FloatArray, seen_from_s: float) -> MotionState:
+    """A scan of a sensor that moves steadily, with an estimate of its velocity."""
+    T_world_lidar = exp(number * INTERVAL_S * STEADY)
+    return MotionState(number * INTERVAL_S, T_world_lidar, velocity, COVARIANCE, INTERVAL_S - seen_from_s)
+
+
+@pytest.mark.parametrize("seen_from_s", [0.0, 0.05, 0.1])
+def test_what_all_sweeps_have_in_common_is_corrected(seen_from_s):
+    """With stamps at the beginning of the sweeps, in their middle, and at their end."""
+    bias, last = VelocityBias(), swept(0, STEADY + BIAS, seen_from_s)
+    for number in range(1, 60):
+        state = swept(number, STEADY + BIAS, seen_from_s)
+        bias = bias.updated(last, state, seen_from_s, GAINS)
+        last = bias.corrected(state)
+    np.testing.assert_allclose(last.velocity, STEADY, atol=1e-6)
+    np.testing.assert_allclose(bias.correction, -BIAS, atol=1e-6)
+
+
+def test_a_sudden_acceleration_is_no_bias():
+    """Of 360 deg/s and 30 m/s, 2.4 degrees and 10 cm per second are taken over."""
+    sudden = np.array([0.0, 0.0, np.deg2rad(360.0), 30.0, 0.0, 0.0])
+    bias = VelocityBias().updated(swept(0, STEADY - sudden, 0.0), swept(1, STEADY, 0.0), 0.0, GAINS)
+    np.testing.assert_allclose(bias.correction[[2, 3]], [np.deg2rad(2.4), 0.1], rtol=1e-6)
+
+
+def test_a_gap_between_sweeps_begins_anew():
+    for last, now in ((0, 2), (1, 1)):
+        bias = VelocityBias(BIAS).updated(swept(last, STEADY, 0.0), swept(now, STEADY, 0.0), 0.0, GAINS)
+        assert not bias.correction.any()
+
+
+def test_the_pose_follows_as_it_is_correlated():
+    """Known best in the middle of a sweep, the pose at its begin goes back by half of the velocity's sweep."""
+    covariance = COVARIANCE.copy()
+    covariance[:6, 6:] = covariance[6:, :6] = -0.5 * INTERVAL_S * COVARIANCE[6:, 6:]
+    state = MotionState(0.0, MOTION, STEADY, covariance, INTERVAL_S)
+    corrected = VelocityBias(BIAS).corrected(state)
+    np.testing.assert_allclose(log(inverse(MOTION) @ corrected.T_world_lidar), -0.05 * BIAS, atol=1e-12)
+    np.testing.assert_allclose(corrected.velocity, STEADY + BIAS)
+
+
+def test_the_loop_of_correction_and_map_is_damped():
+    """Where the next velocity follows from the map of corrected sweeps, a bias dies away: its swings do not last."""
+    bias, last, errors = VelocityBias(), swept(0, STEADY + BIAS, 0.05), []
+    for number in range(1, 30):
+        state = swept(number, last.velocity, 0.05)
+        bias = bias.updated(last, state, 0.05, GAINS)
+        last = bias.corrected(state)
+        errors.append((last.velocity - STEADY) / np.where(BIAS == 0.0, np.inf, BIAS))
+    assert np.abs(errors[15:]).max() < 0.15
