@@ -208,7 +208,7 @@ def test_an_interruption_before_any_turn_is_written_for_every_recording(recordin
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lidarslam.compare.comparison.run_method", interrupted)
+    monkeypatch.setattr("lidarslam.compare.method_run.run_method", interrupted)
     entries = (RecordingEntry(recording), RecordingEntry(recording, start=1))
     outcome = compare(_request(recording, tmp_path, "kiss-icp", recordings=entries), told.narrator)
     assert outcome.interrupted
