@@ -18,9 +18,11 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_poi
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.config import GlobalMapConfig, KeyframeConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.pose_graph.edges import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
@@ -49,11 +51,23 @@ def test_true_motions_give_true_poses_and_a_true_map(true_odometry, room, room_s
     np.testing.assert_allclose([result.T_world_lidar for result in results], truth, atol=1e-9)
     assert all(result.status is Status.OK for result in results)
     assert all(set(result.stage_ms) == set(STAGES) for result in results)
-    in_room = transform_points(room_truth.T_world_lidar[0], np.concatenate(notes.drawn))
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     # A voxel's mean may lie off a corner by a part of the voxel; nothing else may lie off a surface.
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 1e-6
     assert distance.max() < 0.06
+
+
+def test_with_a_pose_graph_the_map_is_that_of_its_submaps(true_odometry, room_scans):
+    graph = KeyframeGraph(KeyframeConfig(distance_m=0.5))
+    pipeline = make_pipeline(true_odometry, graph)
+    list(pipeline.run(room_scans))
+    assert len(graph.store) > 2
+    submaps = GlobalMap(0.1)
+    for means, keyframe in zip(graph.store, graph.keyframes, strict=False):  # the last one is still open
+        submaps.add_means(means, graph.scan_poses[keyframe.scan])
+    np.testing.assert_array_equal(pipeline.map.global_map.points(), submaps.points())
+    graph.close()
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
