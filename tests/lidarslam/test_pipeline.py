@@ -62,7 +62,7 @@ def test_with_a_pose_graph_the_map_is_that_of_its_submaps(true_odometry, room_sc
     graph = KeyframeGraph(KeyframeConfig(distance_m=0.5))
     pipeline = make_pipeline(true_odometry, graph)
     list(pipeline.run(room_scans))
-    assert len(graph.store) > 2
+    assert len(graph.store) == 2
     submaps = GlobalMap(0.1)
     for means, keyframe in zip(graph.store, graph.keyframes, strict=False):  # the last one is still open
         submaps.add_means(means, graph.scan_poses[keyframe.scan])
