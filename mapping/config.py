@@ -19,7 +19,7 @@ BudgetMs = Annotated[float, Field(ge=1.0, le=1e6)] | Literal["auto"] | None
 
 
 class TrackingConfig(Settings):
-    """Inlier ratios that a registered scan needs; see `mapping.tracking.fit`."""
+    """Inlier ratios that a registered scan needs; see `mapping.tracking.mapped_scan`."""
 
     degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio below which a scan is degraded")
     lost_below: float = Field(0.45, ge=0.0, le=1.0, description="inlier ratio below which a scan is lost")

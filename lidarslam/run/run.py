@@ -21,7 +21,7 @@ from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator
-from lidarslam.mapping.global_map.drawing import DrawnMap
+from lidarslam.mapping.global_map.global_map import DrawnMap
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import GivenLoops
 from lidarslam.mapping.motion.prediction import Prior

@@ -18,9 +18,9 @@ from lidarslam.mapping.motion.prediction import (
 from lidarslam.mapping.surfels.surfel_map import constraining_points
 from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.mapped_scan import Attempt
-from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
-from lidarslam.mapping.tracking.start_poses import (
+from lidarslam.mapping.tracking.scan_matcher import (
     SCORED_POINTS,
+    ScanMatcher,
     best_supported,
     best_velocity,
     positions_around,

@@ -12,8 +12,7 @@ from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import Steps, complete
 from lidarslam.mapping.tracking.mapped_scan import Attempt, best_of
-from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
-from lidarslam.mapping.tracking.start_poses import best_starts, turned_poses
+from lidarslam.mapping.tracking.scan_matcher import ScanMatcher, best_starts, turned_poses
 
 _YAW_STEP_DEG = 15.0
 # Radius of a scan's bird's-eye view in median ranges, its cell in cells of the map, and the places that are tried.

@@ -6,13 +6,11 @@ from lidarslam.core.geometry import displacement_m, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
-from lidarslam.mapping.motion.velocity_bias import VelocityBias
+from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior, VelocityBias
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.budget import Budget
-from lidarslam.mapping.tracking.fit import Fit
-from lidarslam.mapping.tracking.mapped_scan import Attempt, MappedScan, best_of, judge
+from lidarslam.mapping.tracking.mapped_scan import Attempt, Fit, MappedScan, best_of, judge
 from lidarslam.mapping.tracking.near_search import WEAK_CAUTION, NearSearch
 from lidarslam.mapping.tracking.relocalisation import ArchivedMaps, SpreadSearch, search_nearby
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher

@@ -9,8 +9,7 @@ import pytest
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.tracking.fit import NO_FIT
-from lidarslam.mapping.tracking.mapped_scan import Attempt
+from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 FOUND = TrackingState().registered(Status.OK, True, 0.8, 5.0)

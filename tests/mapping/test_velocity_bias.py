@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from lidarslam.mapping.motion.prediction import MotionState
-from lidarslam.mapping.motion.velocity_bias import VelocityBias
+from lidarslam.mapping.motion.prediction import MotionState, VelocityBias
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 INTERVAL_S = 0.1
