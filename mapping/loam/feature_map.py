@@ -105,12 +105,9 @@ def match_features(
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
     `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
-    normal, are moved to its beginning. A plane that is known better takes the place of another. The normal of a plane
-    faces the sensor (3,), and so did the plane when it was seen; the first of a line points from that to the point.
-    With `has_rings`, planes that may be those of a single ring do not count.
-
-    Returns:
-        Number of the points that were moved.
+    normal, are moved to its beginning; their number is returned. A plane that is known better takes the place of
+    another. The normal of a plane faces the sensor (3,), and so did the plane when it was seen; the first of a line
+    points from that to the point. With `has_rings`, planes that may be those of a single ring do not count.
     """
     left, scale = 0, 1.0 / voxels.cell_m
     around, near = np.empty(27, dtype=np.int64), np.empty(NEIGHBOURS, dtype=np.int64)
@@ -267,10 +264,7 @@ def _spans_rings(
 def _uncertainty(across: float, along: float, number: float, spent: float) -> tuple[float, float]:
     """Standard deviations of a line or plane across it, with that of its position, and of its direction.
 
-    Args:
-        across, along: variances of its points.
-        number: of the points.
-        spent: residuals that the fit takes.
+    Of so many points with variances across and along it; the fit takes `spent` residuals.
     """
     noise = _COUNTED * _RANGE_NOISE_M * _RANGE_NOISE_M
     variance = (number * max(across, 0.0) + noise) / (max(number - spent, 0.0) + _COUNTED)
@@ -370,14 +364,9 @@ class VoxelGrid(Stateful):
 
 
 class FeatureMatcher(Matcher):
-    """Lines of edges and planes of other points, through their nearest voxels.
+    """Lines of edges and planes of other points of a sweep, through their nearest voxels in grids, the finest first.
 
     A point that has moved by a small part of a cell since it was matched keeps its line or plane.
-
-    Args:
-        edges, planes: grids of voxels, the finest first.
-        has_rings: whether points of the map lie in rings.
-        sweep: with the kinds of its points; without, all points are planar.
     """
 
     def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], has_rings: bool, sweep: Sweep) -> None:

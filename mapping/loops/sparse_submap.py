@@ -133,23 +133,20 @@ def _level_rotation(normals: FloatArray) -> FloatArray:
     return levelling(axis)
 
 
-class SubmapFile:
+class SubmapFile(BlockFile):
     """Sparse submaps in order, in a file without a name: those of hours would take hundreds of megabytes of memory."""
 
     def __init__(self, directory: Path | None = None) -> None:
-        self._blocks = BlockFile(directory)
-        self._recent = lru_cache(_KEPT)(self._read)
-
-    def __len__(self) -> int:
-        return len(self._blocks)
+        super().__init__(directory)
+        self._recent = lru_cache(_KEPT)(self._unpickled)
 
     def __getitem__(self, index: int) -> SparseSubmap:
         return self._recent(range(len(self))[index])
 
     def append(self, submap: SparseSubmap) -> None:
         """Keep one more; OSError where the disk is full."""
-        self._blocks.write(pickle.dumps(submap))
+        self.write(pickle.dumps(submap))
 
-    def _read(self, index: int) -> SparseSubmap:
-        submap: SparseSubmap = pickle.loads(self._blocks.read(index))  # noqa: S301 (of a file that nobody else can open)
+    def _unpickled(self, index: int) -> SparseSubmap:
+        submap: SparseSubmap = pickle.loads(self.read(index))  # noqa: S301 (of a file that nobody else can open)
         return submap

@@ -321,10 +321,8 @@ def linearise(
     """Write a row (10,) for every residual of points (N, 3) of the LiDAR frame at a pose (4, 4).
 
     The Jacobian is for a motion from the right, rotation first. `times` (N,) are seconds from the stamp, or empty;
-    `inflation` (N,) are factors on the standard deviation of each point's surface.
-
-    Returns:
-        Number of residuals, and the sum of the squared ranges of their points.
+    `inflation` (N,) are factors on the standard deviation of each point's surface. Returned are the number of residuals
+    and the sum of the squared ranges of their points.
     """
     T, count, squared = T_world_lidar, 0, 0.0
     for n in range(len(points)):
@@ -354,16 +352,11 @@ def linearise(
 def accumulate(
     rows: FloatArray, squared_scale: float, noise_m: float, gate_m: float, unknown: FloatArray, total: FloatArray
 ) -> tuple[float, float, float]:
-    """Add the weighted products of residuals (M, 10) up, with Geman and McClure's weights over the variances.
+    """Add the weighted products of rows (M, 10) up, with Geman and McClure's weights over the variances.
 
-    Args:
-        rows: of `linearise`.
-        squared_scale: of the robust kernel, to which the variance of each surface is added.
-        noise_m: standard deviation of a range.
-        gate_m: residuals beyond do not count.
-        unknown: (3, 6, 6) coefficients of the pose's covariance t seconds from the stamp, a polynomial in t; the
-            variance that it propagates to a residual widens the kernel.
-        total: (13, 13), zero, written: the Hessian of pose and velocity, and in the last column the gradient.
+    The robust kernel is wider by the variance of each surface, and by the variance that the pose's covariance t seconds
+    from the stamp, a polynomial in t of coefficients (3, 6, 6), propagates to a residual. Into `total` (13, 13), zero
+    before, go the Hessian of pose and velocity, and in the last column the gradient.
 
     Returns:
         The sums of the weights and of the weighted squares of the normals' standard deviations, and the mean square of

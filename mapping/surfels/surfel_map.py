@@ -60,11 +60,7 @@ def match_planes(
     A better one is known better and its points are spread less: across steps, a coarse plane's are spread more.
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
     without a plane, or with one whose normal has a standard deviation of `certain_tilt` and more, are moved to the
-    beginning of `unmatched`. `spread_m` (N,) has the standard deviations of each plane's points across it, and is
-    written.
-
-    Returns:
-        Number of the points that were moved.
+    beginning of `unmatched`; their number is returned. `spread_m` (N,), of each plane's points across it, is written.
     """
     left = 0
     for w in range(len(unmatched)):

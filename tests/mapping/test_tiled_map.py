@@ -9,8 +9,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.config import GlobalMapConfig
-from lidarslam.mapping.global_map import voxels
 from lidarslam.mapping.global_map import global_map as module
+from lidarslam.mapping.global_map import voxels
 from lidarslam.mapping.global_map.global_map import GlobalMap, drawn_map
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud
