@@ -16,8 +16,7 @@ from lidarslam.mapping.config import KeyframeConfig, LoopConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, means_points, voxel_size_for
 from lidarslam.mapping.loops.detection import KeyframeDatabase
 from lidarslam.mapping.loops.refinement import DenseSubmap
-from lidarslam.mapping.pose_graph.edges import drift_covariance
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector, drift_covariance
 from lidarslam.pipeline.threads import in_order
 from lidarslam.simulation.recorder import Simulation
 

@@ -17,7 +17,7 @@ from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import POSITION, VIEW, Rows
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.pose_graph.edges import Keyframe, first_connected
+from lidarslam.mapping.pose_graph.keyframe_graph import Keyframe, first_connected
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 # A submap is off when its place in the local map differs from the corrected one by more than this share of a cell or

@@ -20,7 +20,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.motion.deskew import move
-from lidarslam.mapping.pose_graph.edges import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry

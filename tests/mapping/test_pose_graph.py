@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.pose_graph.edges import Attitude, first_connected
+from lidarslam.mapping.pose_graph.keyframe_graph import Attitude, first_connected
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, RelaxSchedule, bounded, optimise, relax
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2

@@ -4,7 +4,12 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.mapping.pose_graph import edges
-from lidarslam.mapping.pose_graph.edges import GraphScan, MotionSinceKeyframe, drift_covariance, trajectory_edges
+from lidarslam.mapping.pose_graph.keyframe_graph import (
+    GraphScan,
+    MotionSinceKeyframe,
+    drift_covariance,
+    trajectory_edges,
+)
 
 STEP = exp([0.0, 0.1, 0.5, 2.0, -1.0, 0.3])
 SIGMA = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
