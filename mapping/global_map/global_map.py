@@ -28,8 +28,6 @@ from lidarslam.mapping.global_map.voxels import (
     TileStore,
     Tiling,
     Voxels,
-    column_cells,
-    row_cells,
     write_sums,
 )
 from lidarslam.mapping.surfels.voxel_hash import EMPTY, key_cells, reach_m
@@ -161,10 +159,7 @@ class GlobalMap(Stateful):
 
     def lies_in(self, tile: Tile) -> NDArray[np.bool_]:
         """(M,) which of `points` lie in a tile."""
-        keys = self._voxels().keys
-        low, high = self.tiling.bounds(tile)
-        x, y = column_cells(keys), row_cells(keys)
-        return (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+        return self.tiling.lies_in(tile, self._voxels().keys)
 
     def brightest(self) -> float:
         """The largest intensity of a voxel; 0 where none is known."""

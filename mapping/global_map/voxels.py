@@ -256,6 +256,10 @@ class Tiling:
         """The tiles that voxels lie in, sorted, by the voxels' sorted keys (M,)."""
         return [_tile(int(code)) for code in _distinct(self.codes(keys))]
 
+    def lies_in(self, tile: Tile, keys: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(M,) which voxels lie in a tile, by their keys (M,)."""
+        return np.asarray(self.codes(keys) == (tile[0] << _CODE_BITS) + tile[1])
+
     def bounds(self, tile: Tile, margin_m: float = 0.0) -> tuple[Tile, Tile]:
         """The cells of a tile and a margin around it: the first in x and y, and those after the last."""
         margin = math.ceil(margin_m / self.voxel_size_m)

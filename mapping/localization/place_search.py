@@ -29,8 +29,8 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
-from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Fit
-from lidarslam.mapping.tracking.scan_matcher import best_starts, measure_fit, positions_around, start_score
+from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Fit, measure_fit
+from lidarslam.mapping.tracking.scan_matcher import best_starts, positions_around, start_score
 
 # Least edge of a surfel cell in spacings of the map's points. With fewer points in and around a cell normals are
 # uncertain: at 1.7, roll was found to be degenerate in an office.

@@ -77,14 +77,10 @@ class SubmapPlacement(Stateful):
         self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans],
         scan: int,
     ) -> SurfelMap | None:  # fmt: skip
-        """The rebuilt map; None unless a submap near the sensor is missing, or lies elsewhere than it should.
+        """The rebuilt map without the latest scan; None unless a submap nearby is missing, or lies elsewhere than due.
 
-        Args:
-            targets: (K, 4, 4) T_odom_keyframe as corrected; that of the last keyframe is as it was.
-            members: (K,) which submaps are connected with the last one.
-            cell_m: edge of the finest cells.
-            submap: of a keyframe.
-            scan: the latest one, which is not in the map.
+        Targets (K, 4, 4) are T_odom_keyframe as corrected, that of the last keyframe as it was; members (K,) are the
+        submaps that are connected with the last one.
         """
         relative = np.where(members, self._distances(targets) / self.radius_m, np.inf)
         is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()

@@ -140,8 +140,7 @@ class LocalMap(Stateful, ABC):
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Planes in the coarsest resolution at points (N, 3) of the world, seen from (3,).
 
-        Returns:
-            Unit normals (N, 3), and standard deviations (N,) along them, infinite where there is no plane.
+        Unit normals (N, 3), and standard deviations (N,) along them, infinite where there is no plane.
         """
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray, level: int = 0) -> Correspondences:

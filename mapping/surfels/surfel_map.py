@@ -206,8 +206,7 @@ class SurfelMap(LocalMap):
     def of_cloud(cls, points: FloatArray, normals: FloatArray, cell_m: float, radius_m: float) -> "SurfelMap":
         """The surfels of points (N, 3) of the world whose normals (N, 3) face the side that was seen.
 
-        Raises:
-            InputError: points lie beyond the reach of the cells.
+        InputError where points lie beyond the reach of the cells.
         """
         require_reach(points, cell_m)
         surfel_map = cls(cell_m, radius_m)

@@ -6,12 +6,12 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.geometry import FloatArray, inverse, log, transform_points
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import TrackingConfig
-from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
-from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.local_map import LocalMap, Matcher
 from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 
@@ -66,48 +66,10 @@ class Fit:
     # wherever a scan slides along a street, the constraining ones do not. None when there are none.
     support: float | None = None
     # information of the inliers along the least constrained direction of translation, relative to that feigned by the
-    # noise of their normals; None where that noise is unknown, or there are none.
+    # noise of their normals; None when there are none.
     evidence: float | None = None
     weakest: tuple[float, float, float] | None = None  # that direction, unit, in the world
     unsupported: tuple[float, float, float] | None = None  # direction of the least support if that is too low
-
-    @classmethod
-    def of(
-        cls, distances: FloatArray, normals: FloatArray, ranges: FloatArray, points: int, cell_m: float,
-        thickness_m: FloatArray | None = None, tilt: FloatArray | None = None,
-    ) -> "Fit":  # fmt: skip
-        """Fit of the M of so many points that have a correspondence, to a map of this spacing.
-
-        They have distances (M,) from their surfaces and ranges (M,); the surfaces unit normals (M, 3) in the world,
-        standard deviations (M,) along these, and of the normals, radians; None where they are unknown.
-        """
-        if not len(distances):
-            return NO_FIT
-        nearest_m = max(_GATE_MIN_M, _GATE_CELLS * cell_m)
-        within_m = np.maximum(nearest_m, _GATE_RATIO * ranges)
-        inlier = distances < (within_m if thickness_m is None else np.maximum(within_m, _GATE_SIGMAS * thickness_m))
-        residual_m, facing = float(np.median(distances)), np.abs(normals).argmax(axis=1)
-        counts, inliers = np.bincount(facing), np.bincount(facing, weights=inlier)
-        ratios = (inliers / np.maximum(counts, 1))[counts >= _FEWEST_FACING]
-        distances = distances / (_HALF_CELLS * cell_m)
-        weights = None if thickness_m is None else 1.0 / (1.0 + (thickness_m / _RANGE_NOISE_M) ** 2)
-        information = translation_information(normals, distances, weights)
-        evidence, weakest = None, None
-        if tilt is not None and weights is not None:
-            noise = float((weights / (1.0 + distances**2)) @ tilt**2)
-            values, axes = np.linalg.eigh(information[1])
-            evidence, weakest = float(values[0]) / max(noise, 1e-12), tuple(axes[:, 0].tolist())
-        support, least = directional_support(*information)
-        return cls(
-            matched=len(distances),
-            overlap=len(distances) / points,
-            residual_m=residual_m,
-            inlier_ratio=float(ratios.min() if len(ratios) else inlier.mean()),
-            support=support,
-            evidence=evidence,
-            weakest=weakest,
-            unsupported=tuple(least.tolist()) if support < _DEGRADED_SUPPORT else None,
-        )
 
     @property
     def is_constrained(self) -> bool:
@@ -158,6 +120,41 @@ class Fit:
 
 
 NO_FIT = Fit(0, 0.0, None, None)
+
+
+def measure_fit(
+    points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, matcher: Matcher | None = None
+) -> Fit:
+    """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4), with the matcher of a pose nearby."""
+    matcher, world = matcher or local_map.matcher(Sweep(points)), transform_points(T_world_lidar, points)
+    matcher.match(world, T_world_lidar)
+    matches = matcher.correspondences(1)
+    if not len(matches):
+        return NO_FIT
+    normals, thickness_m = matches.normals, matches.thickness_m
+    distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
+    ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
+    within_m = np.maximum(max(_GATE_MIN_M, _GATE_CELLS * local_map.cell_m), _GATE_RATIO * ranges)
+    inlier = distances < np.maximum(within_m, _GATE_SIGMAS * thickness_m)
+    residual_m, facing = float(np.median(distances)), np.abs(normals).argmax(axis=1)
+    counts, inliers = np.bincount(facing), np.bincount(facing, weights=inlier)
+    ratios = (inliers / np.maximum(counts, 1))[counts >= _FEWEST_FACING]
+    distances = distances / (_HALF_CELLS * local_map.cell_m)
+    weights = 1.0 / (1.0 + (thickness_m / _RANGE_NOISE_M) ** 2)
+    information = translation_information(normals, distances, weights)
+    noise = float((weights / (1.0 + distances**2)) @ matches.tilt**2)
+    values, axes = np.linalg.eigh(information[1])
+    support, least = directional_support(*information)
+    return Fit(
+        matched=len(distances),
+        overlap=len(distances) / len(points),
+        residual_m=residual_m,
+        inlier_ratio=float(ratios.min() if len(ratios) else inlier.mean()),
+        support=support,
+        evidence=float(values[0]) / max(noise, 1e-12),
+        weakest=tuple(axes[:, 0].tolist()),
+        unsupported=tuple(least.tolist()) if support < _DEGRADED_SUPPORT else None,
+    )
 
 
 def directional_support(information: FloatArray, supported: FloatArray, share: float) -> tuple[float, FloatArray]:

@@ -138,8 +138,7 @@ class Mapper(Stateful):
     def redraw(self, drawn: SurfelMap, scans: int) -> bool:
         """Replace the local map of surfels by a rebuilt one without the latest `scans` scans, which are then inserted.
 
-        Returns:
-            False where another map has begun since, or a search of the map is in progress: the map stays.
+        False where another map has begun since, or a search of the map is in progress: the map stays.
         """
         if self._map is None or self._tracker.is_searching or self._map_since > self._scans - scans:
             return False

@@ -9,11 +9,11 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.registration.registration import register, with_mean_velocity
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.budget import Budget, Steps
-from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt, Fit, translation_information
+from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt, measure_fit, translation_information
 
 # Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
@@ -124,19 +124,6 @@ class ScanMatcher:
         held = start.holds(registration.T_world_lidar, _HELD_CELLS * self.local_map.cell_m)
         status = fit.status(self.config.tracking, self.local_map.is_young, held)
         return Attempt(prediction, self.local_map, registration, fit, status)
-
-
-def measure_fit(
-    points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, matcher: Matcher | None = None
-) -> Fit:
-    """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4), with the matcher of a pose nearby."""
-    matcher, world = matcher or local_map.matcher(Sweep(points)), transform_points(T_world_lidar, points)
-    matcher.match(world, T_world_lidar)
-    matches = matcher.correspondences(1)
-    distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
-    ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
-    surfaces = matches.thickness_m, matches.tilt
-    return Fit.of(distances, matches.normals, ranges, len(points), local_map.cell_m, *surfaces)
 
 
 def turned_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float) -> FloatArray:

@@ -7,8 +7,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.mapped_scan import Fit, directional_support, translation_information
-from lidarslam.mapping.tracking.scan_matcher import measure_fit
+from lidarslam.mapping.tracking.mapped_scan import Fit, directional_support, measure_fit, translation_information
 
 from .shapes import across_x, on_sides, surfel_map_of
 
