@@ -108,7 +108,7 @@ def _step(T: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     errors = np.linalg.norm(residuals, axis=1)
     scale = max(_LEAST_SCALE_M, _MAD * float(np.median(errors)))
     weights = 1.0 / (scale**2 * (1.0 + (errors / (_CAUCHY * scale)) ** 2))
-    J = np.concatenate([-R @ np.stack([skew(each) for each in x]), np.tile(R, (len(x), 1, 1))], axis=2)
+    J = np.concatenate([-R @ skew(x), np.tile(R, (len(x), 1, 1))], axis=2)
     H = np.einsum("n,nij,nik->jk", weights, J, J)
     b = np.einsum("n,nij,ni->j", weights, J, residuals)
     # The prior: R z is up, a vector whose horizontal part is the tilt; d(R z) = R (d x z) = -R [z] d.

@@ -14,7 +14,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces, vertical_of
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
@@ -427,10 +427,10 @@ class FeatureMap(LocalMap):
     def means(self) -> FloatArray:
         return np.concatenate([self._edges[1].means, self._planes[1].means])
 
-    def level_normals(self) -> FloatArray:
+    def vertical(self) -> FloatArray:
         sensor = np.zeros(3) if self._centre is None else self._centre
         normals, spread_m = self.coarse_planes(self._planes[-1].means, sensor)
-        return normals[np.isfinite(spread_m)]
+        return vertical_of(normals[np.isfinite(spread_m)])
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.thinning import central_per_cell, one_per_cell
+from lidarslam.core.thinning import central_per_cell, evenly, one_per_cell
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.sampled_scan import MAP_SPACING, MOST_SPACING_M, Sampler
 
@@ -174,8 +174,7 @@ class FeatureSampler(Sampler):
         assert sweep.kinds is not None
         edges, planes = (np.flatnonzero(sweep.kinds == kind) for kind in (EDGE, PLANE))
         edges = edges.take(central_per_cell(sweep.points.take(edges, axis=0), _EDGE_SPACING * cell_m))
-        if len(edges) > _MOST_EDGES:
-            edges = edges[np.linspace(0, len(edges) - 1, _MOST_EDGES).astype(np.intp)]
+        edges = evenly(edges, _MOST_EDGES)
         return np.concatenate([edges, planes.take(super()._keypoints(sweep.take(planes), cell_m))])
 
 

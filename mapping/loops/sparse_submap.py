@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, levelling
 from lidarslam.core.state import BlockFile
-from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.thinning import evenly, one_per_cell
 
 PLANE, LINE = 1, 2
 # Nearer points are mostly the carrier itself.
@@ -60,9 +60,7 @@ class SparseSubmap:
         range_m = float(np.median(ranges)) if len(ranges) else 1.0
         cell_m = float(np.clip(range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
         fine = points[one_per_cell(points, 0.5 * cell_m)]
-        chosen = one_per_cell(fine, 2.0 * cell_m)
-        if len(chosen) > _MAX_POINTS:
-            chosen = chosen[np.linspace(0, len(chosen) - 1, _MAX_POINTS).astype(np.intp)]
+        chosen = evenly(one_per_cell(fine, 2.0 * cell_m), _MAX_POINTS)
         kinds, axes, tilt = _shapes(fine, fine[chosen])
         image = np.full(PIXELS[0] * PIXELS[1], np.inf)
         np.minimum.at(image, _pixels(points, ranges), ranges)

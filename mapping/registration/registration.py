@@ -132,7 +132,7 @@ def register(
                 velocity = velocity + solution.step[6:]
                 iterations += 1
                 unknown = _NARROWING**iterations * solution.covariance()
-                if _has_converged(solution.step, level, cell_m, system.lever_m):
+                if _has_converged(solution.step, level, cell_m, system.degeneracy.lever_m):
                     if level > 0 or inflation is not uniform:
                         break
                     found = inflation_of_small(points, T_world_lidar, matcher.surfaces, local_map)
@@ -237,10 +237,6 @@ class _System:
     degeneracy: Degeneracy
     squared_time: float  # mean square of the residuals' times
 
-    @property
-    def lever_m(self) -> float:
-        return self.degeneracy.lever_m
-
     @classmethod
     def of(
         cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces,
@@ -298,7 +294,7 @@ class _Solution:
     @cached_property
     def _observed(self) -> FloatArray:
         """(12, 12) projector onto the directions that are not degenerate."""
-        scale, D = lever_scale(self.system.lever_m), self.system.degeneracy.directions
+        scale, D = lever_scale(self.system.degeneracy.lever_m), self.system.degeneracy.directions
         observed = np.zeros((12, 12))  # several times as fast as `np.kron`
         observed[:6, :6] = observed[6:, 6:] = np.eye(6) - (D / scale).T @ (D * scale)
         return observed

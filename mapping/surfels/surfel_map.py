@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
-from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces, vertical_of
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
@@ -242,10 +242,9 @@ class SurfelMap(LocalMap):
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
         return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
 
-    def level_normals(self) -> FloatArray:
-        grid = self._grids[-1]
-        surfels = grid.surfels(np.arange(len(grid), dtype=np.int32))
-        return np.asarray(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL], dtype=np.float64)
+    def vertical(self) -> FloatArray:
+        surfels = self._grids[-1].surfels(np.arange(len(self._grids[-1]), dtype=np.int32))
+        return vertical_of(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL])
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         grid = self._grids[-1]

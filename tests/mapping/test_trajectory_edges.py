@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
-from lidarslam.mapping.pose_graph import edges
+from lidarslam.mapping.pose_graph import keyframe_graph
 from lidarslam.mapping.pose_graph.keyframe_graph import (
     GraphScan,
     MotionSinceKeyframe,
@@ -54,7 +54,7 @@ def test_an_edge_is_as_precise_as_both_poses_and_the_drift_between():
     assert [(e.first, e.second) for e in (refined, measured)] == [(6, 7), (6, 7)]
     A = adjoint(inverse(STEP))
     np.testing.assert_allclose(refined.covariance, drift_covariance(1.5) + SIGMA + A @ before @ A.T, rtol=1e-12)
-    np.testing.assert_allclose(measured.covariance, edges._ODOMETRY_CAUTION**2 * SIGMA, rtol=1e-12)
+    np.testing.assert_allclose(measured.covariance, keyframe_graph._ODOMETRY_CAUTION**2 * SIGMA, rtol=1e-12)
 
 
 def test_where_tracking_was_lost_the_edge_is_loose_whatever_the_covariances_of_the_poses():
