@@ -164,11 +164,6 @@ class Voxels:
         return between.chosen((y >= low[1]) & (y < high[1]))
 
 
-def column_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells (M,) along x of voxels, by their keys (M,)."""
-    return (keys >> (2 * BITS)) - OFFSET
-
-
 def row_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Cells (M,) along y of voxels, by their keys (M,)."""
     return ((keys >> BITS) & _MASK) - OFFSET
@@ -250,7 +245,8 @@ class Tiling:
 
     def codes(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """(M,) the tiles of voxels as single numbers, in the order of tiles, by the voxels' keys (M,)."""
-        return ((column_cells(keys) // self.cells) << _CODE_BITS) + row_cells(keys) // self.cells
+        columns = ((keys >> (2 * BITS)) - OFFSET) // self.cells
+        return (columns << _CODE_BITS) + row_cells(keys) // self.cells
 
     def tiles(self, keys: NDArray[np.int64]) -> list[Tile]:
         """The tiles that voxels lie in, sorted, by the voxels' sorted keys (M,)."""

@@ -1,5 +1,6 @@
 """Registration of one scan to one map: from its prediction, or from the best of some start poses anywhere."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,6 +92,13 @@ class ScanMatcher:
             return held
         return replace(held, registration=held.registration.without(direction, start))
 
+    def displaced(self, start: Prediction, offsets_m: Iterable[float], direction: FloatArray) -> Iterator[Prediction]:
+        """Starts displaced along a direction (3,) of the world, one after another while the budget lasts."""
+        for offset_m in offsets_m:
+            if self.budget.is_spent:
+                return
+            yield start.displaced(offset_m * direction)
+
     def _found_along(
         self, prediction: Prediction, start: Prediction, direction: FloatArray, keypoints: Sweep
     ) -> Attempt | None:
@@ -99,16 +107,11 @@ class ScanMatcher:
         None where no attempt is constrained.
         """
         reach_m, spacing_m = _FOUND_SIGMAS * start.sigma_along(direction), _FOUND_CELLS * self.local_map.cell_m
-        best = None
-        for steps in range(1, int(reach_m / spacing_m) + 1):
-            for sign in (-1.0, 1.0):
-                if self.budget.is_spent:
-                    return best
-                moved = start.displaced(sign * steps * spacing_m * direction)
-                found = self._registered(prediction, moved, False, False, keypoints)
-                if found.fit.is_constrained and (best is None or found.fit.constraint > best.fit.constraint):
-                    best = found
-        return best
+        steps = range(1, int(reach_m / spacing_m) + 1)
+        starts = self.displaced(start, [sign * n * spacing_m for n in steps for sign in (-1.0, 1.0)], direction)
+        found = (self._registered(prediction, moved, False, False, keypoints) for moved in starts)
+        constrained = (attempt for attempt in found if attempt.fit.is_constrained)
+        return max(constrained, key=lambda attempt: attempt.fit.constraint, default=None)
 
     def _registered(
         self, prediction: Prediction, start: Prediction, coarse_first: bool, patient: bool, keypoints: Sweep
