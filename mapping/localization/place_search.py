@@ -127,15 +127,15 @@ def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bo
 
 
 class Regions:
-    """Regions of the map as surfels: all within reach of a position, and a share more; the latest few are kept."""
+    """Regions of the map as surfels: all within reach of a position, and a margin; the latest few are kept."""
 
     def __init__(self, fixed_map: FixedMap, spare: float, kept: int = 1) -> None:
-        self._map, self._spare, self._kept = fixed_map, spare, kept
+        self._map, self._spare, self._kept = fixed_map, spare, kept  # the margin is this share of the reach
         self.cell_m, self._reach_m, self._spare_m = 0.0, 0.0, 0.0
         self._drawn: list[tuple[FloatArray, SurfelMap]] = []
 
     def resize(self, wanted_m: float, reach_m: float) -> None:
-        """Begin with regions of this reach where the edge of cells that is wanted makes for others than before."""
+        """Adapt to the wanted edge of cells; where that changes theirs, begin again with regions of this reach."""
         cell_m = self._map.cell_m(wanted_m)
         if cell_m != self.cell_m:
             self.cell_m, self._reach_m, self._spare_m, self._drawn = cell_m, reach_m, self._spare * reach_m, []
