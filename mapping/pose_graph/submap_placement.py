@@ -77,7 +77,7 @@ class SubmapPlacement(Stateful):
         self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans],
         scan: int,
     ) -> SurfelMap | None:  # fmt: skip
-        """The rebuilt map without the latest scan; None unless a submap nearby is missing, or lies elsewhere than due.
+        """The map rebuilt without the latest scan; None unless a submap nearby is missing, or lies where it should not.
 
         Targets (K, 4, 4) are T_odom_keyframe as corrected, that of the last keyframe as it was; members (K,) are the
         submaps that are connected with the last one.

@@ -54,7 +54,7 @@ def gauss_newton(
     linearise: Callable[[FloatArray], NormalEquations | None], T: FloatArray, prior: FloatArray,
     prior_information: FloatArray, most_steps: int, lever_m: float, settled_m: float,
 ) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
-    """The pose from T (4, 4) and its Hessian (6, 6), with a prior (4, 4) of the given information (6, 6).
+    """The pose at the minimum, from T (4, 4) on, and the Hessian (6, 6), with a prior (4, 4) of an information (6, 6).
 
     None where the correspondences are too few.
     """
