@@ -31,7 +31,7 @@ from lidarslam.mapping.global_map.global_map import voxel_size_for
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.pose_graph.correction import Corrected
-from lidarslam.mapping.pose_graph.edges import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.simulation.recorder import Simulation

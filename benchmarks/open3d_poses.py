@@ -25,8 +25,7 @@ from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.loops.detection import KeyframeDatabase
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.loops.verification import register, verify
-from lidarslam.mapping.pose_graph.edges import drift_covariance
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector, drift_covariance
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
 from lidarslam.pipeline.threads import in_order

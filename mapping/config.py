@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from lidarslam.core.plugins import PlugPoint
-from lidarslam.core.settings import Settings, require_lost_worse, require_range_left
+from lidarslam.core.settings import Settings, require_range_left
 
 MappingName = Literal["surfels", "loam", "off"]
 MAPPINGS = PlugPoint("mapping", get_args(MappingName))
@@ -19,14 +19,18 @@ BudgetMs = Annotated[float, Field(ge=1.0, le=1e6)] | Literal["auto"] | None
 
 
 class TrackingConfig(Settings):
-    """Inlier ratios that a registered scan needs; see `mapping.tracking.fit`."""
+    """Inlier ratios that a registered scan needs; see `mapping.tracking.mapped_scan`."""
 
     degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio below which a scan is degraded")
     lost_below: float = Field(0.45, ge=0.0, le=1.0, description="inlier ratio below which a scan is lost")
 
     @model_validator(mode="after")
     def _lost_is_worse_than_degraded(self) -> Self:
-        require_lost_worse(self.lost_below, self.degraded_below)
+        if self.lost_below > self.degraded_below:
+            raise ValueError(
+                f"lost_below={self.lost_below:g} must not exceed degraded_below={self.degraded_below:g},"
+                " as a lost scan is worse than a degraded one"
+            )
         return self
 
 

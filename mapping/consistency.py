@@ -186,13 +186,9 @@ def vote(
     it if it is then within a's radius; the vote falls off to zero at a distance of `gate_m` from the plane. A surfel
     has at most one vote for each shift.
 
-    Args:
-        points, normals: (M, 3) surfels of the one scan, those of a block successively.
-        blocks: (M,) ascending, which block each belongs to.
-        held_points, held_normals, held_radii: (K, 3), (K, 3), (K,) of the other, in the same frame.
-        direction: (3,) unit vector; held normals are not at right angles to it.
-        gate_m, bin_m: width of a vote, and between shifts.
-        votes: (B, S) written, of each block; the shift of zero is in the middle.
+    The M surfels of the one scan are in the order of their blocks (M,); the K of the other are in the same frame, none
+    of their normals at right angles to the direction (3,). Votes (B, S) are of each block, for shifts every `bin_m`,
+    that of zero in the middle.
     """
     votes[:, :] = 0.0
     middle = votes.shape[1] // 2

@@ -1,4 +1,4 @@
-"""The base of all settings that a configuration file holds, and checks of two settings against each other."""
+"""The base of all settings that a configuration file holds, and a check of two settings against each other."""
 
 from pydantic import BaseModel, ConfigDict
 
@@ -14,13 +14,4 @@ def require_range_left(min_range_m: float, max_range_m: float) -> None:
     if min_range_m >= max_range_m:
         raise ValueError(
             f"min_range_m={min_range_m:g} must be less than max_range_m={max_range_m:g}, or no point is left"
-        )
-
-
-def require_lost_worse(lost_below: float, degraded_below: float) -> None:
-    """The threshold of lost must not exceed that of degraded."""
-    if lost_below > degraded_below:
-        raise ValueError(
-            f"lost_below={lost_below:g} must not exceed degraded_below={degraded_below:g},"
-            " as a lost scan is worse than a degraded one"
         )

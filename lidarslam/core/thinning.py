@@ -42,6 +42,12 @@ def central_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     return np.sort(kept[: _most_central(points, slots, _slot_values(), sums, kept)])
 
 
+def evenly(indices: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """At most so many of the indices, evenly spread."""
+    count = len(indices)
+    return indices if count <= most else indices[np.linspace(0, count - 1, most).astype(np.intp)]
+
+
 def _slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
     slots = np.empty(len(points), dtype=np.int32)
     _write_slots(points, np.float32(1.0 / cell_m), slots)

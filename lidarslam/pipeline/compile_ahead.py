@@ -129,14 +129,14 @@ PARTS = {
         _surfels,
         (
             *(f"mapping.surfels.{name}" for name in ("voxel_hash", "surfel_kernels", "surfel_map")),
-            "mapping.registration.linear_kernels",
+            "mapping.registration.registration",
         ),
     ),
     "loam": Part(
         partial(_register, "loam"),
         (
             *(f"mapping.loam.{name}" for name in ("features", "feature_map")),
-            "mapping.registration.linear_kernels",
+            "mapping.registration.registration",
             "mapping.surfels.voxel_hash",
         ),
     ),

@@ -11,7 +11,7 @@ from lidarslam.core.state import TRANSFORM, Shape
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew, even
 from lidarslam.mapping.motion.prediction import GravityDirection
-from lidarslam.mapping.pose_graph.edges import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.odometry.interface import Motion
 

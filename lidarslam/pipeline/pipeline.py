@@ -20,8 +20,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.voxels import TileStore
-from lidarslam.mapping.pose_graph.edges import GraphScan
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan, KeyframeGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline import threads

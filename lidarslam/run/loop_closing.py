@@ -17,8 +17,8 @@ from lidarslam.run.summary import GraphSummary, LoopReport, Milliseconds, ScanLo
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.global_map.georeference import ProjectedTrack
     from lidarslam.mapping.pose_graph.correction import Corrected
-    from lidarslam.mapping.pose_graph.edges import ProjectedTrack
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)

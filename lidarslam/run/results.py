@@ -20,8 +20,7 @@ from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat
 from lidarslam.mapping.consistency import PairTest, find_contradictions
-from lidarslam.mapping.global_map.drawing import DrawnMap, TiledMap, drawn_map
-from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.global_map.global_map import DrawnMap, GlobalMap, TiledMap, drawn_map
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.mapping.global_map.voxels import Tile

@@ -21,7 +21,7 @@ from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.config import MAPPINGS
 from lidarslam.mapping.elevation import ElevationEstimator
-from lidarslam.mapping.global_map.drawing import DrawnMap
+from lidarslam.mapping.global_map.global_map import DrawnMap
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import GivenLoops
 from lidarslam.mapping.motion.prediction import Prior
@@ -49,8 +49,8 @@ from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM and SciPy take a while to load
+    from lidarslam.mapping.global_map.georeference import ProjectedTrack
     from lidarslam.mapping.inertial.inertial import Inertial
-    from lidarslam.mapping.pose_graph.edges import ProjectedTrack
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
@@ -108,7 +108,7 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
     if not (request.config.pose_graph.enabled and request.config.pose_graph.gnss):
         return None
     from lidarslam.exports.geo import read_gnss, utm_around
-    from lidarslam.mapping.pose_graph.edges import ProjectedTrack
+    from lidarslam.mapping.global_map.georeference import ProjectedTrack
 
     track = read_gnss(request.source, request.config.reader)
     utm = utm_around(track.geodetic)

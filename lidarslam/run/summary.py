@@ -18,7 +18,7 @@ from lidarslam.core.text import count
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.consistency import Contradiction
-from lidarslam.mapping.global_map.drawing import TiledMap
+from lidarslam.mapping.global_map.global_map import TiledMap
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.calibration import Elevation, time_scale, time_scale_warning

@@ -1,11 +1,12 @@
-"""Alignment of a trajectory with a GNSS track: where the world of a run lies on the Earth."""
+"""Alignment of a trajectory with a GNSS track: where the world of a run lies on the Earth; positions for its graph."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, exp, make_transform, skew
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, skew
 from lidarslam.core.trajectory import Trajectory
 
 # Prior standard deviation of the tilt of the world's z axis, which positions on a straight line leave open.
@@ -14,6 +15,10 @@ _ITERATIONS = 30
 # Of the scale of the residuals: of the median of |N(0, 1)|, a floor in metres, and Cauchy's weights.
 _MAD, _LEAST_SCALE_M, _CAUCHY = 1.4826, 0.01, 2.385
 _FEWEST = 5
+# Errors of GNSS are correlated over this time, seconds: positions within it count as one.
+_CORRELATED_S = 10.0
+# Standard deviations, metres: where none is stated, and at least. That of the height is larger by the factor.
+_UNKNOWN_M, _LEAST_GNSS_M, _HEIGHT = 3.0, 0.02, 2.0
 
 
 class TooFewPositionsError(ValueError):
@@ -103,7 +108,7 @@ def _step(T: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     errors = np.linalg.norm(residuals, axis=1)
     scale = max(_LEAST_SCALE_M, _MAD * float(np.median(errors)))
     weights = 1.0 / (scale**2 * (1.0 + (errors / (_CAUCHY * scale)) ** 2))
-    J = np.concatenate([-R @ np.stack([skew(each) for each in x]), np.tile(R, (len(x), 1, 1))], axis=2)
+    J = np.concatenate([-R @ skew(x), np.tile(R, (len(x), 1, 1))], axis=2)
     H = np.einsum("n,nij,nik->jk", weights, J, J)
     b = np.einsum("n,nij,ni->j", weights, J, residuals)
     # The prior: R z is up, a vector whose horizontal part is the tilt; d(R z) = R (d x z) = -R [z] d.
@@ -113,3 +118,46 @@ def _step(T: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     H += J_tilt.T @ J_tilt / _TILT**2
     b -= J_tilt.T @ tilt / _TILT**2
     return np.asarray(np.linalg.solve(H, b), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class AntennaPosition:
+    """A measured position, assigned to the keyframe nearest in time."""
+
+    key: int
+    antenna: FloatArray  # (3,) in the keyframe's LiDAR frame, by the registered motion between both
+    measured: FloatArray  # (3,) x east, y north, z up, metres
+    sigmas: FloatArray  # (3,) metres
+    repeats: float  # number of positions whose errors are correlated
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedTrack:
+    """A GNSS track in a map projection."""
+
+    track: GnssTrack
+    projected: FloatArray  # (N, 3) metres
+    scale: float  # of the projection at this place
+
+    def aligned(self, trajectory: Trajectory) -> FloatArray:
+        """T_map_world (4, 4) of a trajectory; the origin of the map is the first position."""
+        T = align_to_track(trajectory, self.track, self.projected - self.projected[0], self.scale).T_map_world.copy()
+        T[:3, 3] /= self.scale
+        return T
+
+    def positions(self, trajectory: Trajectory, keyframe_scans: Sequence[int]) -> list[AntennaPosition]:
+        """The positions within the time of a trajectory (M poses), assigned to the keyframes among its scans."""
+        track, scans = self.track, np.asarray(keyframe_scans)
+        rows = np.flatnonzero(track.is_within(trajectory, self.projected))
+        keys = np.abs(trajectory.stamps[scans][None, :] - track.stamps[rows, None]).argmin(axis=1)
+        antennas = trajectory.at(track.stamps[rows]) @ np.append(track.lidar_antenna, 1.0)
+        T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])
+        antennas = np.einsum("nij,nj->ni", T_keyframe_world, antennas)[:, :3]
+        measured = (self.projected[rows] - self.projected[0]) / self.scale
+        repeats = max(1.0, len(rows) * _CORRELATED_S / max(float(np.ptp(track.stamps[rows])), _CORRELATED_S))
+        stated = np.where(np.isfinite(track.sigma_m[rows]), track.sigma_m[rows], _UNKNOWN_M)
+        sigmas = np.maximum(stated, _LEAST_GNSS_M)[:, None] * np.array([1.0, 1.0, _HEIGHT])
+        return [
+            AntennaPosition(int(key), antenna, position, sigma, repeats)
+            for key, antenna, position, sigma in zip(keys, antennas, measured, sigmas, strict=True)
+        ]

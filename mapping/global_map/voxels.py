@@ -164,11 +164,6 @@ class Voxels:
         return between.chosen((y >= low[1]) & (y < high[1]))
 
 
-def column_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells (M,) along x of voxels, by their keys (M,)."""
-    return (keys >> (2 * BITS)) - OFFSET
-
-
 def row_cells(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Cells (M,) along y of voxels, by their keys (M,)."""
     return ((keys >> BITS) & _MASK) - OFFSET
@@ -250,11 +245,16 @@ class Tiling:
 
     def codes(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """(M,) the tiles of voxels as single numbers, in the order of tiles, by the voxels' keys (M,)."""
-        return ((column_cells(keys) // self.cells) << _CODE_BITS) + row_cells(keys) // self.cells
+        columns = ((keys >> (2 * BITS)) - OFFSET) // self.cells
+        return (columns << _CODE_BITS) + row_cells(keys) // self.cells
 
     def tiles(self, keys: NDArray[np.int64]) -> list[Tile]:
         """The tiles that voxels lie in, sorted, by the voxels' sorted keys (M,)."""
         return [_tile(int(code)) for code in _distinct(self.codes(keys))]
+
+    def lies_in(self, tile: Tile, keys: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(M,) which voxels lie in a tile, by their keys (M,)."""
+        return np.asarray(self.codes(keys) == (tile[0] << _CODE_BITS) + tile[1])
 
     def bounds(self, tile: Tile, margin_m: float = 0.0) -> tuple[Tile, Tile]:
         """The cells of a tile and a margin around it: the first in x and y, and those after the last."""

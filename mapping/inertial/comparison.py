@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, log, make_transform
+from lidarslam.core.geometry import FloatArray, exp, log, make_transform, skew
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.mapping.inertial.window import Preintegration
 
@@ -164,7 +164,7 @@ class Comparison:
         rows = np.array(self._turns).reshape(-1, 13)
         a, b, change, spans = rows[:, :3], rows[:, 3:6], rows[:, 6:9], rows[:, 9]
         J = np.zeros((len(rows), 3, 7))
-        J[:, :, 0], J[:, :, 1:4] = change, -_skews(b)
+        J[:, :, 0], J[:, :, 1:4] = change, -skew(b)
         J[:, :, 4:] = -spans[:, None, None] * np.eye(3)
         prior = np.diag(np.array([_CLOCK_S, *3 * [_ROTATION], *3 * [_BIAS]]) ** -2.0)
         x, covariance = _robust_fit(J, a - b, prior, _TURN_ERROR)
@@ -277,8 +277,3 @@ def _share(remaining: FloatArray, of: FloatArray) -> float:
 
 def _vector(R: FloatArray) -> FloatArray:
     return log(make_transform(R, np.zeros(3)))[:3]
-
-
-def _skews(vectors: FloatArray) -> FloatArray:
-    """(N, 3, 3) matrices of the cross product."""
-    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2), dtype=np.float64)

@@ -14,7 +14,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces, vertical_of
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
@@ -105,12 +105,9 @@ def match_features(
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
     `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
-    normal, are moved to its beginning. A plane that is known better takes the place of another. The normal of a plane
-    faces the sensor (3,), and so did the plane when it was seen; the first of a line points from that to the point.
-    With `has_rings`, planes that may be those of a single ring do not count.
-
-    Returns:
-        Number of the points that were moved.
+    normal, are moved to its beginning; their number is returned. A plane that is known better takes the place of
+    another. The normal of a plane faces the sensor (3,), and so did the plane when it was seen; the first of a line
+    points from that to the point. With `has_rings`, planes that may be those of a single ring do not count.
     """
     left, scale = 0, 1.0 / voxels.cell_m
     around, near = np.empty(27, dtype=np.int64), np.empty(NEIGHBOURS, dtype=np.int64)
@@ -267,10 +264,7 @@ def _spans_rings(
 def _uncertainty(across: float, along: float, number: float, spent: float) -> tuple[float, float]:
     """Standard deviations of a line or plane across it, with that of its position, and of its direction.
 
-    Args:
-        across, along: variances of its points.
-        number: of the points.
-        spent: residuals that the fit takes.
+    Of so many points with variances across and along it; the fit takes `spent` residuals.
     """
     noise = _COUNTED * _RANGE_NOISE_M * _RANGE_NOISE_M
     variance = (number * max(across, 0.0) + noise) / (max(number - spent, 0.0) + _COUNTED)
@@ -370,14 +364,9 @@ class VoxelGrid(Stateful):
 
 
 class FeatureMatcher(Matcher):
-    """Lines of edges and planes of other points, through their nearest voxels.
+    """Lines of edges and planes of other points of a sweep, through their nearest voxels in grids, the finest first.
 
     A point that has moved by a small part of a cell since it was matched keeps its line or plane.
-
-    Args:
-        edges, planes: grids of voxels, the finest first.
-        has_rings: whether points of the map lie in rings.
-        sweep: with the kinds of its points; without, all points are planar.
     """
 
     def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], has_rings: bool, sweep: Sweep) -> None:
@@ -438,10 +427,10 @@ class FeatureMap(LocalMap):
     def means(self) -> FloatArray:
         return np.concatenate([self._edges[1].means, self._planes[1].means])
 
-    def level_normals(self) -> FloatArray:
+    def vertical(self) -> FloatArray:
         sensor = np.zeros(3) if self._centre is None else self._centre
         normals, spread_m = self.coarse_planes(self._planes[-1].means, sensor)
-        return normals[np.isfinite(spread_m)]
+        return vertical_of(normals[np.isfinite(spread_m)])
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.thinning import central_per_cell, one_per_cell
+from lidarslam.core.thinning import central_per_cell, evenly, one_per_cell
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.sampled_scan import MAP_SPACING, MOST_SPACING_M, Sampler
 
@@ -43,12 +43,9 @@ _ROW_RAD = np.deg2rad(0.5)
 
 @compiled
 def write_curvatures(points: FloatArray, rings: NDArray[np.intp], curvature: FloatArray) -> None:
-    """Write the squared length (N,) of the sum of differences to ten neighbours on the ring; NaN at its ends.
+    """Write the squared length (N,), m^2, of the sum of differences to ten neighbours on the ring; NaN at its ends.
 
-    Args:
-        points: (N, 3) ring after ring.
-        rings: (N,) ascending.
-        curvature: written, square metres.
+    Points (N, 3) are in the order of their rings (N,).
     """
     for i in range(len(points)):
         curvature[i] = np.nan
@@ -68,14 +65,9 @@ def classify(
     points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], curvature: FloatArray, above_noise: float,
     kinds: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Write whether points are edges, planar, or neither.
+    """Write whether points (N, 3), ring after ring, are edges, planar, or neither.
 
-    Args:
-        points, ranges: (N, 3) and (N,), ring after ring.
-        rings, curvature: (N,) of the points.
-        above_noise: multiple of its sector's median curvature that an edge needs; the others are planar where they are
-            reliable.
-        kinds: (N,) written.
+    An edge needs `above_noise` times the median curvature of its sector; others are planar where they are reliable.
     """
     free = np.empty(len(points), dtype=np.bool_)
     _write_reliable(points, ranges, rings, curvature, kinds, free)
@@ -182,8 +174,7 @@ class FeatureSampler(Sampler):
         assert sweep.kinds is not None
         edges, planes = (np.flatnonzero(sweep.kinds == kind) for kind in (EDGE, PLANE))
         edges = edges.take(central_per_cell(sweep.points.take(edges, axis=0), _EDGE_SPACING * cell_m))
-        if len(edges) > _MOST_EDGES:
-            edges = edges[np.linspace(0, len(edges) - 1, _MOST_EDGES).astype(np.intp)]
+        edges = evenly(edges, _MOST_EDGES)
         return np.concatenate([edges, planes.take(super()._keypoints(sweep.take(planes), cell_m))])
 
 

@@ -25,8 +25,7 @@ from lidarslam.mapping.localization.place_search import (
 )
 from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
-from lidarslam.mapping.tracking.fit import Fit
-from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, MappedScan
+from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, Fit, MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.mapping.tracking.tracker import Tracker
 from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER
@@ -58,12 +57,12 @@ class LocalMapping:
         self._followed: list[int] = []  # numbers of the scans that the latest one follows without a break
         self._mapper = Mapper(config)
         self._first = first
-        self._count = self._lost = 0
+        self.count = self._lost = 0  # scans in all, and those lost in a row
         self._next_search, self._wait = _FIRST_SEARCH, float(_FIRST_SEARCH)
 
     def add(self, scan: SampledScan, prior: Prior) -> MappedScan:
         """Map the next scan."""
-        mapped, number = self._mapper.process(scan, prior), self._first + self._count
+        mapped, number = self._mapper.process(scan, prior), self._first + self.count
         self.poses[number] = mapped.state.T_world_lidar
         if mapped.status is not Status.LOST:
             self._lost = 0
@@ -75,7 +74,7 @@ class LocalMapping:
             self._lost += 1
             if self._lost >= GIVE_UP_AFTER:  # the local map restarts at a pose that is only predicted
                 self.kept, self._followed, self._lost = KeptScans(), [], 0
-        self._count += 1
+        self.count += 1
         return mapped
 
     def followed_within(self, ranges: float, before: int) -> list[int]:
@@ -94,17 +93,12 @@ class LocalMapping:
         local_map = self._mapper.local_map
         return np.array([0.0, 0.0, 1.0]) if local_map is None else local_map.vertical()
 
-    @property
-    def searches_nearby(self) -> bool:
-        """Whether a place that is supposed is to be tried now."""
-        return self._count % _NEARBY_EVERY == 0
-
     def searches_anywhere(self) -> bool:
         """Whether the whole map is to be searched now; the next search is postponed."""
-        if self._count < self._next_search:
+        if self.count < self._next_search:
             return False
         self._wait = min(_GROWTH * self._wait, float(_LONGEST))
-        self._next_search = self._count + round(self._wait)
+        self._next_search = self.count + round(self._wait)
         return True
 
 
@@ -124,13 +118,12 @@ class MapLocaliser(Stateful):
         self, config: MappingConfig, fixed_map: FixedMap, guess: tuple[float, float, float] | None = None
     ) -> None:
         self._config = config
-        self._map = fixed_map
         self._sampler = Sampler(config)
         self._search = PlaceSearch(fixed_map, config.max_range_m)
         self._local: LocalMapping | None = LocalMapping(config, None)
         self._guess = guess
         self._tracker: Tracker | None = None
-        self._regions: Regions | None = None
+        self._regions = Regions(fixed_map, _SPARE)
         self._last: MotionState | None = None
         self._pending: tuple[Localisation, FloatArray] | None = None  # unconfirmed, and its `T_map_local` (4, 4)
         self._count = 0
@@ -175,7 +168,8 @@ class MapLocaliser(Stateful):
         prediction = tracker.tracking.predict(scan, prior, last, self._config)
         if scan.is_sparse:
             return self._lose(tracker, prediction, None, f"only {len(scan)} points within range")
-        surfel_map = self._regions_for(scan).around(prediction.T_world_lidar[:3, 3])
+        self._regions.resize(scan.cell_m, min(_RANGES * scan.range_m, self._config.radius_m))
+        surfel_map = self._regions.around(prediction.T_world_lidar[:3, 3])
         attempt = tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.registration is None or attempt.status is Status.LOST:
             reason = attempt.fit.explain(self._config.tracking) or "several places nearby fit alike"
@@ -231,7 +225,7 @@ class MapLocaliser(Stateful):
 
     def _searched(self, local: LocalMapping, own: MappedScan) -> Found | None:
         nearby = None
-        if local.searches_nearby:
+        if local.count % _NEARBY_EVERY == 0:
             if self._guess is not None:
                 local.T_map_local = self._search.guessed(local.kept, local.up, *self._guess)
             if local.T_map_local is not None:
@@ -256,14 +250,6 @@ class MapLocaliser(Stateful):
             state, place.T_map_lidar, True, Status.DEGRADED, message, place.fits[0],
             place.registration.degeneracy.names, place.registration.iterations, is_connected=False,
         )  # fmt: skip
-
-    def _regions_for(self, scan: SampledScan) -> Regions:
-        """The drawn region of the map; a new one where the scale of the scene has changed."""
-        cell_m = self._map.cell_m(scan.cell_m)
-        if self._regions is None or self._regions.cell_m != cell_m:
-            reach_m = min(_RANGES * scan.range_m, self._config.radius_m)
-            self._regions = Regions(self._map, cell_m, reach_m, _SPARE * reach_m)
-        return self._regions
 
 
 def _dead_reckoned(local: LocalMapping, own: MappedScan, reason: str) -> MappedScan:

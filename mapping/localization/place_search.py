@@ -29,9 +29,8 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
-from lidarslam.mapping.tracking.fit import NO_FIT, Fit
-from lidarslam.mapping.tracking.scan_matcher import measure_fit
-from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
+from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Fit, measure_fit
+from lidarslam.mapping.tracking.scan_matcher import best_starts, positions_around, start_score
 
 # Least edge of a surfel cell in spacings of the map's points. With fewer points in and around a cell normals are
 # uncertain: at 1.7, roll was found to be degenerate in an office.
@@ -130,9 +129,16 @@ def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bo
 class Regions:
     """Regions of the map as surfels: all within reach of a position, and a margin; the latest few are kept."""
 
-    def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:
-        self._map, self.cell_m, self._reach_m, self._spare_m, self._kept = fixed_map, cell_m, reach_m, spare_m, kept
+    def __init__(self, fixed_map: FixedMap, spare: float, kept: int = 1) -> None:
+        self._map, self._spare, self._kept = fixed_map, spare, kept  # the margin is this share of the reach
+        self.cell_m, self._reach_m, self._spare_m = 0.0, 0.0, 0.0
         self._drawn: list[tuple[FloatArray, SurfelMap]] = []
+
+    def resize(self, wanted_m: float, reach_m: float) -> None:
+        """Adapt to the wanted edge of cells; where that changes theirs, begin again with regions of this reach."""
+        cell_m = self._map.cell_m(wanted_m)
+        if cell_m != self.cell_m:
+            self.cell_m, self._reach_m, self._spare_m, self._drawn = cell_m, reach_m, self._spare * reach_m, []
 
     def around(self, position: FloatArray) -> SurfelMap:
         """A region with all that is within reach of a position (3,)."""
@@ -249,7 +255,7 @@ class PlaceSearch:
     def __init__(self, fixed_map: FixedMap, max_range_m: float) -> None:
         self._map = fixed_map
         self._max_range_m = max_range_m
-        self._regions: Regions | None = None
+        self._regions = Regions(fixed_map, _SPARE, _REGIONS)
 
     def anywhere(self, scans: KeptScans, up: FloatArray) -> Found:
         """Search the whole map with the scans kept so far; `up` (3,) is the vertical of their local frame."""
@@ -268,31 +274,25 @@ class PlaceSearch:
         kept = scans.chosen(_OTHERS)
         if not starts:
             return "there is nothing upright to search with"
-        reach_m, cell_m = self._reach_m(kept[0]), self._map.cell_m(kept[0].cell_m)
-        if self._regions is None or self._regions.cell_m != cell_m:
-            self._regions = Regions(self._map, cell_m, reach_m, _SPARE * reach_m, _REGIONS)
-        regions = self._regions
+        self._regions.resize(kept[0].cell_m, self._reach_m(kept[0]))
         few = replace(kept[0], keypoints=kept[0].keypoints[:: max(1, len(kept[0].keypoints) // _FEW_POINTS)])
-        scores = [start_score(few.keypoints, start, regions.around(start[:3, 3])) for start in starts]
+        scores = [start_score(few.keypoints, start, self._regions.around(start[:3, 3])) for start in starts]
         promising = [starts[index] for index in np.argsort(scores)[::-1][:_PROMISING]]
-        rough = self._places(few, promising, _ROUGH, regions)
+        rough = self._places(few, promising, _ROUGH)
         likely = [place.T_map_lidar for place in rough if place.quality > _LIKELY * rough[0].quality]
-        places = self._places(kept[0], likely, _CHAINED, regions)
+        places = self._places(kept[0], likely, _CHAINED)
         if not places:
             return "no place in the map fits at all"
         if not places[0].objection():
-            places = [place for place in places if place.quality > _RIVAL * places[0].quality]
-            places = [self._with_others(place, kept, regions) for place in places]
-            places.sort(key=lambda place: -place.quality)
+            rivals = [place for place in places if place.quality > _RIVAL * places[0].quality]
+            places = sorted((self._with_others(place, kept) for place in rivals), key=lambda place: -place.quality)
         return _decided(places)
 
-    def _places(
-        self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float], regions: Regions
-    ) -> list[Place]:
+    def _places(self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float]) -> list[Place]:
         """The different places that a scan is registered at from poses (4, 4), by descending quality."""
         places: list[Place] = []
         for start in starts:
-            place = self._register(scan, start, sigmas, regions)
+            place = self._register(scan, start, sigmas)
             if place is not None and not any(place.is_at(other) for other in places):
                 places.append(place)
         return sorted(places, key=lambda place: -place.quality)
@@ -318,24 +318,22 @@ class PlaceSearch:
             starts.append(positions_around(T, up, _NEAR_CELLS * cell_m, 0.5 * _NEAR_CELLS * cell_m))
         return self.among(scans, list(complete(best_starts(latest.keypoints, np.concatenate(starts), region))))
 
-    def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: Regions) -> Place:
+    def _with_others(self, place: Place, kept: Sequence[KeptScan]) -> Place:
         """A place with the fits of the other scans; none where one contradicts the motion between the scans."""
         fits, last, T_map_last = list(place.fits), kept[0], place.T_map_lidar
         for scan in kept[1:]:
             motion = inverse(last.T_local_lidar) @ scan.T_local_lidar
             start = T_map_last @ motion
-            found = self._register(scan, start, _CHAINED, regions)
-            if found is None or _is_off(start, found.T_map_lidar, motion, regions.cell_m):
+            found = self._register(scan, start, _CHAINED)
+            if found is None or _is_off(start, found.T_map_lidar, motion, self._regions.cell_m):
                 fits.append(NO_FIT)
                 continue
             fits += found.fits
             last, T_map_last = scan, found.T_map_lidar
         return replace(place, fits=tuple(fits))
 
-    def _register(
-        self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float], regions: Regions
-    ) -> Place | None:
-        surfel_map = regions.around(start[:3, 3])
+    def _register(self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float]) -> Place | None:
+        surfel_map = self._regions.around(start[:3, 3])
         points = scan.keypoints
         points = points[np.einsum("ij,ij->i", points, points) < self._reach_m(scan) ** 2]
         variances = np.array([sigmas[0]] * 3 + [sigmas[1]] * 3 + [_STILL] * 6) ** 2

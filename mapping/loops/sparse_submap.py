@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, levelling
 from lidarslam.core.state import BlockFile
-from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.thinning import evenly, one_per_cell
 
 PLANE, LINE = 1, 2
 # Nearer points are mostly the carrier itself.
@@ -60,9 +60,7 @@ class SparseSubmap:
         range_m = float(np.median(ranges)) if len(ranges) else 1.0
         cell_m = float(np.clip(range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
         fine = points[one_per_cell(points, 0.5 * cell_m)]
-        chosen = one_per_cell(fine, 2.0 * cell_m)
-        if len(chosen) > _MAX_POINTS:
-            chosen = chosen[np.linspace(0, len(chosen) - 1, _MAX_POINTS).astype(np.intp)]
+        chosen = evenly(one_per_cell(fine, 2.0 * cell_m), _MAX_POINTS)
         kinds, axes, tilt = _shapes(fine, fine[chosen])
         image = np.full(PIXELS[0] * PIXELS[1], np.inf)
         np.minimum.at(image, _pixels(points, ranges), ranges)
@@ -133,23 +131,20 @@ def _level_rotation(normals: FloatArray) -> FloatArray:
     return levelling(axis)
 
 
-class SubmapFile:
+class SubmapFile(BlockFile):
     """Sparse submaps in order, in a file without a name: those of hours would take hundreds of megabytes of memory."""
 
     def __init__(self, directory: Path | None = None) -> None:
-        self._blocks = BlockFile(directory)
-        self._recent = lru_cache(_KEPT)(self._read)
-
-    def __len__(self) -> int:
-        return len(self._blocks)
+        super().__init__(directory)
+        self._recent = lru_cache(_KEPT)(self._unpickled)
 
     def __getitem__(self, index: int) -> SparseSubmap:
         return self._recent(range(len(self))[index])
 
     def append(self, submap: SparseSubmap) -> None:
         """Keep one more; OSError where the disk is full."""
-        self._blocks.write(pickle.dumps(submap))
+        self.write(pickle.dumps(submap))
 
-    def _read(self, index: int) -> SparseSubmap:
-        submap: SparseSubmap = pickle.loads(self._blocks.read(index))  # noqa: S301 (of a file that nobody else can open)
+    def _unpickled(self, index: int) -> SparseSubmap:
+        submap: SparseSubmap = pickle.loads(self.read(index))  # noqa: S301 (of a file that nobody else can open)
         return submap

@@ -54,15 +54,10 @@ def body_velocity(T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
 
 
 def even(points: FloatArray, times: FloatArray, turn_acceleration: FloatArray, middle_s: float) -> FloatArray:
-    """Points (N, 3) as if the sensor had turned at the mean rate of the sweep all the time.
+    """Points (N, 3) of a sweep with times (N,) as if the sensor had turned at its mean rate all the time.
 
-    Its other acceleration displaces points by millimetres only, and is not counted.
-
-    Args:
-        points: (N, 3) as measured, each in the LiDAR frame of its own instant.
-        times: (N,) seconds from the stamp.
-        turn_acceleration: (3,) angular, during the sweep, in the LiDAR frame, rad/s^2.
-        middle_s: seconds from the stamp to the middle of the sweep, where the rate is the mean one.
+    That is the rate at `middle_s` from the stamp; the angular acceleration (3,) is in the LiDAR frame, rad/s^2. Other
+    acceleration displaces points by millimetres only, and is not counted.
     """
     return move(points, (0.5 * times - middle_s) * times, np.pad(turn_acceleration, (0, 3)))
 
@@ -70,15 +65,10 @@ def even(points: FloatArray, times: FloatArray, turn_acceleration: FloatArray, m
 def deskew(
     points: FloatArray, time_offsets: FloatArray, velocity_before: FloatArray, velocity_after: FloatArray
 ) -> FloatArray:
-    """Move points to the scan's stamp, with one velocity before the stamp and one after it.
+    """Move points (N, 3), measured at times (N,) from the stamp, to the LiDAR frame at the stamp.
 
-    A point `p` measured at offset t lies at `exp(t * velocity) p` in the frame of the stamp.
-
-    Args:
-        points: (N, 3) as measured, each in the LiDAR frame of its own instant.
-        time_offsets: (N,) seconds from the stamp.
-        velocity_before: (6,) for points before the stamp, rotation first, in the frame of the stamp.
-        velocity_after: (6,) for points after it.
+    A point `p` measured at offset t lies there at `exp(t * velocity) p`; the velocity (6,), rotation first, in that
+    frame, is one before the stamp and one after it.
     """
     if np.array_equal(velocity_before, velocity_after):
         return move(points, time_offsets, velocity_after)

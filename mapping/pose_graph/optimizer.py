@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Stateful
+from lidarslam.mapping.global_map.georeference import AntennaPosition
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.pose_graph.edges import AntennaPosition, Attitude, first_connected, squared_error
+from lidarslam.mapping.pose_graph.keyframe_graph import Attitude, first_connected, squared_error
 
 # Standard deviations of a pose that is held, radians and metres: firm compared with every edge, but no singular system.
 _HELD = np.array([np.deg2rad(0.01)] * 3 + [0.001] * 3)

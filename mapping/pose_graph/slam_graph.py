@@ -21,21 +21,21 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import TRANSFORM
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import PoseGraphConfig
+from lidarslam.mapping.global_map.georeference import ProjectedTrack
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
-from lidarslam.mapping.pose_graph.edges import (
+from lidarslam.mapping.pose_graph.keyframe_graph import (
     GraphScan,
     Keyframe,
-    ProjectedTrack,
+    KeyframeGraph,
     drift_covariance,
     first_connected,
     squared_error,
 )
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.pose_graph.optimizer import Optimised, RelaxSchedule, optimise, relax
 from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, connected_with_last
 from lidarslam.mapping.surfels.surfel_map import SurfelMap

@@ -17,7 +17,7 @@ from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import POSITION, VIEW, Rows
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.pose_graph.edges import Keyframe, first_connected
+from lidarslam.mapping.pose_graph.keyframe_graph import Keyframe, first_connected
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 # A submap is off when its place in the local map differs from the corrected one by more than this share of a cell or
@@ -77,14 +77,10 @@ class SubmapPlacement(Stateful):
         self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans],
         scan: int,
     ) -> SurfelMap | None:  # fmt: skip
-        """The rebuilt map; None unless a submap near the sensor is missing, or lies elsewhere than it should.
+        """The map rebuilt without the latest scan; None unless a submap nearby is missing, or lies where it should not.
 
-        Args:
-            targets: (K, 4, 4) T_odom_keyframe as corrected; that of the last keyframe is as it was.
-            members: (K,) which submaps are connected with the last one.
-            cell_m: edge of the finest cells.
-            submap: of a keyframe.
-            scan: the latest one, which is not in the map.
+        Targets (K, 4, 4) are T_odom_keyframe as corrected, that of the last keyframe as it was; members (K,) are the
+        submaps that are connected with the last one.
         """
         relative = np.where(members, self._distances(targets) / self.radius_m, np.inf)
         is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()

@@ -54,10 +54,9 @@ def gauss_newton(
     linearise: Callable[[FloatArray], NormalEquations | None], T: FloatArray, prior: FloatArray,
     prior_information: FloatArray, most_steps: int, lever_m: float, settled_m: float,
 ) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
-    """Minimise from T (4, 4), with a prior (4, 4) of the given information (6, 6).
+    """The pose at the minimum, from T (4, 4) on, and the Hessian (6, 6), with a prior (4, 4) of an information (6, 6).
 
-    Returns:
-        The pose, and the Hessian (6, 6) with the prior; None where the correspondences are too few.
+    None where the correspondences are too few.
     """
     hessian = prior_information
     for _ in range(most_steps):

@@ -133,15 +133,14 @@ class LocalMap(Stateful, ABC):
         """Points (M, 3) of the map in the middle resolution, in the world."""
 
     @abstractmethod
-    def level_normals(self) -> FloatArray:
-        """Unit normals (M, 3) of the planes in the coarsest resolution."""
+    def vertical(self) -> FloatArray:
+        """Unit normal (3,) of floors and ceilings near the sensor, by `vertical_of` the coarsest planes."""
 
     @abstractmethod
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Planes in the coarsest resolution at points (N, 3) of the world, seen from (3,).
 
-        Returns:
-            Unit normals (N, 3), and standard deviations (N,) along them, infinite where there is no plane.
+        Unit normals (N, 3), and standard deviations (N,) along them, infinite where there is no plane.
         """
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray, level: int = 0) -> Correspondences:
@@ -149,10 +148,6 @@ class LocalMap(Stateful, ABC):
         matcher = self.matcher(Sweep(points), level)
         matcher.match(points, T_world_lidar)
         return matcher.correspondences()
-
-    def vertical(self) -> FloatArray:
-        """Unit normal (3,) of floors and ceilings near the sensor; the world's z axis when there are none."""
-        return vertical_of(self.level_normals())
 
     def _count(self, sensor: FloatArray) -> None:
         """Count a scan that was inserted, seen from a position (3,), and drop the cells that are too far by now."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan, squared_ranges
 from lidarslam.core.state import Shape, Stateful
-from lidarslam.core.thinning import central_per_cell, one_per_cell
+from lidarslam.core.thinning import central_per_cell, evenly, one_per_cell
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 
@@ -141,10 +141,7 @@ class Sampler(Stateful):
     def _keypoints(self, sweep: Sweep, cell_m: float) -> NDArray[np.intp]:
         """Indices (K,) of the points that are registered."""
         # The last points of the sweep would lie on the same side of every tree, and a sensor at rest would rotate.
-        keys = central_per_cell(sweep.points, _KEYPOINT_SPACING * cell_m)
-        if len(keys) > self._config.keypoints:
-            keys = keys[np.linspace(0, len(keys) - 1, self._config.keypoints).astype(np.intp)]
-        return keys
+        return evenly(central_per_cell(sweep.points, _KEYPOINT_SPACING * cell_m), self._config.keypoints)
 
 
 def has_rings(scan: Scan) -> bool:

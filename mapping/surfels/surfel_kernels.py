@@ -197,7 +197,7 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
         prefetch(cells.sums, ahead)
         prefetch(counts, ahead)
         row = rows[n]
-        if row >= 0 and outdated(row, cells.sums, counts):
+        if row >= 0 and counts[row] * _GROWTH <= cells.sums[row, 0]:
             counts[row] = cells.sums[row, 0]
             prefetch_around(cells.keys[row], cells.bits, cells.table_keys, cells.table_rows)
             waiting[count] = row
@@ -215,12 +215,6 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
 def is_steep(along: float, distance: float) -> bool:
     """Whether a ray of some length meets a plane at no grazing angle, from the side of its normal."""
     return along > _LEAST_SINE * distance
-
-
-@compiled_part
-def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -> bool:
-    """Whether the cell in a row has grown since its surfel was computed."""
-    return bool(counts[row] * _GROWTH <= sums[row, 0])
 
 
 @compiled_part

@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
-from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces, vertical_of
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
@@ -60,11 +60,7 @@ def match_planes(
     A better one is known better and its points are spread less: across steps, a coarse plane's are spread more.
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
     without a plane, or with one whose normal has a standard deviation of `certain_tilt` and more, are moved to the
-    beginning of `unmatched`. `spread_m` (N,) has the standard deviations of each plane's points across it, and is
-    written.
-
-    Returns:
-        Number of the points that were moved.
+    beginning of `unmatched`; their number is returned. `spread_m` (N,), of each plane's points across it, is written.
     """
     left = 0
     for w in range(len(unmatched)):
@@ -210,8 +206,7 @@ class SurfelMap(LocalMap):
     def of_cloud(cls, points: FloatArray, normals: FloatArray, cell_m: float, radius_m: float) -> "SurfelMap":
         """The surfels of points (N, 3) of the world whose normals (N, 3) face the side that was seen.
 
-        Raises:
-            InputError: points lie beyond the reach of the cells.
+        InputError where points lie beyond the reach of the cells.
         """
         require_reach(points, cell_m)
         surfel_map = cls(cell_m, radius_m)
@@ -247,10 +242,9 @@ class SurfelMap(LocalMap):
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
         return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
 
-    def level_normals(self) -> FloatArray:
-        grid = self._grids[-1]
-        surfels = grid.surfels(np.arange(len(grid), dtype=np.int32))
-        return np.asarray(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL], dtype=np.float64)
+    def vertical(self) -> FloatArray:
+        surfels = self._grids[-1].surfels(np.arange(len(self._grids[-1]), dtype=np.int32))
+        return vertical_of(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL])
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         grid = self._grids[-1]

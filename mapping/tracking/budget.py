@@ -19,12 +19,7 @@ _FREE_SCANS = 2
 
 
 class Budget:
-    """The time of a scan, and whether it is spent.
-
-    Args:
-        budget_ms: milliseconds per scan; auto: half of the time between scans; None: not bounded.
-        clock: seconds.
-    """
+    """The time of a scan, and whether it is spent; see `BudgetMs`. The clock is in seconds."""
 
     def __init__(self, budget_ms: BudgetMs = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self._budget_ms = budget_ms

@@ -19,15 +19,20 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
-from lidarslam.mapping.motion.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
-from lidarslam.mapping.motion.velocity_bias import velocity_error
+from lidarslam.mapping.motion.prediction import (
+    LOST_MOTION,
+    UNKNOWN_VELOCITY,
+    MotionState,
+    Prediction,
+    Prior,
+    velocity_error,
+)
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import beyond_reach
 from lidarslam.mapping.tracking.budget import Budget
-from lidarslam.mapping.tracking.fit import Fit
-from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.mapped_scan import Fit, MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
@@ -133,8 +138,7 @@ class Mapper(Stateful):
     def redraw(self, drawn: SurfelMap, scans: int) -> bool:
         """Replace the local map of surfels by a rebuilt one without the latest `scans` scans, which are then inserted.
 
-        Returns:
-            False where another map has begun since, or a search of the map is in progress: the map stays.
+        False where another map has begun since, or a search of the map is in progress: the map stays.
         """
         if self._map is None or self._tracker.is_searching or self._map_since > self._scans - scans:
             return False

@@ -18,9 +18,9 @@ from lidarslam.mapping.motion.prediction import (
 from lidarslam.mapping.surfels.surfel_map import constraining_points
 from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.mapped_scan import Attempt
-from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
-from lidarslam.mapping.tracking.start_poses import (
+from lidarslam.mapping.tracking.scan_matcher import (
     SCORED_POINTS,
+    ScanMatcher,
     best_supported,
     best_velocity,
     positions_around,
@@ -225,13 +225,10 @@ class NearSearch:
         """
         if near.status is Status.OK or near.fit.weakest is None or not near.fit.is_constrained:
             return near
-        others, cell_m = [], self.matcher.local_map.cell_m
-        for cells in _ALONG_CELLS:
-            if self.matcher.budget.is_spent:
-                break
-            start = replace(near.prediction, T_world_lidar=near.T_world_lidar)
-            start = start.displaced(cells * cell_m * np.array(near.fit.weakest))
-            others.append(self.matcher.attempt(near.prediction, start, coarse_first=False))
+        cell_m, here = self.matcher.local_map.cell_m, replace(near.prediction, T_world_lidar=near.T_world_lidar)
+        offsets_m = [cells * cell_m for cells in _ALONG_CELLS]
+        starts = self.matcher.displaced(here, offsets_m, np.array(near.fit.weakest))
+        others = [self.matcher.attempt(near.prediction, start, coarse_first=False) for start in starts]
         others = [other for other in others if _apart_m(other, near) < _MOST_ALONG_CELLS * cell_m]
         best = max(others, key=self._likely_quality, default=near)
         return best if self._likely_quality(best) > _CLEARLY_BETTER * self._likely_quality(near) else near
@@ -253,10 +250,8 @@ class NearSearch:
         count = int(min(_RIVAL_SIGMAS * sigma_m / cell_m, _MOST_RIVAL_CELLS) / _RIVAL_CELLS)
         offsets_m = np.arange(-count, count + 1) * _RIVAL_CELLS * cell_m - away_m
         here = replace(prediction, T_world_lidar=near.T_world_lidar)
-        for offset_m in sorted(offsets_m[np.abs(offsets_m) > _RIVAL_CELLS * cell_m], key=abs):
-            if self.matcher.budget.is_spent:
-                break
-            start = here.displaced(offset_m * direction)
+        farther_m = sorted(offsets_m[np.abs(offsets_m) > _RIVAL_CELLS * cell_m], key=abs)
+        for start in self.matcher.displaced(here, farther_m, direction):
             rival = near.rival_of([self.matcher.attempt(prediction, start, coarse_first=False)])
             if rival is not None:
                 return replace(near, rival=rival)

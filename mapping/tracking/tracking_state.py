@@ -13,9 +13,9 @@ from lidarslam.mapping.motion.prediction import (
     Prediction,
     Prior,
     ProcessNoise,
+    VelocityBias,
     predict,
 )
-from lidarslam.mapping.motion.velocity_bias import VelocityBias
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 
 # After a gap of this length between scans the pose is uncertain.

@@ -16,7 +16,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.pose_graph.edges import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper

@@ -21,8 +21,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, KeyframeConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.motion.deskew import move
-from lidarslam.mapping.pose_graph.edges import GraphScan
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan, KeyframeGraph
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry

@@ -7,9 +7,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.global_map.georeference import GnssTrack, align_to_track
+from lidarslam.mapping.global_map.georeference import GnssTrack, ProjectedTrack, align_to_track
 from lidarslam.mapping.loops.closure import RelativePose
-from lidarslam.mapping.pose_graph.edges import ProjectedTrack
 from lidarslam.mapping.pose_graph.optimizer import optimise
 
 from .runs import assert_near

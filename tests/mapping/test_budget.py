@@ -11,7 +11,7 @@ from simulated_faults import Faulty, carried_off, covered, index_back
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.tracking import scan_matcher, start_poses
+from lidarslam.mapping.tracking import scan_matcher
 from lidarslam.mapping.tracking.budget import Budget, Steps
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -113,7 +113,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     clock = FakeClock()
     monkeypatch.setattr(scan_matcher, "register", clock.passes(REGISTRATION_MS, scan_matcher.register))
     monkeypatch.setattr(scan_matcher, "with_mean_velocity", lambda registration, *_: registration)
-    monkeypatch.setattr(start_poses, "_distances", clock.passes(SCORE_MS, start_poses._distances))
+    monkeypatch.setattr(scan_matcher, "_distances", clock.passes(SCORE_MS, scan_matcher._distances))
     return clock
 
 

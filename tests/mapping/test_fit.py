@@ -11,9 +11,14 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.fit import NO_FIT, Fit, directional_support, translation_information
-from lidarslam.mapping.tracking.mapped_scan import Attempt
-from lidarslam.mapping.tracking.scan_matcher import measure_fit
+from lidarslam.mapping.tracking.mapped_scan import (
+    NO_FIT,
+    Attempt,
+    Fit,
+    directional_support,
+    measure_fit,
+    translation_information,
+)
 from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER, TrackingState
 
 from .shapes import across_x, on_sides, surfel_map_of

@@ -7,8 +7,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map import global_map as module
-from lidarslam.mapping.global_map.drawing import drawn_map
-from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.global_map.global_map import GlobalMap, drawn_map, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.voxels import COUNT
 from lidarslam.mapping.surfels.voxel_hash import reach_m

@@ -17,9 +17,9 @@ from lidarslam.mapping.motion.prediction import (
     Prediction,
     Prior,
     ProcessNoise,
+    VelocityBias,
     predict,
 )
-from lidarslam.mapping.motion.velocity_bias import VelocityBias
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s

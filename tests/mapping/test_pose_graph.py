@@ -10,17 +10,17 @@ from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
-from lidarslam.mapping.pose_graph import edges, keyframe_graph
+from lidarslam.mapping.pose_graph import keyframe_graph
 from lidarslam.mapping.pose_graph.correction import corrected, format_g2o
-from lidarslam.mapping.pose_graph.edges import (
+from lidarslam.mapping.pose_graph.keyframe_graph import (
     Attitude,
     GraphScan,
+    KeyframeSelector,
     MotionSinceKeyframe,
     drift_covariance,
     first_connected,
     trajectory_edges,
 )
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, RelaxSchedule, bounded, optimise, relax
 
 from .runs import assert_near
@@ -359,7 +359,7 @@ def test_an_edge_is_as_precise_as_both_poses_and_the_drift_between():
     assert [(e.first, e.second) for e in (refined, measured)] == [(6, 7), (6, 7)]
     A = adjoint(inverse(STEP))
     np.testing.assert_allclose(refined.covariance, drift_covariance(1.5) + SIGMA + A @ before @ A.T, rtol=1e-12)
-    np.testing.assert_allclose(measured.covariance, edges._ODOMETRY_CAUTION**2 * SIGMA, rtol=1e-12)
+    np.testing.assert_allclose(measured.covariance, keyframe_graph._ODOMETRY_CAUTION**2 * SIGMA, rtol=1e-12)
 
 
 def test_where_tracking_was_lost_the_edge_is_loose_whatever_the_covariances_of_the_poses():

@@ -13,8 +13,7 @@ from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.loops.closure import NEAR_SCANS, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph import slam_graph
 from lidarslam.mapping.pose_graph.correction import Corrected
-from lidarslam.mapping.pose_graph.edges import GraphScan
-from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
+from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan, KeyframeGraph
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap

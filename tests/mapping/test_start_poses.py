@@ -10,7 +10,7 @@ from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
-from lidarslam.mapping.tracking.start_poses import best_starts, best_velocity, turned_poses
+from lidarslam.mapping.tracking.scan_matcher import best_starts, best_velocity, turned_poses
 
 from .runs import assert_near
 from .shapes import l_shaped_room, surfel_map_of

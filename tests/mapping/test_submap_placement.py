@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout, Rows
 from lidarslam.mapping.loops.closure import LoopClosure
-from lidarslam.mapping.pose_graph.edges import Keyframe
+from lidarslam.mapping.pose_graph.keyframe_graph import Keyframe
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER, Drawn, SubmapPlacement, draw_local_map
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 

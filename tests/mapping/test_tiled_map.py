@@ -9,10 +9,9 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.config import GlobalMapConfig
-from lidarslam.mapping.global_map import drawing, voxels
 from lidarslam.mapping.global_map import global_map as module
-from lidarslam.mapping.global_map.drawing import drawn_map
-from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.global_map import voxels
+from lidarslam.mapping.global_map.global_map import GlobalMap, drawn_map
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.mapping.global_map.voxels import Tile, TileStore, Tiling
@@ -25,7 +24,6 @@ CONFIG = GlobalMapConfig(voxel_size_m=VOXEL_M, most_points=MOST, fields=("intens
 @pytest.fixture(autouse=True)
 def _small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voxels, "_EDGE_M", 4.03)  # no whole number of voxels
-    monkeypatch.setattr(drawing, "NORMALS_MARGIN_M", 1.5)
     monkeypatch.setattr(module, "NORMALS_MARGIN_M", 1.5)
 
 
