@@ -20,7 +20,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
-from lidarslam.run.summary import time_scale, time_scale_warning
+from lidarslam.run.calibration import time_scale, time_scale_warning
 
 from ..conftest import lidarslam, succeeds, write_recording
 from ..mapping.runs import errors
