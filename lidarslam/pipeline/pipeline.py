@@ -215,10 +215,9 @@ class Pipeline(Stateful):
 
 def _give(graph: KeyframeGraph, built: MapBuilder, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
     """Give the graph a scan, and the map a submap that is complete; the local map where loop closures change it."""
-    complete = len(graph.store)
-    graph.add(scan)
-    for key in range(complete, len(graph.store)):
-        built.add_submap(graph.store[key], graph.scan_poses[graph.keyframes[key].scan])
+    submap = graph.add(scan)
+    if submap is not None:  # of the keyframe before the new one
+        built.add_submap(submap, graph.scan_poses[graph.keyframes[-2].scan])
     return None if cell_m is None else graph.redrawn_local_map(cell_m)
 
 

@@ -260,8 +260,12 @@ class KeyframeGraph(Stateful):
             self._submap = self._submap or GlobalMap(voxel_size_m)
             self._submap.add(points, inverse(self.scan_poses[self.keyframes[-1].scan]) @ T_world_lidar, known)
 
-    def add(self, scan: GraphScan) -> None:
-        """Add the next scan; the points of the one before have been drawn by now."""
+    def add(self, scan: GraphScan) -> VoxelMeans | None:
+        """Add the next scan; the points of the one before have been drawn by now.
+
+        Where it is a keyframe, the submap of the one before is complete, and returned.
+        """
+        complete = None
         if self.scan_poses:
             step_m = float(np.linalg.norm(scan.T_world_lidar[:3, 3] - self.scan_poses[-1][:3, 3]))
             self._motion = self._motion.then(scan, step_m)
@@ -270,20 +274,23 @@ class KeyframeGraph(Stateful):
         if scan.belongs_in_map and len(scan.points) and self._selector.is_due(scan.T_world_lidar, scan.points):
             started = time.perf_counter()
             self._selector.take(scan.T_world_lidar, scan.points)
-            self.end_recording()
+            complete = self.end_recording()
             self._begin_keyframe(scan)
             self.keyframe_ms.append(1e3 * (time.perf_counter() - started))
         self.attitudes += measured_attitude(scan, self.keyframes, self.scan_poses)
+        return complete
 
     def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:  # noqa: ARG002
         """None: without loop closures the running local map stays as it is."""
         return None
 
-    def end_recording(self) -> None:
-        """Keep the submap of the last keyframe: there are no more scans, or another keyframe follows."""
-        if self._is_submap_open:
-            means, self._submap = self.means(len(self.keyframes) - 1), None
-            self._keep(means)
+    def end_recording(self) -> VoxelMeans | None:
+        """Keep, and return, the submap of the last keyframe: there are no more scans, or another keyframe follows."""
+        if not self._is_submap_open:
+            return None
+        means, self._submap = self.means(len(self.keyframes) - 1), None
+        self._keep(means)
+        return means
 
     def close(self) -> None:
         """Release the submaps on disk."""

@@ -14,7 +14,6 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
-from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
@@ -36,7 +35,6 @@ class Graph:
     def __init__(self, delay_s: float = 0.0, fails: bool = False, closes: bool = True) -> None:
         self.delay_s, self.fails, self.closes = delay_s, fails, closes
         self.scans: list[GraphScan] = []
-        self.store: list[VoxelMeans] = []
 
     def draw(self, *_: Any) -> None:
         time.sleep(self.delay_s)

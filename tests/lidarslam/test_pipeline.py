@@ -104,7 +104,6 @@ class _Notes:
 
     def __init__(self) -> None:
         self.told: list[Any] = []
-        self.store: list[Any] = []  # of submaps
         self.drawn: list[FloatArray] = []  # points in the world
 
     def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, _attributes: object) -> None:
