@@ -74,7 +74,10 @@ class ImuStream(Stateful):
         self._begin_anew(T_lidar_imu)
 
     def add(self, stamp: float, angular_velocity: FloatArray, acceleration: FloatArray) -> None:
-        """Take the next sample, from any thread, rad/s and m/s^2 (3,); InputError where the stamp is not later."""
+        """Take the next sample (3,), rad/s and m/s^2, stamped by the clock of the scans, from any thread.
+
+        InputError where the stamp is not after the last one.
+        """
         with self._lock:
             if not stamp > self.last_s:
                 raise InputError(f"stamps must increase: {stamp:.9f} s is not after the last, {self.last_s:.9f} s")

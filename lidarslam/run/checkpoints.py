@@ -44,7 +44,10 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
 
 
 def lost_when_finished(request: RunRequest) -> bool | None:
-    """Whether tracking was lost in this very run, if finished, else None; InputError where `out` has another one."""
+    """Whether tracking was lost, where `out` holds this very run, finished; None where it does not.
+
+    InputError where it holds another finished run.
+    """
     out = request.out
     if About.read(out) is not None or not (out / files.CONFIG).is_file() or not (out / files.SUMMARY).is_file():
         return None

@@ -43,7 +43,10 @@ def begin_graph(
     takes_gnss: bool = False,
     given: GivenLoops | None = None,
 ) -> "SlamGraph | None":
-    """A configured pose graph, its submaps in the directory or file; ConfigError where it lacks GNSS positions."""
+    """The pose graph of a run, its submaps in a file of the directory or in the given one; None unless it is enabled.
+
+    ConfigError where it is to use GNSS positions and the command takes none.
+    """
     if config.pose_graph.gnss and not takes_gnss:
         raise ConfigError("pose_graph.gnss is available in lidarslam run only; leave it out here")
     if not config.pose_graph.enabled:

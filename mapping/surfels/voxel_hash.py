@@ -97,7 +97,7 @@ def insert_keys(
 ) -> tuple[int, int]:
     """Write the rows of keys (N,) from `begin` on, the next ones for new keys, until the hash holds `most`.
 
-    Returned are the numbers of keys done, and of rows.
+    The numbers of keys done and of rows are returned.
     """
     for n in range(begin, len(keys)):
         prefetch_slot(keys[min(n + PREFETCHED, len(keys) - 1)], bits, table_keys, table_rows)
