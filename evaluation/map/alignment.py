@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
@@ -13,8 +14,13 @@ from lidarslam.evaluation.map.voxel_thinning import thin
 
 GLOBAL = "global"
 
-# At a wrong pose in a building a quarter of a map lies on some wall or floor, at the right one most of it.
+# At a wrong pose in a building, all floors and a quarter of the walls may coincide; at the right one, most of each do.
 TRUSTED_FITNESS = 0.5
+# Least share at which no other pose can have as much.
+_UNRIVALLED = 0.8
+# Directions of surfaces count as such from this share of the points on; a surface faces along a direction within this
+# cosine.
+_LEAST_SURFACES, _FACING = 0.05, 0.7
 # A second pose with this share of the best fitness makes the registration ambiguous; poses nearer than this are one.
 _AMBIGUOUS_SHARE = 0.9
 _SAME_PLACE_M, _SAME_ANGLE_RAD = 1.0, np.deg2rad(8.0)
@@ -51,17 +57,19 @@ class MapAlignment:
     fitness: float  # share of inliers, the map's points with a point of the reference within `inlier_m`, 0 to 1
     inlier_rmse_m: float | None  # root mean square distance of the inliers; None without any
     inlier_m: float  # largest distance of an inlier
+    # the least of the inliers' shares of surfaces that face along the commonest normal, a floor's, and of all others
+    least_fitness: float
     # moved_m, moved_deg: translation of the map's median and rotation by ICP, a misplacement that does not show in the
     # map's errors
     moved_m: float = 0.0
     moved_deg: float = 0.0
-    runner_up: float | None = None  # fitness of the next best, different pose of a global search
+    runner_up: float | None = None  # least fitness of the next best, different pose of a global search
 
     @property
     def is_trustworthy(self) -> bool:
-        """Whether half of the points are inliers, and at no other pose nearly as many."""
-        distinct = self.runner_up is None or self.runner_up < _AMBIGUOUS_SHARE * self.fitness
-        return self.fitness >= TRUSTED_FITNESS and distinct
+        """Whether half of the surfaces of either direction are inliers, and at no other pose nearly as many."""
+        distinct = self.runner_up is None or self.runner_up < _AMBIGUOUS_SHARE * self.least_fitness
+        return self.least_fitness >= TRUSTED_FITNESS and distinct
 
     def to_json(self) -> dict[str, object]:
         """All of it, for metrics.json."""
@@ -79,37 +87,38 @@ def align_map(
 ) -> MapAlignment:
     """Pose of a map (N, 3) in the frame of a reference (M, 3), by point-to-plane ICP, coarse to fine.
 
-    With `search`, the first trustworthy guess is taken, else a global registration decides. Without, there is one
-    guess, which is taken whatever its fitness.
+    With `search`, the first guess at which most of either direction's surfaces coincide is taken, else the best of the
+    guesses and a global registration, if it is trustworthy. Without, there is one guess, which is taken whatever its
+    fitness.
 
     Guesses are `T_reference_map` (4, 4) by name; with `refine`, ICP follows.
     """
-
     clouds = _Clouds.prepare(map_points, reference_points)
     tried = []
     for name, T_reference_map in guesses.items():
         tried.append(clouds.judge(clouds.to_local(T_reference_map), name, refine))
-        if tried[-1].is_trustworthy or not search:
+        if tried[-1].least_fitness >= _UNRIVALLED or not search:
             return clouds.to_given(tried[-1])
-    tried.append(_search(clouds))
-    if not tried[-1].is_trustworthy:
-        raise InputError(_explain(tried))
-    return clouds.to_given(tried[-1])
+    best = _search(clouds, tried)
+    if not best.is_trustworthy:
+        raise InputError(_explain(best, tried))
+    return clouds.to_given(best)
 
 
-def _search(clouds: "_Clouds") -> MapAlignment:
-    """The best pose of a global registration, with the fitness of the next best."""
+def _search(clouds: "_Clouds", tried: Sequence[MapAlignment]) -> MapAlignment:
+    """The best of the poses that were tried and those of a global registration, with the fitness of the next best."""
     judged = [clouds.judge(T, GLOBAL, True, _SEARCH_POINTS) for T in candidate_poses(clouds.mapped, clouds.reference)]
-    likeliest = max(judged, key=lambda found: found.fitness).T_reference_map
+    likeliest = max(judged, key=lambda found: found.least_fitness).T_reference_map
     # Buildings look similar when they are turned by right angles about the vertical through their middle.
     middle = make_transform(np.eye(3), 0.5 * (clouds.mapped.min(axis=0) + clouds.mapped.max(axis=0)))
     for quarters in (1, 2, 3):
         turn = middle @ exp([0.0, 0.0, quarters * np.pi / 2.0, 0.0, 0.0, 0.0]) @ inverse(middle)
         judged.append(clouds.judge(likeliest @ turn, GLOBAL, True, _SEARCH_POINTS))
-    judged.sort(key=lambda found: -found.fitness)
-    best = clouds.judge(judged[0].T_reference_map, GLOBAL, refine=True)
-    others = [other.fitness for other in judged[1:] if not _is_same(best.T_reference_map, other.T_reference_map)]
-    return replace(best, moved_m=0.0, moved_deg=0.0, runner_up=max(others, default=0.0))
+    best, *others = sorted([*tried, *judged], key=lambda found: -found.least_fitness)
+    if best.method == GLOBAL:
+        best = replace(clouds.judge(best.T_reference_map, GLOBAL, refine=True), moved_m=0.0, moved_deg=0.0)
+    rivals = [other.least_fitness for other in others if not _is_same(best.T_reference_map, other.T_reference_map)]
+    return replace(best, runner_up=max(rivals, default=0.0))
 
 
 def _is_same(T_a: FloatArray, T_b: FloatArray) -> bool:
@@ -158,24 +167,32 @@ class _Clouds:
 
     def judge(self, T_guess: FloatArray, method: str, refine: bool, most_points: int = _MOST_POINTS) -> MapAlignment:
         """The guess with its fitness, refined by ICP on `most_points` of the map where that adds inliers."""
-        T, (fitness, rmse_m) = T_guess, self._fitness(T_guess)
+        T, distances = T_guess, self._distances(T_guess)
         if refine:
             T_icp = self._icp(T_guess, self.mapped[:: -(-len(self.mapped) // most_points)])
-            after = self._fitness(T_icp)
-            if after[0] >= fitness:
-                T, (fitness, rmse_m) = T_icp, after
+            after = self._distances(T_icp)
+            if np.isfinite(after).mean() >= np.isfinite(distances).mean():
+                T, distances = T_icp, after
+        near = np.isfinite(distances)
+        rmse_m = float(np.sqrt(np.mean(distances[near] ** 2))) if near.any() else None
+        shares = [float(near[surface].mean()) for surface in self._surfaces]
         moved = inverse(T_guess) @ T
         moved_m, moved_deg = float(np.linalg.norm(moved[:3, 3])), float(np.rad2deg(rotation_angle(moved)))
-        return MapAlignment(T, method, refine, fitness, rmse_m, self.inlier_m, moved_m, moved_deg)
+        fit = float(near.mean()), rmse_m, self.inlier_m, min(shares)
+        return MapAlignment(T, method, refine, *fit, moved_m, moved_deg)
 
     @cached_property
     def _normals(self) -> FloatArray:
         """Unit normals (M, 3) of the reference."""
-        import open3d as o3d
+        return _estimate_normals(self.reference)
 
-        still = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.reference))
-        still.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
-        return np.array(still.normals, dtype=np.float64)
+    @cached_property
+    def _surfaces(self) -> list[NDArray[np.bool_]]:
+        """Masks (N,) of the map's points whose surfaces face along the commonest normal, and of all others."""
+        normals = _estimate_normals(self.mapped)
+        commonest = np.linalg.eigh(normals.T @ normals)[1][:, -1]
+        facing = np.abs(normals @ commonest) > _FACING
+        return [surface for surface in (facing, ~facing) if surface.mean() > _LEAST_SURFACES]
 
     def _icp(self, T: FloatArray, mapped: FloatArray) -> FloatArray:
         """Pose (4, 4) after point-to-plane ICP (Chen, Medioni, IVC 1992) with ever shorter correspondences.
@@ -197,17 +214,29 @@ class _Clouds:
                     break
         return T
 
-    def _fitness(self, T: FloatArray) -> tuple[float, float | None]:
-        distances, _ = self.tree.query(transform_points(T, self.mapped), distance_upper_bound=self.inlier_m, workers=-1)
-        near = np.asarray(distances)[np.isfinite(distances)]
-        return len(near) / len(self.mapped), float(np.sqrt(np.mean(near**2))) if len(near) else None
+    def _distances(self, T: FloatArray) -> FloatArray:
+        """Distances (N,) of the map's points to the reference, infinite beyond those of inliers."""
+        points = transform_points(T, self.mapped)
+        return np.asarray(self.tree.query(points, distance_upper_bound=self.inlier_m, workers=-1)[0])
 
 
-def _explain(tried: Sequence[MapAlignment]) -> str:
-    fits = "; ".join(f"{a.method}: {100.0 * a.fitness:.0f} % of the map within {a.inlier_m:g} m" for a in tried)
+def _estimate_normals(points: FloatArray) -> FloatArray:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
+    return np.array(cloud.normals, dtype=np.float64)
+
+
+def _explain(best: MapAlignment, tried: Sequence[MapAlignment]) -> str:
+    fits = "; ".join(
+        f"{a.method}: {100.0 * a.fitness:.0f} % of the map within {a.inlier_m:g} m, {100.0 * a.least_fitness:.0f} %"
+        " in the worse of two directions"
+        for a in (*tried, *([best] if best.method == GLOBAL else []))
+    )
     reason = "cannot be aligned with its reference so that half of it fits"
-    if tried[-1].fitness >= TRUSTED_FITNESS:
-        reason = f"fits its reference at more than one pose ({100.0 * (tried[-1].runner_up or 0.0):.0f} % at another)"
+    if best.least_fitness >= TRUSTED_FITNESS:
+        reason = f"fits its reference at more than one pose ({100.0 * (best.runner_up or 0.0):.0f} % at another)"
     return f"the map {reason} ({fits}); are both in metres? Else give the pose as a 4x4 text file, --map-alignment FILE"
 
 

@@ -105,8 +105,9 @@ class MapEvaluation:
         alignment, gap_m = self.alignment, self.comparison.map_gap_m
         if not alignment.is_trustworthy:
             yield (
-                f"only {100.0 * alignment.fitness:.0f} % of the map lies within {alignment.inlier_m:g} m of the"
-                " reference: the map is bent, or its alignment is wrong; look at it with --errors FILE.ply"
+                f"only {100.0 * alignment.least_fitness:.0f} % of the surfaces of one direction lie within"
+                f" {alignment.inlier_m:g} m of the reference: the map is bent or misaligned; look at it with"
+                " --errors FILE.ply"
             )
         if gap_m is not None and gap_m > F_SCORE_THRESHOLDS_M[0]:
             yield (

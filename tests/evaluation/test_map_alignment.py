@@ -88,6 +88,18 @@ def test_a_guess_that_fits_needs_no_search(building):
     assert align_map(seen, building, {"trajectory": T_true}, search=True).method == "trajectory"
 
 
+def test_a_guess_at_which_floors_and_half_of_the_walls_coincide_is_rejected():
+    """An L-shaped room, turned by 180 degrees, has 60 % of its points on the other's surfaces."""
+    rng = np.random.default_rng(0)
+    wide, deep = (on_boxes([((x, y, 1.3), (x, y, 1.3))], 1.0 / 30.0, rng) for x, y in ((7.0, 2.5), (3.0, 6.0)))
+    room = np.concatenate([wide[(wide[:, 0] > 6.0) | (wide[:, 1] < 5.0)], deep[deep[:, 1] > 5.0]])
+    T_reference_map = exp([0.0, 0.0, np.pi, 5.0, 3.0, 0.0])
+    seen = transform_points(inverse(T_reference_map), room + rng.normal(0.0, 0.01, room.shape))
+    found = align_map(seen, room, {"given": np.eye(4)}, search=True)
+    assert found.method == "global"
+    assert _error(found.T_reference_map, T_reference_map, seen) < 0.01
+
+
 @pytest.mark.long
 def test_another_place_is_refused(building):
     rng = np.random.default_rng(3)
