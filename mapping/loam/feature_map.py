@@ -393,7 +393,6 @@ class FeatureMatcher(Matcher):
 class FeatureMap(LocalMap):
     """Edges and planar points within a radius of the sensor."""
 
-    velocity_gains = np.full(6, 0.3)  # features do not swing, and in fields they are noisier
     _edges: list[VoxelGrid]
     _planes: list[VoxelGrid]
     _has_rings: bool

@@ -1,6 +1,6 @@
 """Prediction of the next scan's pose and velocity by a Kalman filter of the last motion and the odometry."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -39,7 +39,9 @@ _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
 _CONFLICT_SQUARED, _CONFLICT_M, _CONFLICT_SHARE, _WALKING_M_S = 16.0, 0.03, 0.25, 2.0
 # Consistent motions in a row after which an odometry may reject a registration.
 _PROVEN_AFTER = 10
-# The largest difference of velocities that counts as a bias, rad/s and m/s: a sudden acceleration makes a larger one.
+# Share of the difference between a motion and the velocity of its sweeps that is corrected, and the largest difference
+# that counts, rad/s and m/s: a sudden acceleration makes a larger one.
+_CORRECTED_SHARE = 0.8
 _MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
 # Sweeps follow one another where they cover this share of the interval between their stamps.
 _COVERED = 0.8
@@ -352,33 +354,20 @@ def velocity_error(last: MotionState, state: MotionState, share: float) -> Float
     return np.asarray(motion - (share * last.velocity + (1.0 - share) * state.velocity), dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class VelocityBias:
-    """The correction of estimated velocities: the integral of their difference from the motion between poses.
+def corrected_by_motion(state: MotionState, last: MotionState, seen_from_s: float) -> MotionState:
+    """The state with its velocity drawn towards that of the motion from the last one, and the likeliest pose given it.
 
     Sweeps that are bent equally fit one another and the map that they make, so that their registration hardly observes
-    a bias in common. The motion between the poses of successive sweeps does: on average, it is their velocity.
+    a bias in common. The motion between the poses of successive sweeps does: on average, it is their velocity. The map
+    receives the corrected sweeps, and the next velocity is estimated from that, so that a bias fades away.
+
+    The sweep begins `seen_from_s` before its stamp; the last one's velocity is the corrected one. After a gap between
+    the two, the state stays as it is.
     """
-
-    correction: Annotated[FloatArray, Shape(6)] = field(default_factory=lambda: np.zeros(6))  # rotation first
-
-    def updated(self, last: MotionState, state: MotionState, seen_from_s: float, gains: FloatArray) -> "VelocityBias":
-        """The bias after another sweep, as it was estimated, and the corrected one before; none after a gap.
-
-        The sweep begins `seen_from_s` before its stamp. The gains (6,) are shares of the difference, rotation first.
-        The map receives the corrected sweeps, and the next velocity is estimated from that: with a gain g, both
-        together swing with a damping ratio of half its square root.
-        """
-        interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
-        if not covered_s > _COVERED * interval_s > 0.0:
-            return VelocityBias()
-        now = replace(state, velocity=state.velocity + self.correction)
-        error = velocity_error(last, now, last.seen_until_s / covered_s)
-        return VelocityBias(self.correction + gains * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE))
-
-    def corrected(self, state: MotionState) -> MotionState:
-        """The state with the corrected velocity, and the pose that is most likely given that."""
-        P = state.covariance
-        step = P[:6, 6:] @ np.linalg.solve(P[6:, 6:], self.correction)
-        T_world_lidar = state.T_world_lidar @ exp(step)
-        return replace(state, T_world_lidar=T_world_lidar, velocity=state.velocity + self.correction)
+    interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
+    if not covered_s > _COVERED * interval_s > 0.0:
+        return state
+    error = velocity_error(last, state, last.seen_until_s / covered_s)
+    correction, P = _CORRECTED_SHARE * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE), state.covariance
+    T_world_lidar = state.T_world_lidar @ exp(P[:6, 6:] @ np.linalg.solve(P[6:, 6:], correction))
+    return replace(state, T_world_lidar=T_world_lidar, velocity=state.velocity + correction)

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,6 @@ class LocalMap(Stateful, ABC):
     """Surfaces within a radius of the sensor, in several resolutions."""
 
     cell_m: float  # edge of the finest cells
-    velocity_gains: ClassVar[FloatArray]  # (6,) of `VelocityBias`
     scans: int  # number of inserted scans
     _radius_m: float
     _centre: Annotated[FloatArray, Shape(3)] | None

@@ -190,8 +190,6 @@ class SurfelMap(LocalMap):
     compact object in the finest grid, along the axes of small extent.
     """
 
-    # With a third, an office's pitch swings ever wider.
-    velocity_gains = np.array([0.8] * 3 + [0.5] * 3)
     _grids: list[SurfelGrid]
 
     def __init__(self, cell_m: float, radius_m: float) -> None:

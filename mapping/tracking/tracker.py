@@ -12,7 +12,14 @@ from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior, VelocityBias
+from lidarslam.mapping.motion.prediction import (
+    FADING,
+    LOST_MOTION,
+    MotionState,
+    Prediction,
+    Prior,
+    corrected_by_motion,
+)
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
@@ -229,18 +236,14 @@ class Tracker(Stateful):
         T_world_lidar, velocity, covariance = registration.T_world_lidar, registration.velocity, registration.covariance
         state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
         tracking = self.tracking.registered(attempt.status, relocalised, attempt.quality, scan.stamp)
-        bias = tracking.velocity_bias
-        if relocalised or jumped or not tracking.velocity_known or prior.inertial is not None:
-            bias = VelocityBias()
-        elif is_timed:
-            bias = bias.updated(last, state, scan.seen_from_s, attempt.local_map.velocity_gains)
-            state = bias.corrected(state)
+        velocity_known = not (jumped or relocalised)
+        if is_timed and velocity_known and tracking.velocity_known and prior.inertial is None:
+            state = corrected_by_motion(state, last, scan.seen_from_s)
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not relocalised:
             tracking = tracking.moved(last, state, motion, prior, self._config)
         tracking = tracking.with_prediction_error(displacement_m(attempt.correction, scan.range_m))
-        velocity_known = not (jumped or relocalised)
-        self.tracking = tracking = replace(tracking, velocity_known=velocity_known, velocity_bias=bias)
+        self.tracking = tracking = replace(tracking, velocity_known=velocity_known)
         if not velocity_known:
             velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
             state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)

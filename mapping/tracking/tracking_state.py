@@ -13,7 +13,6 @@ from lidarslam.mapping.motion.prediction import (
     Prediction,
     Prior,
     ProcessNoise,
-    VelocityBias,
     predict,
 )
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -54,7 +53,6 @@ class TrackingState:
     prediction_error_m: float = _UNKNOWN_ERROR_M
     process_noise: ProcessNoise = field(default_factory=ProcessNoise)
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
-    velocity_bias: VelocityBias = field(default_factory=VelocityBias)
 
     @property
     def is_unconfirmed(self) -> bool:
