@@ -59,10 +59,10 @@ LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
 # Least contradicting pairs of a stretch. A single one counts where it has so many votes and another confirms it, or, in
 # runs of fewer tested pairs, where it has more or the pose has less than a share of them. In the sparse scans of a
-# Mid-360, chance makes one of 8.1 votes, with a tenth of them at the pose, and of 9.9 to 12.1, with a quarter; slips
-# leave next to none.
+# Mid-360, chance makes one of 8.1 to 10 votes, with a tenth or more of them at the pose, and of 9.9 to 12.1, with a
+# quarter; slips leave next to none.
 _LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE = 2, 4, 10.0
-_MANY_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 14.0, 0.2
+_MANY_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 14.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
