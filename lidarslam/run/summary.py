@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.text import count
-from lidarslam.core.tracking import Status
+from lidarslam.core.tracking import AXES, Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.global_map import TiledMap
@@ -398,10 +398,15 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 
 
 def _unconstrained_m(log: ScanLog) -> float:
-    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends."""
+    """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
+
+    Where a rotation is degenerate, hardly anything is known of the motion.
+    """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
-    open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)
+    degenerate = [[axis in names.split() for axis in AXES] for names in log.degenerate[1:]]
+    rotation, translation = np.hsplit(np.array(degenerate).reshape(-1, 6), 2)
+    open_axes = translation | rotation.any(axis=1, keepdims=True)
     lengths_m = np.linalg.norm(moved * open_axes, axis=1)
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))
     return float(lengths_m.sum())
