@@ -1,6 +1,6 @@
 """Prediction of the next scan's pose and velocity by a Kalman filter of the last motion and the odometry."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -29,7 +29,8 @@ _PROCESS_SMOOTHING, _PROCESS_MARGIN = 0.1, 4.0
 _VELOCITY_INFLATION = 2.0
 # Error of a constant velocity within a sweep, per acceleration and square of the duration.
 _UNEVEN = 1.0 / 8.0
-# Smoothing of the odometry's normalised squared error, and its gate: chi square, six degrees of freedom, 1 in 10,000.
+# Smoothing of the odometry's normalised error and its square, and the gate of the latter: chi square, six degrees of
+# freedom, 1 in 10,000.
 _ODOMETRY_SMOOTHING, _GATE = 0.2, 27.9
 # Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
 _LARGEST_MEASURED = np.array([0.1] * 3 + [1.0] * 3)
@@ -159,12 +160,13 @@ class ProcessNoise:
 LARGEST_PROCESS_NOISE = ProcessNoise(*_LARGEST_ACCELERATION)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OdometryNoise:
     """Scale of an odometry's errors against its stated covariance."""
 
     variance: float = 1.0  # factor on the covariance, at least one
     agreed: int = 0  # consistent motions in a row
+    mean: Annotated[FloatArray, Shape(6)] = field(default_factory=lambda: np.zeros(6))  # smoothed error
 
     def updated(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> "OdometryNoise":
         """The noise after a registered motion (4, 4), by the odometry's normalised squared error."""
@@ -172,7 +174,19 @@ class OdometryNoise:
             return self
         squared = _squared_error(prior, T_prev_curr, prior.motion_covariance(config))
         variance = max(1.0, self.variance + _ODOMETRY_SMOOTHING * (squared / 6.0 - self.variance))
-        return OdometryNoise(variance, self.agreed + 1 if squared < _GATE * self.variance else 0)
+        error = log(inverse(prior.T_prev_curr) @ T_prev_curr)
+        mean = self.mean + _ODOMETRY_SMOOTHING * (error - self.mean)
+        return OdometryNoise(variance, self.agreed + 1 if squared < _GATE * self.variance else 0, mean)
+
+    def covariance(self, prior: Prior, config: MappingConfig) -> FloatArray:
+        """(6, 6) of a motion for its prediction: larger if the errors are, or if they have one sign.
+
+        Such an odometry, as in grass, would draw one pose after the other to its side. The mean of independent errors,
+        smoothed by a, has a normalised square of `6 a / (2 - a)`.
+        """
+        own = prior.motion_covariance(config) if prior.covariance is None else prior.covariance
+        bias = (2.0 / _ODOMETRY_SMOOTHING - 1.0) * float(self.mean @ np.linalg.solve(own, self.mean)) / 6.0
+        return max(self.variance, bias) * prior.motion_covariance(config)
 
     def agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool | None:
         """Whether a registered motion (4, 4) passes the gate of a proven odometry; None where there is none."""
@@ -271,7 +285,7 @@ def predict(
     """
     interval_s = stamp - last.stamp
     joint, contradicted = _Joint.propagated(last, interval_s, seen_from_s, process_noise), False
-    covariance = odometry_noise.variance * prior.motion_covariance(config)
+    covariance = odometry_noise.covariance(prior, config)
     if prior.T_prev_curr is not None:
         T_expected = inverse(joint.T_world_last) @ joint.T_world_next
         H = np.zeros((6, 24))

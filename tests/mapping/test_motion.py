@@ -176,7 +176,17 @@ def test_the_noise_of_an_odometry_follows_its_errors():
         for _ in range(200):
             noise = noise.updated(told, MOVED @ exp(rng.normal(scale=sigma, size=6)), CONFIG)
         assert least < noise.variance < most
-    assert noise.updated(measured(), MOVED, CONFIG) == noise
+        assert noise.covariance(told, CONFIG)[0, 0] == pytest.approx(noise.variance * isotropic(0.01)[0, 0])
+    assert noise.updated(measured(), MOVED, CONFIG) is noise
+
+
+def test_an_odometry_whose_errors_have_one_sign_counts_less():
+    """Two standard deviations, well within ten."""
+    noise, told = OdometryNoise(), Prior(MOVED, covariance=isotropic(0.01))
+    for _ in range(50):
+        noise = noise.updated(told, MOVED @ ahead(0.02), CONFIG)
+    assert noise.variance == 1.0
+    np.testing.assert_allclose(noise.covariance(told, CONFIG), 6.0 * told.motion_covariance(CONFIG), rtol=1e-3)
 
 
 def test_an_odometry_confirms_and_rejects_motions_once_it_was_consistent_for_long():
