@@ -87,13 +87,14 @@ def test_a_restored_log_goes_on_alike(log):
     np.testing.assert_array_equal(restored.trajectory.T_world_lidar, log.trajectory.T_world_lidar)
 
 
+@pytest.mark.parametrize("direction", ["x", "yaw"])
 @pytest.mark.parametrize(("open_scans", "unknown"), [(0, False), (1, False), (4, True)])
-def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(open_scans, unknown):
-    """Eleven scans a metre apart along x, the last of which hardly constrain it."""
+def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(open_scans, unknown, direction):
+    """Eleven scans a metre apart along x, the last of which hardly constrain it, or not even the rotation."""
     log = ScanLog()
     for scan in range(11):
         pose = exp([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]) @ exp([0.0, 0.0, 0.0, float(scan), 0.0, 0.0])
-        degenerate = ("roll", "x") if scan > 10 - open_scans else ("yaw", "z")
+        degenerate = (direction, "y") if scan > 10 - open_scans else ("z",)
         log.add(result(0.1 * scan, T_world_lidar=pose, degenerate=degenerate))
     summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
     assert summary.to_json()["unconstrained_m"] == pytest.approx(open_scans, abs=1e-9)
