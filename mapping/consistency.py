@@ -54,8 +54,9 @@ _NEAR = 20
 # A closer pair has no direction of travel: x and y of the LiDAR are tested.
 _LEAST_WAY_M = 0.2
 # A pair contradicts its relative pose when the pose has less than this share of the peak's votes within the tolerance,
-# and so many fewer; a lower peak may be chance, or a vehicle.
-LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
+# and so many fewer; a peak of fewer votes may be chance, or a vehicle. In the sparse scans of a Mid-360, chance makes
+# pairs of peaks with 6 to 7 votes more than the pose.
+LEAST_VOTES, LARGEST_SHARE, _LEAST_FEWER = 8.0, 0.5, 7.0
 _TOLERANCE_BINS = 1
 # Least contradicting pairs of a stretch. A single one counts where it has so many votes and another confirms it, or, in
 # runs of fewer tested pairs, where it has more or the pose has less than a share of them. In the sparse scans of a
@@ -358,8 +359,8 @@ def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArra
 def find_contradictions(tests: Sequence[PairTest], T_world_lidar: FloatArray) -> tuple[Contradiction, ...]:
     """The stretches where scans clearly fit better at a shift along their path than at their final poses (N, 4, 4)."""
     known = [test.at(T_world_lidar) for test in tests if max(test.first, test.second) < len(T_world_lidar)]
-    more = [one for one in known if one.votes - one.votes_at_pose >= LEAST_VOTES]
-    bad = [one for one in more if one.votes_at_pose < LARGEST_SHARE * one.votes]
+    high = [one for one in known if one.votes >= LEAST_VOTES]
+    bad = [one for one in high if one.votes_at_pose < min(LARGEST_SHARE * one.votes, one.votes - _LEAST_FEWER)]
     stretches: list[list[Contradiction]] = []
     for one in sorted(bad, key=lambda one: one.first):
         if stretches and one.first < max(before.last for before in stretches[-1]):

@@ -405,7 +405,7 @@ def _unconstrained_m(log: ScanLog) -> float:
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     degenerate = [[axis in names.split() for axis in AXES] for names in log.degenerate[1:]]
-    rotation, translation = np.hsplit(np.array(degenerate).reshape(-1, 6), 2)
+    rotation, translation = np.hsplit(np.array(degenerate, dtype=bool).reshape(-1, 6), 2)
     open_axes = translation | rotation.any(axis=1, keepdims=True)
     lengths_m = np.linalg.norm(moved * open_axes, axis=1)
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))

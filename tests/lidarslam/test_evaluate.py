@@ -86,7 +86,7 @@ def test_every_alignment_is_told(run, tmp_path, alignment):
     assert found.refined == (alignment != "none")
     if alignment == "none":  # wrong here: said in figures and in words
         assert not found.is_trustworthy
-        assert any("its alignment is wrong" in note for note in evaluation.notes)
+        assert any("misaligned" in note for note in evaluation.notes)
     else:
         assert evaluation.map.json["accuracy_mean_m"] < 0.02
 
