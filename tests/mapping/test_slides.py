@@ -138,11 +138,18 @@ def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, vote
 
 
 @pytest.mark.parametrize(
-    ("votes", "votes_at_pose", "stretches"), [(9.0, 0.5, 0), (10.0, 0.5, 1), (10.0, 2.5, 0), (15.0, 7.0, 1)]
+    ("votes", "votes_at_pose", "stretches"), [(9.0, 0.5, 0), (10.0, 0.5, 1), (10.0, 1.5, 0), (15.0, 7.0, 1)]
 )
 def test_the_only_pair_of_a_short_run_counts_where_it_is_clear(votes, votes_at_pose, stretches):
     standing = np.tile(np.eye(4), (11, 1, 1))
     assert len(find_contradictions([pair(0, 10, 0.4, votes, votes_at_pose)], standing)) == stretches
+
+
+@pytest.mark.parametrize(("votes_at_pose", "stretches"), [(0.5, 1), (2.2, 0)])
+def test_two_low_peaks_contradict_poses_only_where_next_to_nothing_fits_there(votes_at_pose, stretches):
+    """A quarter of the votes at the pose, and nine at a peak, is chance among sparse strokes."""
+    pairs = [pair(0, 20, -0.9, 8.3, votes_at_pose), pair(10, 20, -0.8, 9.0, votes_at_pose)]
+    assert len(find_contradictions(pairs, np.tile(np.eye(4), (31, 1, 1)))) == stretches
 
 
 def test_poses_that_were_corrected_are_judged_as_corrected(scans):
