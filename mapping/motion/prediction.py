@@ -42,7 +42,7 @@ _CONFLICT_SQUARED, _CONFLICT_M, _CONFLICT_SHARE, _WALKING_M_S = 16.0, 0.03, 0.25
 _PROVEN_AFTER = 10
 # Share of the difference between a motion and the velocity of its sweeps that is corrected, and the largest difference
 # that counts, rad/s and m/s: a sudden acceleration makes a larger one.
-_CORRECTED_SHARE = 0.8
+_CORRECTED_SHARE = 0.3
 _MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
 # Sweeps follow one another where they cover this share of the interval between their stamps.
 _COVERED = 0.8

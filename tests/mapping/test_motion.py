@@ -308,17 +308,17 @@ def swept(number: int, velocity: FloatArray, seen_from_s: float) -> MotionState:
 def test_a_bias_that_sweeps_and_map_have_in_common_fades_away(seen_from_s, share):
     """With stamps at the beginning of the sweeps, in their middle, and at their end; sweeps are a share of the map."""
     bias, last = BIAS, swept(0, STEADY + BIAS, seen_from_s)
-    for number in range(1, 60):
+    for number in range(1, 200):
         last = corrected_by_motion(swept(number, STEADY + bias, seen_from_s), last, seen_from_s)
         bias = bias + share * (last.velocity - STEADY - bias)
     np.testing.assert_allclose(last.velocity, STEADY, atol=0.01 * np.abs(BIAS).max())
 
 
 def test_a_sudden_acceleration_is_no_bias():
-    """Of 360 deg/s and 30 m/s, 2.4 degrees and 16 cm per second are corrected."""
+    """Of 360 deg/s and 30 m/s, 0.9 degrees and 6 cm per second are corrected."""
     sudden = np.array([0.0, 0.0, np.deg2rad(360.0), 30.0, 0.0, 0.0])
     state = corrected_by_motion(swept(1, STEADY, 0.0), swept(0, STEADY - sudden, 0.0), 0.0)
-    np.testing.assert_allclose((state.velocity - STEADY)[[2, 3]], [np.deg2rad(2.4), 0.16], rtol=1e-6)
+    np.testing.assert_allclose((state.velocity - STEADY)[[2, 3]], [np.deg2rad(0.9), 0.06], rtol=1e-6)
 
 
 def test_nothing_is_corrected_after_a_gap_between_sweeps():
@@ -335,4 +335,4 @@ def test_the_pose_follows_as_it_is_correlated():
     corrected = corrected_by_motion(state, swept(0, STEADY + BIAS, 0.0), 0.0)
     correction = corrected.velocity - STEADY
     np.testing.assert_allclose(log(inverse(MOTION) @ corrected.T_world_lidar), -0.05 * correction, atol=1e-12)
-    assert np.abs(correction + 0.8 * BIAS).max() < 1e-12
+    assert np.abs(correction + 0.3 * BIAS).max() < 1e-12
