@@ -87,7 +87,7 @@ def main() -> None:
             for number, (name, distort) in enumerate(DISTORTIONS.items()):
                 prior = Path(folder) / f"{number}.tum"
                 write_tum(prior, Trajectory(trajectory.stamps, distort(trajectory.T_world_lidar)))
-                settings = {"odometry": {"method": "external"}, "mapping": {"method": "off"}}
+                settings: dict[str, object] = {"odometry": {"method": "external"}, "mapping": {"method": "off"}}
                 summary = run(Path(source), Path(folder) / str(number), settings, prior)
                 print(row(Path(source).name, name, summary), flush=True)
 
