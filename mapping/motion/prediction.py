@@ -172,21 +172,22 @@ class OdometryNoise:
         """The noise after a registered motion (4, 4), by the odometry's normalised squared error."""
         if prior.T_prev_curr is None:
             return self
-        squared = _squared_error(prior, T_prev_curr, prior.motion_covariance(config))
-        variance = max(1.0, self.variance + _ODOMETRY_SMOOTHING * (squared / 6.0 - self.variance))
         error = log(inverse(prior.T_prev_curr) @ T_prev_curr)
+        squared = float(error @ np.linalg.solve(prior.motion_covariance(config), error))
+        variance = max(1.0, self.variance + _ODOMETRY_SMOOTHING * (squared / 6.0 - self.variance))
         mean = self.mean + _ODOMETRY_SMOOTHING * (error - self.mean)
         return OdometryNoise(variance, self.agreed + 1 if squared < _GATE * self.variance else 0, mean)
 
     def covariance(self, prior: Prior, config: MappingConfig) -> FloatArray:
-        """(6, 6) of a motion for its prediction: larger if the errors are, or if they have one sign.
+        """(6, 6) of a motion for the prediction: inflated by large errors, and by a bias, which poses would inherit.
 
-        Such an odometry, as in grass, would draw one pose after the other to its side. The mean of independent errors,
-        smoothed by a, has a normalised square of `6 a / (2 - a)`.
+        The bias is tested by the normalised square of the mean error: `6 a / (2 - a)` for independent errors that are
+        smoothed by a.
         """
-        own = prior.motion_covariance(config) if prior.covariance is None else prior.covariance
+        covariance = prior.motion_covariance(config)
+        own = covariance if prior.covariance is None else prior.covariance
         bias = (2.0 / _ODOMETRY_SMOOTHING - 1.0) * float(self.mean @ np.linalg.solve(own, self.mean)) / 6.0
-        return max(self.variance, bias) * prior.motion_covariance(config)
+        return max(self.variance, bias) * covariance
 
     def agrees(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool | None:
         """Whether a registered motion (4, 4) passes the gate of a proven odometry; None where there is none."""
@@ -369,7 +370,7 @@ def velocity_error(last: MotionState, state: MotionState, share: float) -> Float
 
 
 def corrected_by_motion(state: MotionState, last: MotionState, seen_from_s: float) -> MotionState:
-    """The state with its velocity drawn towards that of the motion from the last one, and the likeliest pose given it.
+    """The state with its velocity corrected by the motion since the last one, and the likeliest pose given that.
 
     Sweeps that are bent equally fit one another and the map that they make, so that their registration hardly observes
     a bias in common. The motion between the poses of successive sweeps does: on average, it is their velocity. The map
