@@ -112,7 +112,9 @@ def smoothed_start(
     reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))
     backwards = _backwards(taken, _motions(known), reverse)
     earlier = len(taken) - len(known)  # scans; the first of them has nothing to fit
-    again, in_order = backwards[len(known) : -1], forwards[1:earlier]
+    again = backwards[len(known) : -1]
+    # Scans that were inserted at their predictions, into a map that was too thin, are no measure.
+    in_order = [one for one in forwards[1:earlier] if one.registered or not one.added] or known
     is_better = _quality(again) >= _quality(in_order) or _constrains_better(again, in_order)
     if len(_tracked_at_last(backwards)) < len(backwards) or not is_better:
         return {}

@@ -400,7 +400,7 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 def _unconstrained_m(log: ScanLog) -> float:
     """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
 
-    Where a rotation is degenerate, hardly anything is known of the motion.
+    Where a rotation is degenerate, hardly anything is known of the motion; where all axes are, it may be a walking speed.
     """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
@@ -408,6 +408,8 @@ def _unconstrained_m(log: ScanLog) -> float:
     rotation, translation = np.hsplit(np.array(degenerate, dtype=bool).reshape(-1, 6), 2)
     open_axes = translation | rotation.any(axis=1, keepdims=True)
     lengths_m = np.linalg.norm(moved * open_axes, axis=1)
+    is_unknown = rotation.all(axis=1) & translation.all(axis=1)
+    lengths_m[is_unknown] = np.maximum(lengths_m, _WALKING_MPS * np.diff(log.stamps))[is_unknown]
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))
     return float(lengths_m.sum())
 

@@ -409,9 +409,11 @@ class FeatureMap(LocalMap):
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
         self._has_rings = scan.has_rings
         views, is_edge = views_of(points, sensor), _edges_of(scan.sweep)
-        for grids, chosen in ((self._edges, is_edge), (self._planes, ~is_edge)):
+        for grids, is_kind in ((self._edges, is_edge), (self._planes, ~is_edge)):
+            chosen = np.flatnonzero(is_kind)
+            inserted = points.take(chosen, axis=0), views.take(chosen, axis=0), scan.elevations.take(chosen)
             for grid in grids:
-                grid.insert(points[chosen], views[chosen], scan.elevations[chosen])
+                grid.insert(*inserted)
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002

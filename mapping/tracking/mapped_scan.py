@@ -41,6 +41,9 @@ _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
 # it may have been carried anywhere. The same where a consistent odometry measured the motion since.
 _MORE_SPEED_M_S, _MORE_TURN_RAD_S, _REACH_S = 3.0, np.deg2rad(200.0), 1.0
 _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S = 0.3, np.deg2rad(20.0), 3.0
+# Overlap with a map that may be too thin from which a registration counts; and its largest correction, degrees and
+# cells, where the map is of several scans at their predictions.
+_FOUNDED_OVERLAP, _AGREEING = 0.2, (np.deg2rad(3.0), 0.5)
 # A turn that a gyroscope measured is known to this.
 _MEASURED_TURN = np.deg2rad(5.0)
 # A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place this many
@@ -254,6 +257,19 @@ class Attempt:
         angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
         most = _MEASURED_TURN if self.prediction.is_inertial else _LEAST_JUMP[0] + turn * since_s
         return bool(angle < most and distance_m < _LEAST_JUMP[3] + speed * since_s)
+
+    def confirms_map(self, of_predictions: bool) -> bool:
+        """Whether a map, of one scan or of several at their predictions, suffices for this registration.
+
+        Scans that were inserted with a wrong motion make planes all the same. What fits these agrees with the predicted
+        motion only by chance.
+        """
+        if not of_predictions:
+            return self.status is not Status.LOST
+        angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
+        agrees = angle < _AGREEING[0] and distance_m < _AGREEING[1] * self.local_map.cell_m
+        is_known = self.status is not Status.LOST and not self.unconstrained
+        return is_known and agrees and self.fit.overlap >= _FOUNDED_OVERLAP
 
     def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:
         """Velocity (6,) after a jump or a relocalisation from the last scan's state.

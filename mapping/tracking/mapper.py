@@ -15,11 +15,12 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
-from lidarslam.core.tracking import Status
+from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import FeatureSampler
 from lidarslam.mapping.motion.prediction import (
+    LEAST_SIGMA,
     LOST_MOTION,
     UNKNOWN_VELOCITY,
     MotionState,
@@ -40,6 +41,12 @@ logger = logging.getLogger(__name__)
 # Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
 # quality that this keeps: the velocity within a sparse sweep may be far off.
 _REDRAWS, _LEAST_KEPT = 2, 0.5
+# A map of sweeps without rings may begin with several at their predictions, for so many seconds: too few neighbouring
+# points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are, and the
+# sensor moves evenly.
+_GROWING_S = 2.0
+_EVEN_MOTION = np.diag(np.concatenate([LEAST_SIGMA, [np.deg2rad(20.0)] * 3, [0.5] * 3]) ** 2)
+_GROWING = "at its prediction: the map has too few sweeps yet"
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 _SEARCHING = "the search for its place goes on with the next scan"
 
@@ -67,6 +74,7 @@ class Mapper(Stateful):
     _first: SampledScan | None
     _scans: int
     _map_since: int  # number of scans before the present map began, or came back from the archive
+    _growing_since: float | None  # stamp of the map's first scan, while all of its scans are at their predictions
     _recent: list[Insertion]
 
     def __init__(
@@ -81,6 +89,7 @@ class Mapper(Stateful):
         self._map = None
         self._last = None
         self._first = None  # while it alone is the map, drawn with a guessed motion
+        self._growing_since = None
 
     @property
     def local_map(self) -> LocalMap | None:
@@ -120,7 +129,12 @@ class Mapper(Stateful):
         if beyond is not None:
             return self._lose(scan, prediction, local_map, None, beyond)
         # Register the keypoints to the surfels; where that fails, relocalise.
-        attempt = self._tracker.register(scan, prior, prediction, last, local_map)
+        is_growing = self._growing_since is not None and scan.stamp - self._growing_since < _GROWING_S
+        has_grown = is_growing and local_map.scans > 1
+        register = self._tracker.register_near if has_grown else self._tracker.register
+        attempt = register(scan, prior, prediction, last, local_map)
+        if is_growing and not attempt.confirms_map(has_grown):
+            return self._grow(scan, prediction, local_map, attempt.fit)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
             reason = _SEARCHING if self._tracker.is_searching else reason
@@ -132,6 +146,7 @@ class Mapper(Stateful):
             self._map_since = self._scans
         self._map = attempt.local_map
         if mapped.added:
+            self._growing_since = self._growing_since if has_grown else None
             self._insert(scan, mapped.state, self._map)
         return mapped
 
@@ -196,6 +211,13 @@ class Mapper(Stateful):
             lost = replace(lost, message=f"{reason}; a new map begins here")
         return lost
 
+    def _grow(self, scan: SampledScan, prediction: Prediction, local_map: LocalMap, fit: Fit) -> MappedScan:
+        """A scan that the map is too thin for is inserted at its prediction."""
+        T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
+        state = MotionState(scan.stamp, T_world_lidar, velocity, _EVEN_MOTION, scan.seen_until_s)
+        self._insert(scan, state, local_map)
+        return MappedScan(state, T_world_lidar, False, Status.DEGRADED, _GROWING, fit, AXES, added=True)
+
     def _new_map(self, scan: SampledScan, state: MotionState) -> LocalMap:
         """A map of one scan."""
         # Of sparse strokes, few cells have more than one; a plane through neighbouring voxels spans several.
@@ -203,6 +225,7 @@ class Mapper(Stateful):
         local_map = (SurfelMap if is_surfels else FeatureMap)(scan.cell_m, self._config.radius_m)
         logger.info("new local map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
         self._map_since = self._scans
+        self._growing_since = None if scan.has_rings else scan.stamp
         self._insert(scan, state, local_map)
         return local_map
 

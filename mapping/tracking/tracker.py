@@ -224,6 +224,13 @@ class Tracker(Stateful):
             return replace(near, status=Status.LOST, prediction=nearby.continued(near.prediction))
         return best
 
+    def register_near(
+        self, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState, local_map: LocalMap
+    ) -> Attempt:
+        """Register a scan from its prediction alone."""
+        matcher = ScanMatcher(scan, last, local_map, self._config, self._budget)
+        return NearSearch(matcher, self.tracking, prior, prediction).at_prediction()
+
     def accept(
         self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
     ) -> MappedScan:

@@ -12,7 +12,7 @@ from lidarslam.compare import comparison as described
 from lidarslam.compare.comparison import versions
 from lidarslam.core.geometry import exp
 from lidarslam.core.state import Saved
-from lidarslam.core.tracking import Status
+from lidarslam.core.tracking import AXES, Status
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.progress import show_progress
 from lidarslam.run.results import format_times
@@ -85,6 +85,14 @@ def test_a_restored_log_goes_on_alike(log):
         one.add(result(3.0))
     assert restored.format_csv() == log.format_csv()
     np.testing.assert_array_equal(restored.trajectory.T_world_lidar, log.trajectory.T_world_lidar)
+
+
+def test_a_walking_speed_is_missing_where_nothing_is_known_of_the_motion():
+    log = ScanLog()
+    for scan in range(21):
+        log.add(result(0.1 * scan, degenerate=AXES if scan in (1, 2) else ()))
+    summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
+    assert summary.to_json()["unconstrained_m"] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("direction", ["x", "yaw"])

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import Scan
-from lidarslam.core.tracking import Status
+from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.motion.prediction import Prior
@@ -65,6 +65,33 @@ def test_too_few_scans_are_left_as_they_are(strokes):
     scans, _ = strokes
     assert smoothed_start(scans[:5], MappingConfig()) == {}
     assert smoothed_start([], MappingConfig()) == {}
+
+
+@pytest.mark.long
+def test_a_map_too_thin_for_a_registration_grows_at_rest():
+    """Few neighbouring points of a single sweep of a Mid-360 are on a plane of a forest."""
+    scans, truth = walk("mid-360", 0, 26, "forest")
+    results = process(Mapper(MappingConfig()), scans)
+    grown = [result for result in results if not result.registered]
+    assert 2 <= len(grown) < 10, "the first scan, and those that the map is too thin for"
+    assert all(result.added for result in grown)
+    assert [result.status for result in results[-12:]] == [Status.OK] * 12
+    steps = inverse(truth) @ inverse(poses_of(results)[:-1]) @ poses_of(results)[1:]
+    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.08
+    T_first_last = np.linalg.multi_dot(list(truth))
+    assert errors(poses_of(results)[-1], T_first_last)[0] < 0.06
+
+
+def test_a_map_that_nothing_fits_grows_for_two_seconds(rng):
+    def clutter(stamp: float) -> Scan:
+        points = rng.normal(size=(1200, 3)) * [8.0, 8.0, 2.0]
+        points = points[np.argsort(points[:, 2] / np.linalg.norm(points, axis=1))]  # near one another at any time
+        return Scan(points, stamp, time_offsets=np.linspace(0.0, 0.1, len(points)))
+
+    results = process(Mapper(MappingConfig()), [clutter(0.5 * number) for number in range(6)])
+    assert [result.status for result in results[1:]] == [Status.DEGRADED] * 3 + [Status.LOST] * 2
+    assert all(result.degenerate == AXES and result.added for result in results[1:4])
+    assert poses_of(results) == pytest.approx(np.tile(np.eye(4), (6, 1, 1)), abs=1e-9)
 
 
 @pytest.mark.long
