@@ -384,6 +384,8 @@ def summarise(
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
 _WALKING_MPS = 1.5
+# Of a sensor that is not at rest.
+_SHORTEST_MOTION_M = 0.02
 # Of a vehicle, m/s^2.
 _MOST_ACCELERATION = 5.0
 
@@ -400,14 +402,18 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
 def _unconstrained_m(log: ScanLog) -> float:
     """The distance travelled along axes of translation that are degenerate in the scans at the motions' ends.
 
-    Where a rotation is degenerate, hardly anything is known of the motion; where all axes are, it may be a walking speed.
+    Where a rotation is degenerate, hardly anything is known of the motion; where all axes are, not even the speed. A
+    motion that is shorter than the position's standard deviation along it may be noise.
     """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     degenerate = [[axis in names.split() for axis in AXES] for names in log.degenerate[1:]]
     rotation, translation = np.hsplit(np.array(degenerate, dtype=bool).reshape(-1, 6), 2)
     open_axes = translation | rotation.any(axis=1, keepdims=True)
-    lengths_m = np.linalg.norm(moved * open_axes, axis=1)
+    whole_m = np.linalg.norm(moved, axis=1)
+    sigmas_m = np.linalg.norm(moved * np.nan_to_num(log.table["sigmas"][1:, 3:]), axis=1) / np.maximum(whole_m, 1e-9)
+    is_noise = (whole_m > _SHORTEST_MOTION_M) & (whole_m < sigmas_m)
+    lengths_m = np.where(is_noise, whole_m, np.linalg.norm(moved * open_axes, axis=1))
     is_unknown = rotation.all(axis=1) & translation.all(axis=1)
     lengths_m[is_unknown] = np.maximum(lengths_m, _WALKING_MPS * np.diff(log.stamps))[is_unknown]
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))

@@ -261,11 +261,11 @@ class Attempt:
     def confirms_map(self, of_predictions: bool) -> bool:
         """Whether a map, of one scan or of several at their predictions, suffices for this registration.
 
-        Scans that were inserted with a wrong motion make planes all the same. What fits these agrees with the predicted
-        motion only by chance.
+        To one scan, any place may fit. Several that were inserted with a wrong motion make planes all the same; what fits
+        these agrees with the predicted motion only by chance.
         """
         if not of_predictions:
-            return self.status is not Status.LOST
+            return self.status is not Status.LOST and self.rival is None
         angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
         agrees = angle < _AGREEING[0] and distance_m < _AGREEING[1] * self.local_map.cell_m
         is_known = self.status is not Status.LOST and not self.unconstrained

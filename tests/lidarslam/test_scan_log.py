@@ -95,6 +95,17 @@ def test_a_walking_speed_is_missing_where_nothing_is_known_of_the_motion():
     assert summary.to_json()["unconstrained_m"] == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize(("sigma_m", "unconstrained_m"), [(0.2, 2.0), (0.05, 0.0)])
+def test_motions_shorter_than_their_standard_deviation_may_be_noise(sigma_m, unconstrained_m):
+    """Twenty of ten centimetres along x; whatever the deviation along z, which they leave alone."""
+    log = ScanLog()
+    for scan in range(21):
+        pose = exp([0.0, 0.0, 0.0, 0.1 * scan, 0.0, 0.0])
+        log.add(result(0.1 * scan, T_world_lidar=pose, covariance=np.diag([1e-6] * 3 + [sigma_m**2, 1e-4, 1.0])))
+    summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
+    assert summary.to_json()["unconstrained_m"] == pytest.approx(unconstrained_m)
+
+
 @pytest.mark.parametrize("direction", ["x", "yaw"])
 @pytest.mark.parametrize(("open_scans", "unknown"), [(0, False), (1, False), (4, True)])
 def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(open_scans, unknown, direction):
