@@ -261,7 +261,7 @@ class Attempt:
     def confirms_map(self, of_predictions: bool) -> bool:
         """Whether a map, of one scan or of several at their predictions, suffices for this registration.
 
-        To one scan, any place may fit. Several that were inserted with a wrong motion make planes all the same; what fits
+        One scan may fit anywhere. Several that were inserted with a wrong motion make planes all the same; what fits
         these agrees with the predicted motion only by chance.
         """
         if not of_predictions:
