@@ -46,7 +46,7 @@ _REDRAWS, _LEAST_KEPT = 2, 0.5
 # sensor moves evenly.
 _GROWING_S = 2.0
 _EVEN_MOTION = np.diag(np.concatenate([LEAST_SIGMA, [np.deg2rad(20.0)] * 3, [0.5] * 3]) ** 2)
-_GROWING = "at its prediction: the map has too few sweeps yet"
+_GROWING = "inserted at its prediction: the map has too few sweeps for a registration"
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 _SEARCHING = "the search for its place goes on with the next scan"
 
@@ -74,7 +74,7 @@ class Mapper(Stateful):
     _first: SampledScan | None
     _scans: int
     _map_since: int  # number of scans before the present map began, or came back from the archive
-    _growing_since: float | None  # stamp of the map's first scan, while all of its scans are at their predictions
+    _growing_since: float | None  # stamp of the map's first scan, if that may be too thin for a registration
     _recent: list[Insertion]
 
     def __init__(
