@@ -407,14 +407,16 @@ def _unconstrained_m(log: ScanLog) -> float:
     """
     poses = log.trajectory.T_world_lidar
     moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
-    degenerate = [[axis in names.split() for axis in AXES] for names in log.degenerate[1:]]
-    rotation, translation = np.hsplit(np.array(degenerate, dtype=bool).reshape(-1, 6), 2)
+    open_of = [[axis in names.split() for axis in AXES] for names in log.degenerate[1:]]
+    degenerate = np.array(open_of, dtype=bool).reshape(-1, 6)
+    rotation, translation = np.hsplit(degenerate, 2)
     open_axes = translation | rotation.any(axis=1, keepdims=True)
     whole_m = np.linalg.norm(moved, axis=1)
-    sigmas_m = np.linalg.norm(moved * np.nan_to_num(log.table["sigmas"][1:, 3:]), axis=1) / np.maximum(whole_m, 1e-9)
-    is_noise = (whole_m > _SHORTEST_MOTION_M) & (whole_m < sigmas_m)
+    # The standard deviation along a motion, times its length; NaN, and no noise, without a covariance.
+    scaled_m2 = np.linalg.norm(moved * log.table["sigmas"][1:, 3:], axis=1)
+    is_noise = (whole_m > _SHORTEST_MOTION_M) & (whole_m**2 < scaled_m2)
     lengths_m = np.where(is_noise, whole_m, np.linalg.norm(moved * open_axes, axis=1))
-    is_unknown = rotation.all(axis=1) & translation.all(axis=1)
+    is_unknown = degenerate.all(axis=1)
     lengths_m[is_unknown] = np.maximum(lengths_m, _WALKING_MPS * np.diff(log.stamps))[is_unknown]
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))
     return float(lengths_m.sum())

@@ -123,9 +123,9 @@ def register(
                 points = sweep.compensated(velocity)
                 matcher.match(transform_points(T_world_lidar, points), T_world_lidar)
                 system = _System.of(points, times, T_world_lidar, matcher.surfaces, inflation, cell_m, unknown)
-                if system is None and level > 0:  # a coarse level of a thin map
-                    break
                 if system is None:
+                    if level > 0:  # of a thin map
+                        break
                     return None
                 away = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
                 error = np.concatenate([away, velocity - prediction.velocity])

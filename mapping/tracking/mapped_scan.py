@@ -238,6 +238,11 @@ class Attempt:
         """(6,) from the predicted pose to the registered one."""
         return log(inverse(self.prediction.T_world_lidar) @ self.T_world_lidar)
 
+    @property
+    def corrected_by(self) -> tuple[float, float]:
+        """Angle, radians, and distance, metres, of the correction."""
+        return float(np.linalg.norm(self.correction[:3])), float(np.linalg.norm(self.correction[3:]))
+
     @cached_property
     def has_jumped(self) -> bool:
         """Whether the correction exceeds every motion that the prediction allows for."""
@@ -254,7 +259,7 @@ class Attempt:
             turn, reach_s = _MORE_TURN_RAD_S, _REACH_S
         if since_s > reach_s:
             return True
-        angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
+        angle, distance_m = self.corrected_by
         most = _MEASURED_TURN if self.prediction.is_inertial else _LEAST_JUMP[0] + turn * since_s
         return bool(angle < most and distance_m < _LEAST_JUMP[3] + speed * since_s)
 
@@ -264,12 +269,13 @@ class Attempt:
         One scan may fit anywhere. Several that were inserted with a wrong motion make planes all the same; what fits
         these agrees with the predicted motion only by chance.
         """
+        if self.status is Status.LOST:
+            return False
         if not of_predictions:
-            return self.status is not Status.LOST and self.rival is None
-        angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
+            return self.rival is None
+        angle, distance_m = self.corrected_by
         agrees = angle < _AGREEING[0] and distance_m < _AGREEING[1] * self.local_map.cell_m
-        is_known = self.status is not Status.LOST and not self.unconstrained
-        return is_known and agrees and self.fit.overlap >= _FOUNDED_OVERLAP
+        return agrees and not self.unconstrained and self.fit.overlap >= _FOUNDED_OVERLAP
 
     def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:
         """Velocity (6,) after a jump or a relocalisation from the last scan's state.
@@ -347,9 +353,8 @@ def judge(
     if attempt.status is not Status.OK:
         return attempt.status, attempt.fit.explain(config)
     assert attempt.registration is not None
-    degenerate, correction = attempt.registration.degeneracy.names, attempt.correction
-    angle_deg, distance_m = np.rad2deg(np.linalg.norm(correction[:3])), np.linalg.norm(correction[3:])
-    where = f"{angle_deg:.0f} deg and {distance_m:.2f} m from the prediction"
+    degenerate, (angle, distance_m) = attempt.registration.degeneracy.names, attempt.corrected_by
+    where = f"{np.rad2deg(angle):.0f} deg and {distance_m:.2f} m from the prediction"
     reservations = (
         (attempt.relocalised, f"relocalised in the map, {where}; {NOT_CONFIRMED}"),
         (attempt.has_jumped, where),

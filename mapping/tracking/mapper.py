@@ -128,7 +128,7 @@ class Mapper(Stateful):
         beyond = beyond_reach(T_world_near[:3, 3], self._config.max_range_m, local_map.cell_m)
         if beyond is not None:
             return self._lose(scan, prediction, local_map, None, beyond)
-        # Register the keypoints to the surfels; where that fails, relocalise.
+        # Register the keypoints to the surfels; where that fails, relocalise, or let a thin map grow.
         is_growing = self._growing_since is not None and scan.stamp - self._growing_since < _GROWING_S
         has_grown = is_growing and local_map.scans > 1
         register = self._tracker.register_near if has_grown else self._tracker.register
@@ -146,7 +146,8 @@ class Mapper(Stateful):
             self._map_since = self._scans
         self._map = attempt.local_map
         if mapped.added:
-            self._growing_since = self._growing_since if has_grown else None
+            if not has_grown:
+                self._growing_since = None
             self._insert(scan, mapped.state, self._map)
         return mapped
 
