@@ -461,8 +461,8 @@ def _warnings(
     length_m = log.trajectory.length_m
     if is_unconstrained(unconstrained_m, length_m):
         yield (
-            f"the length of {length_m:.1f} m is uncertain by {unconstrained_m:.1f} m, along directions that hardly any"
-            " surface constrains, as in a featureless corridor, or amid people who walk along"
+            f"the length of {length_m:.1f} m is uncertain by {unconstrained_m:.1f} m: hardly any surface constrains the"
+            " motion there, as in a featureless corridor or the first sweeps of a sparse sensor, or people walk along"
         )
     is_tracked = np.array([status is Status.OK for status in log.statuses])
     if (wrong := time_scale_warning(time_scale(log.trajectory, log.table["turn_rate"], is_tracked))) is not None:
