@@ -1,22 +1,22 @@
-"""Are the covariances of poses and motions right? Their normalised estimation error squared (NEES), against the truth.
+"""Consistency of the covariances of poses and motions: normalised estimation error squared (NEES) by ground truth.
 
     python benchmarks/covariance.py
     python benchmarks/covariance.py KITTI/sequences/04 --worlds street --motions car --scans 100 --methods learned+map
 
-Prints a Markdown table, up to three rows for each recording and method. With the error `xi = log(T_estimate^-1 T_true)`
-in the LiDAR frame, NEES is `xi^T Sigma^-1 xi`, chi-square with six degrees of freedom where Sigma is right:
+Prints a Markdown table with up to three rows per recording and method. With the error `xi = log(T_estimate^-1 T_true)`
+in the LiDAR frame, NEES is `xi^T Sigma^-1 xi`, chi-square with six degrees of freedom if Sigma is correct:
 
-- odometry: of the motions T_prev_curr between successive scans, with the covariance that the odometry gives;
-- registration: of the motions between successive registered poses, T_world_prev^-1 T_world_curr, with
-  `Sigma = Sigma_curr + Ad(T_curr_prev) Sigma_prev Ad(T_curr_prev)^T`. That takes the errors of the two poses for
+- odometry: the motions T_prev_curr between consecutive scans, with the covariance of the odometry;
+- registration: the motions between consecutive registered poses, T_world_prev^-1 T_world_curr, with
+  `Sigma = Sigma_curr + Ad(T_curr_prev) Sigma_prev Ad(T_curr_prev)^T`. The errors of the two poses are assumed to be
   independent; the error of the map, which they share, cancels;
-- pose: of the registered poses themselves, relative to the first scan, where the world begins. This includes the drift
-  of the map, of which a covariance of the registration knows nothing.
+- pose: the registered poses relative to the first scan, where the world begins. Their errors include the drift of the
+  map, which is not part of the covariance of a registration.
 
-NEES over 6 has the median 0.89 where the covariance is right, and more where it is too small. Within 1, 2, 3 sigma are
-shares in %; they should be 68.3, 95.4 and 99.7 (chi-square quantiles of these probabilities). Scans that are not `ok`
-are left out, and counted. Of recordings on disk at most `--scans` scans are taken. The truth of a real
-drive has errors of its own, which add to the estimate's; those of its first pose alone make the rows of poses useless.
+The median of NEES / 6 is 0.89 for a correct covariance and larger for one that is too small. The shares within 1, 2, 3
+sigma, in %, should be 68.3, 95.4 and 99.7 (chi-square quantiles of these probabilities). Scans that are not `ok` are
+left out and counted. At most `--scans` scans of a recording on disk are used. The ground truth of a real drive has
+its own errors, which add to those of the estimate; the error of its first pose alone makes the rows of poses useless.
 """
 
 from collections.abc import Iterator, Sequence
@@ -49,37 +49,37 @@ from lidarslam.pipeline.estimates import ScanEstimate
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]
-# Numbers of standard deviations, and the share of errors that should lie within each.
+# Numbers of standard deviations, and the expected share of errors within each.
 SIGMAS = (1, 2, 3)
 EXPECTED_SHARES = tuple(float(erf(sigma / np.sqrt(2.0))) for sigma in SIGMAS)
 
 
 def estimated_motions(config: OdometryConfig, scans: Sequence[Scan]) -> list[Motion]:
-    """What an odometry alone says of each scan."""
+    """Motions of an odometry alone."""
     with closing(make_odometry(config)) as odometry:
         return [odometry.estimate(scan) for scan in scans]
 
 
 def squared_errors(covariances: Sequence[FloatArray | None], errors: FloatArray) -> FloatArray:
-    """(N,) of errors (N, 6), in standard deviations, summed over the six directions; NaN without a covariance."""
+    """(N,) squared Mahalanobis norms of errors (N, 6); NaN without a covariance."""
     pairs = zip(covariances, errors, strict=True)
     return np.array([np.nan if sigma is None else error @ np.linalg.solve(sigma, error) for sigma, error in pairs])
 
 
 def shares_within_sigmas(squared: FloatArray) -> list[float]:
-    """Of squared errors (N,) as above, the shares that lie within each of `SIGMAS`."""
+    """Shares of squared errors (N,) within each of `SIGMAS`."""
     return [float(np.mean(squared <= chi2.ppf(share, 6))) for share in EXPECTED_SHARES]
 
 
 def nees_of_poses(results: Sequence[ScanEstimate], truth: FloatArray) -> FloatArray:
-    """(N,) of poses against the truth (N, 4, 4), the first made to coincide; NaN without a covariance."""
+    """(N,) of poses relative to the first, by ground truth (N, 4, 4); NaN without a covariance."""
     poses = np.array([result.T_world_lidar for result in results])
     errors = log(inverse(inverse(poses[0]) @ poses) @ inverse(truth[0]) @ truth)
     return squared_errors([result.covariance for result in results], errors)
 
 
 def nees_of_registration(results: Sequence[ScanEstimate], truth: FloatArray) -> FloatArray:
-    """(N-1,) of motions between successive poses, against those of the truth (N, 4, 4); NaN without a covariance."""
+    """(N-1,) of motions between consecutive poses, by ground truth (N, 4, 4); NaN without a covariance."""
     poses = np.array([result.T_world_lidar for result in results])
     motions = inverse(poses[:-1]) @ poses[1:]
     errors = log(inverse(motions) @ inverse(truth[:-1]) @ truth[1:])
@@ -88,7 +88,7 @@ def nees_of_registration(results: Sequence[ScanEstimate], truth: FloatArray) -> 
 
 
 def motion_covariance(previous: ScanEstimate, current: ScanEstimate, T_prev_curr: FloatArray) -> FloatArray | None:
-    """(6, 6) of the motion between two poses with independent errors; None when one has no covariance."""
+    """(6, 6) of the motion between two poses with independent errors; None if either has no covariance."""
     if previous.covariance is None or current.covariance is None:
         return None
     A = adjoint(inverse(T_prev_curr))
@@ -96,7 +96,7 @@ def motion_covariance(previous: ScanEstimate, current: ScanEstimate, T_prev_curr
 
 
 def nees_of_odometry(recorded: Recorded, config: OdometryConfig, truth: FloatArray) -> FloatArray:
-    """(N-1,) of an odometry's motions; NaN where it gives no covariance, or measured nothing."""
+    """(N-1,) of an odometry's motions; NaN without a covariance or a measurement."""
     motions = estimated_motions(config, recorded.scans)[1:]
     errors = log(inverse(np.array([motion.T_prev_curr for motion in motions])) @ inverse(truth[:-1]) @ truth[1:])
     measured = [motion.covariance if motion.failure is None else None for motion in motions]
@@ -104,7 +104,7 @@ def nees_of_odometry(recorded: Recorded, config: OdometryConfig, truth: FloatArr
 
 
 def rows(recorded: Recorded, method: str) -> Iterator[list[str]]:
-    """The cells of every kind of estimates that comes with covariances."""
+    """Rows of all kinds of estimates with covariances."""
     truth = true_trajectory(recorded).T_world_lidar
     results = pipeline_results(recorded.scans, METHODS[method])
     ok = np.array([result.status is Status.OK for result in results])
@@ -128,7 +128,7 @@ def main() -> None:
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--methods", nargs="+", choices=_MAPPED, default=_DEFAULT)
     options = parser.parse_args()
-    header = ["recording", "method", "of", "count", "left out", "median NEES/6"]
+    header = ["recording", "method", "of", "count", "left out", "median NEES / 6"]
     header += [f"within {sigma} sigma, %" for sigma in SIGMAS]
     print_header(header)
     for recorded in recordings(options, options.scans):

@@ -1,4 +1,4 @@
-r"""Draw the exact map of every simulated world, as one lap of its route sees it.
+r"""Pictures of the exact maps of the simulated worlds, as seen along one lap of the route.
 
     python benchmarks/draw_worlds.py --out docs/pictures --worlds street office tunnel forest hall park
     python benchmarks/draw_worlds.py --out docs/pictures --worlds terrace --scans 40 --width 800
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
     parser.add_argument("--motion", default="car")
     parser.add_argument("--sensor", default="os0-64")
-    parser.add_argument("--scans", type=int, help="draw what the first scans see; default: a lap")
+    parser.add_argument("--scans", type=int, help="number of scans; default: one lap")
     parser.add_argument("--width", type=int, default=1600, help="pixels")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Coverage-guided fuzzing (Atheris) of the decoders: an input ends in a result or in one of the errors for the user.
+"""Coverage-guided fuzzing (Atheris) of the decoders: every input ends in a result or in an error for the user.
 
     python benchmarks/fuzz_decoders.py mcap --runs 100000
 
-What fails is kept as `crash-*` in the folder of the corpus and is tried first from then on.
+Failing inputs are kept as `crash-*` in the folder of the corpus and are tried first in later runs.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import atheris
 
-os.environ["NUMBA_DISABLE_JIT"] = "1"  # which compiles no function that is instrumented
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # Numba cannot compile instrumented functions
 
 with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"]):
     import numpy as np
@@ -35,26 +35,26 @@ with atheris.instrument_imports(include=["lidarslam", "rosbags", "yaml", "laspy"
     from lidarslam.storage.directory import About
     from lidarslam.storage.finished_run import read_summary
 
-# Of memory, seconds for one input, and its bytes.
+# Memory, seconds per input, and bytes per input.
 _LIMITS = ("-rss_limit_mb=2048", "-timeout=20", "-max_len=65536")
 CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 def scans(path: Path) -> None:
-    """The description and all scans of a recording."""
+    """Read the description and all scans of a recording."""
     recording = open_recording(path, ReaderConfig())
     recording.describe()
     list(recording.scans(faults=Faults()))
 
 
 def live(path: Path) -> None:
-    """The same message at two times."""
+    """Decode the same message at two times."""
     decoder, raw = CloudDecoder(ReaderConfig(), CLOUD, Faults()), path.read_bytes()
     for published_ns in (2 * 10**18, 2 * 10**18 + 10**8):
         decoder.scan(raw, published_ns)
 
 
-# Of each decoder: the name of its file, and what reads that, or the folder in which it lies.
+# Decoder -> file name, and the function that reads the file or its folder.
 TARGETS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "ply": ("0.ply", lambda path: scans(path.parent)),
     "pcd": ("0.pcd", lambda path: scans(path.parent)),
@@ -70,7 +70,7 @@ TARGETS: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
-# Small whole files of text.
+# Small complete text files.
 TEXTS = {
     "tum": "1.0 0 0 0 0 0 0 1\n1.1 1 0 0 0 0 0 1\n",
     "yaml": "odometry: {method: learned}\nmapping:\n  method: loam\n",
@@ -81,7 +81,7 @@ RECORDINGS = {"mcap": "mcap", "bag": "rosbag1", "db3": "rosbag2", "ply": "ply"}
 
 
 def write_seeds(corpus: Path, name: str) -> None:
-    """Small whole files of a kind."""
+    """Write small complete files of a kind."""
     rng = np.random.default_rng(0)
     times = np.linspace(0.0, 0.1, 40)
     sweeps = [Scan(rng.normal(size=(40, 3)), stamp, times) for stamp in (0.1, 0.2, 0.3)]
@@ -118,12 +118,11 @@ def _message(folder: Path, simulated: list[SimulatedScan], rig: Rig) -> bytes:
 
 
 def main() -> None:
-    """Fuzz one decoder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("target", choices=TARGETS)
     parser.add_argument("--runs", type=int, default=10_000)
-    parser.add_argument("--seconds", type=int, default=60, help="at most")
-    parser.add_argument("--corpus", type=Path, help="kept from one time to the next")
+    parser.add_argument("--seconds", type=int, default=60, help="time limit")
+    parser.add_argument("--corpus", type=Path, help="folder kept between runs")
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,14 +1,14 @@
-"""The learned odometry alone on real drives that its weights were not trained on, at several rates, beside KISS-ICP.
+"""The learned odometry alone on real drives held out of its training, at several rates, compared with KISS-ICP.
 
     python benchmarks/held_out.py DRIVE=weights.safetensors ANOTHER=others.safetensors --steps 1 2 3 5
 
-Weights are named for each recording, those of a training that left it out; without any, the program's own are taken.
-The reference is the recording's truth, or with `--mapped` (as for drives whose GPS is off by decimetres) the trajectory
-that mapping at constant velocity finds at full rate. Prints a Markdown table, a row for each recording, step and
-method: the drift over segments of 20 to 60 m from every scan, the error of the rotation from scan to scan (RMS) and of
-the translation (largest), the scans that were lost, and how many errors lie within one, two and three standard
-deviations of the covariance (chi-square with six degrees of freedom: 68.3, 95.4, 99.7 % where it is right). With
-`--starts N`, 50 scans are taken from every N-th on, each time as a run of its own, and a row sums up all of them.
+Weights are given per recording, from a training without that recording; by default, the included weights are used. The
+reference is the recording's ground truth, or with `--mapped` (for drives whose GPS is off by decimetres) the trajectory
+of scan-to-map registration at constant velocity and full rate. Prints a Markdown table with a row per recording, step
+and method: drift over segments of 20 to 60 m from every scan, error of the rotation from scan to scan (RMSE) and of the
+translation (largest), lost scans, and the shares of errors within one, two and three standard deviations of the
+covariance (chi-square with six degrees of freedom: 68.3, 95.4, 99.7 % if it is correct). With `--starts N`, runs of 50
+scans from every N-th scan are added, with one row for all of them.
 """
 
 import argparse
@@ -48,8 +48,8 @@ class Outcome:
     """Runs of one method on parts of one recording."""
 
     drift_percent: FloatArray  # (M,) of all segments
-    wrong: FloatArray  # (N, 4, 4) errors of the motions from scan to scan
-    squared: FloatArray  # (N,) of them in standard deviations, summed over the six directions; NaN without a covariance
+    wrong: FloatArray  # (N, 4, 4) errors of the motions between scans
+    squared: FloatArray  # (N,) their squared Mahalanobis norms; NaN without a covariance
     lost: int  # scans
 
     def cells(self) -> list[str]:
@@ -66,10 +66,10 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", metavar="RECORDING[=WEIGHTS]")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 3, 5])
-    parser.add_argument("--starts", type=int, help="also 50 scans from every so-manieth scan on, at full rate")
-    parser.add_argument("--mapped", action="store_true", help="the reference is the mapped trajectory, not the truth")
+    parser.add_argument("--starts", type=int, help="also runs of 50 scans from every N-th scan, at full rate")
+    parser.add_argument("--mapped", action="store_true", help="use the mapped trajectory as reference")
     options = parser.parse_args()
-    columns = ("recording", "scans", "step, m", "method", "drift, %", "rotation, deg", "largest error, m", "lost")
+    columns = ("recording", "scans", "m per scan", "method", "drift, %", "rotation, deg", "largest error, m", "lost")
     print_header([*columns, "within 1, 2, 3 sigma, %"])
     for source in options.sources:
         name, _, weights = source.partition("=")
@@ -86,18 +86,18 @@ def main() -> None:
 
 
 def rms(values: FloatArray) -> float:
-    """The root of the mean of their squares."""
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def with_truth(source: Path) -> Recorded:
-    """A recording with the truth at its scans' stamps."""
+    """A recording with ground truth at its scans' stamps."""
     recorded = read(source)
     return replace(recorded, truth=true_trajectory(recorded))
 
 
 def mapped(source: Path) -> Recorded:
-    """A recording with the trajectory that mapping finds for its truth."""
+    """A recording with the trajectory of scan-to-map registration as ground truth."""
     recording = open_recording(source)
     scans = list(in_order(recording.scans()))
     results = pipeline_results(scans, METHODS["constant-velocity+map"])
@@ -105,7 +105,7 @@ def mapped(source: Path) -> Recorded:
 
 
 def _parts(recorded: Recorded, options: argparse.Namespace) -> Iterator[tuple[str, list[Recorded]]]:
-    """What each row is about: the recording at a rate, or many short runs."""
+    """Label and runs of each row: the recording at a rate, or many short runs."""
     for step in options.steps:
         label = "every" if step == 1 else f"every {step}"
         yield label, [replace(recorded, scans=recorded.scans[::step])]
@@ -122,7 +122,7 @@ def _steps_m(recorded: Recorded) -> FloatArray:
 
 
 def judged(recorded: Recorded, motions: Sequence[Motion]) -> Outcome:
-    """The motions of one run against the reference."""
+    """Evaluate the motions of one run."""
     truth = true_trajectory(recorded)
     estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
     wrong = inverse(estimated) @ truth.relative_motions()
@@ -139,7 +139,7 @@ def judged(recorded: Recorded, motions: Sequence[Motion]) -> Outcome:
 
 
 def joined(outcomes: Sequence[Outcome]) -> Outcome:
-    """All runs together."""
+    """Combine all runs."""
     drift, wrong, squared = (
         np.concatenate([getattr(one, name) for one in outcomes]) for name in ("drift_percent", "wrong", "squared")
     )

@@ -1,18 +1,18 @@
-"""What an IMU adds: trajectories with and without it beside the truth, on the same scans.
+"""Effect of an IMU: trajectories with and without it, evaluated by ground truth on the same scans.
 
     python benchmarks/imu.py --cases office/handheld hall/tracked-harsh --seeds 0 1 --scans 150
     python benchmarks/imu.py --cases office/handheld/3 --scans 300
     python benchmarks/imu.py 2011_09_26/2011_09_26_drive_0005_sync
 
-A case is WORLD/MOTION, or WORLD/MOTION/STEP where every STEP-th scan is taken; simulated recordings have a consumer's
-MEMS unit, with noise and a walking bias. Prints a Markdown table, a row for each recording and method:
+A case is WORLD/MOTION, or WORLD/MOTION/STEP with every STEP-th scan; simulated recordings have a consumer MEMS unit
+with noise and a random walk of the bias. Prints a Markdown table with a row per recording and method:
 
-- ATE in metres after SE(3) alignment, and the largest error of the height after it;
-- the error of roll and pitch: root mean square of the vertical about its mean, degrees;
-- the error of the turn from scan to scan, root mean square, degrees;
-- scans that were lost and degraded.
+- ATE in metres after SE(3) alignment, and the largest height error after it;
+- error of roll and pitch: RMS of the vertical about its mean, degrees;
+- error of the turn from scan to scan: RMS, degrees;
+- lost and degraded scans.
 
-Every method runs in the pipeline of `lidarslam run` with its defaults; a graph is not part of it.
+Every method runs in the pipeline of `lidarslam run` with its defaults, without a pose graph.
 """
 
 import argparse
@@ -58,7 +58,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def simulate(case: str, scans: int, seed: int) -> Recorded:
-    """A recording straight from the simulator, of every STEP-th scan."""
+    """A recording from the simulator, with every STEP-th scan."""
     world, motion, *step = case.split("/")
     simulation = make_simulation(world, motion, "vlp-16", scans, seed)
     every = int(step[0]) if step else 1
@@ -67,11 +67,11 @@ def simulate(case: str, scans: int, seed: int) -> Recorded:
 
 
 def estimate(recorded: Recorded, config: Config) -> tuple[Trajectory, list[Status]]:
-    """The trajectory of a method, and the status of each scan."""
+    """Trajectory of a method, and the status of each scan."""
     inertial, scans = None, recorded.scans
     if config.odometry.uses_imu:
-        assert recorded.imu is not None, f"{recorded.name}: has no IMU"
-        assert recorded.imu.T_lidar_imu is not None, f"{recorded.name}: it is not known how the IMU is mounted"
+        assert recorded.imu is not None, f"{recorded.name}: no IMU"
+        assert recorded.imu.T_lidar_imu is not None, f"{recorded.name}: the mounting of the IMU is unknown"
         inertial = Inertial(recorded.imu, recorded.imu.T_lidar_imu)
         scans = [inertial.gyroscope.evened(scan) for scan in scans]
     with closing(make_odometry(config.odometry)) as odometry:
@@ -80,7 +80,7 @@ def estimate(recorded: Recorded, config: Config) -> tuple[Trajectory, list[Statu
 
 
 def vertical_error_deg(estimated: FloatArray, true: FloatArray) -> float:
-    """Of poses (N, 4, 4): the true vertical in the estimated world, RMS about its mean."""
+    """RMS of the true vertical in the estimated world about its mean, for poses (N, 4, 4)."""
     ups = np.einsum("nij,nkj,k->ni", estimated[:, :3, :3], true[:, :3, :3], _UP)
     mean = ups.mean(axis=0)
     across = np.linalg.norm(np.cross(ups, mean / np.linalg.norm(mean)), axis=1)
@@ -88,7 +88,6 @@ def vertical_error_deg(estimated: FloatArray, true: FloatArray) -> float:
 
 
 def row(recorded: Recorded, method: str) -> list[str]:
-    """The cells of a recording and a method."""
     odometry, has_map = METHODS[method]
     config = Config(
         odometry=OdometryConfig(method=odometry), mapping=MappingConfig(method="surfels" if has_map else "off")
@@ -115,7 +114,7 @@ def row(recorded: Recorded, method: str) -> list[str]:
 
 
 def recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
-    """All that were asked for."""
+    """Recordings on disk, then simulated ones."""
     for source in arguments.sources:
         yield replace(read(source), imu=open_recording(source).imu)
     for case in arguments.cases:

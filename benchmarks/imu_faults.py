@@ -1,11 +1,11 @@
-"""Faults of an IMU: are they named, and what remains of the accuracy?
+"""Faults of an IMU: the resulting ATE, and whether a warning names the fault.
 
     python benchmarks/imu_faults.py sim_stairs sim_corridor_yard
     python benchmarks/imu_faults.py sim_stairs --faults "1 deg/s bias" "20 ms late" --options --step 5
 
-A recording is a folder of scans with an `imu.csv` and a ground truth. Each fault is put into a copy of the samples, and
-the recording run with `--odometry learned+imu`. Prints a Markdown table: ATE in metres after SE(3) alignment, scans
-that were lost, exit status, and the warnings, or the reason of a refusal, that name the fault.
+A recording is a folder of scans with `imu.csv` and ground truth. Each fault is applied to a copy of the samples, and
+the recording is run with `--odometry learned+imu`. Prints a Markdown table: ATE in metres after SE(3) alignment, lost
+scans, exit status, and the warnings, or the error message, that name the fault.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from lidarslam.core.geometry import FloatArray
 
 # Rows of `imu.csv`: stamp, angular velocity (rad/s), specific force (m/s^2).
 STAMP, RATE, FORCE = slice(0, 1), slice(1, 4), slice(4, 7)
-# What names a fault.
+# Words in warnings that name a fault.
 ANY = ("IMU", "gyroscope", "accelerometer")
 
 
@@ -44,7 +44,7 @@ def _swapped(rows: FloatArray) -> FloatArray:
 
 
 def _saturated(rows: FloatArray) -> FloatArray:
-    """A gyroscope whose range ends at nine tenths of the largest rate."""
+    """A gyroscope that saturates at nine tenths of the largest rate."""
     largest = 0.9 * np.abs(rows[:, RATE]).max()
     rows[:, RATE] = np.clip(rows[:, RATE], -largest, largest)
     return rows
@@ -67,7 +67,7 @@ FAULTS: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def faulty(source: Path, folder: Path, fault: str) -> Path:
-    """A copy of a recording with a fault in its samples; its scans are links."""
+    """A copy of a recording with a fault in its samples; scans are links."""
     lines = (source / "imu.csv").read_text().splitlines()
     header = [line for line in lines if line.startswith("#")]
     rows = FAULTS[fault](np.loadtxt([line for line in lines if not line.startswith("#")], delimiter=","))
@@ -81,7 +81,6 @@ def faulty(source: Path, folder: Path, fault: str) -> Path:
 
 
 def row(source: Path, fault: str, options: list[str]) -> list[str]:
-    """The cells of a recording and a fault."""
     with tempfile.TemporaryDirectory() as temporary:
         copy, out = faulty(source, Path(temporary), fault), Path(temporary) / "run"
         arguments = ["run", str(copy), "--out", str(out), "--odometry", "learned+imu", "--no-report", *options]
@@ -97,11 +96,11 @@ def row(source: Path, fault: str, options: list[str]) -> list[str]:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("sources", nargs="+", type=Path, help="folders of scans with imu.csv and a ground truth")
+    parser.add_argument("sources", nargs="+", type=Path, help="folders of scans with imu.csv and ground truth")
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
-    parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of lidarslam run")
+    parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="options of lidarslam run")
     arguments = parser.parse_args()
-    print_header(["recording", "fault", "ATE, m", "lost", "exit", "said"])
+    print_header(["recording", "fault", "ATE, m", "lost", "exit", "reported"])
     for source in arguments.sources:
         for fault in arguments.faults:
             print_row(row(source, fault, arguments.options))

@@ -1,12 +1,12 @@
-"""Wall time of a comparison of 12 recordings: one job, two, a Ray cluster of two nodes, and one of them killed.
+"""Wall time of a comparison of 12 recordings: one job, two jobs, a Ray cluster of two nodes, and with one node killed.
 
     python benchmarks/jobs.py
     python benchmarks/jobs.py --recordings 4 --scans 20 --methods constant-velocity+map,learned+map
 
-The recordings are simulated. The cluster's nodes are on this machine, with one CPU each; the killed one dies with all
-its processes when a third of the runs have been started. `run again` are runs that were started more than once;
-`same files` says whether configuration, trajectories and map of every run are those of one job, to the byte, and
-`figures` is the largest relative difference of an error in comparison.json. The exit status is 1 where files differ, or
+The recordings are simulated. The nodes of the cluster are on this machine, with one CPU each; one is killed with all
+its processes when a third of the runs have been started. `run again` lists runs that were started more than once;
+`same files` is yes if configuration, trajectories and map of every run are byte-identical to those of one job;
+`figures` is the largest relative difference of an error in comparison.json. The exit status is 1 if files differ, or
 figures by more than rounding.
 """
 
@@ -31,7 +31,7 @@ WORLDS = ("office", "street", "hall", "tunnel")
 ROUNDING = 1e-9
 SAME = ("config.yaml", "map.ply", "odometry.tum", "trajectory.tum", "trajectory.kitti")
 
-# Notes the start of a method, and becomes its process.
+# Records the start of a method, then replaces itself by the method's process.
 NOTED = """
 import json, os, sys
 from pathlib import Path
@@ -53,17 +53,17 @@ def make_recordings(folder: Path, count: int, scans: int) -> tuple[RecordingEntr
 
 
 def started(file: Path) -> list[str]:
-    """The runs whose processes were started, RECORDING/METHOD."""
+    """Runs whose processes were started, RECORDING/METHOD."""
     return file.read_text().splitlines() if file.exists() else []
 
 
 def contents(out: Path) -> dict[str, bytes]:
-    """The files of the runs in the folder of a comparison that hold no times."""
+    """Files without times of all runs of a comparison."""
     return {str(path.relative_to(out)): path.read_bytes() for name in SAME for path in out.rglob(name)}
 
 
 def figures(out: Path) -> dict[str, float]:
-    """The errors of all runs, by their names in comparison.json."""
+    """Errors of all runs by their names in comparison.json."""
     content = json.loads((out / "comparison.json").read_text())
     found: dict[str, float] = {}
 
@@ -81,7 +81,7 @@ def figures(out: Path) -> dict[str, float]:
 
 
 def largest_difference(one: dict[str, float], other: dict[str, float]) -> float:
-    """Of two sets of figures, relative; infinite where they are not of the same names."""
+    """Largest relative difference of two sets of figures; infinite if their names differ."""
     if one.keys() != other.keys():
         return float("inf")
     return max((abs(value - other[name]) / max(abs(value), 1e-300) for name, value in one.items()), default=0.0)
@@ -89,7 +89,7 @@ def largest_difference(one: dict[str, float], other: dict[str, float]) -> float:
 
 @contextmanager
 def cluster(starts: Path, kill_after: int | None) -> Iterator[str]:
-    """The address of a cluster of two nodes beside its head; one is killed after so many starts."""
+    """Address of a cluster of a head and two nodes, one of which is killed after `kill_after` starts."""
     from ray.cluster_utils import Cluster
 
     ray = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})

@@ -1,8 +1,8 @@
-"""KISS-ICP's `register_frame` over scans from a file, timed after the first few, as JSON.
+"""Time of KISS-ICP's `register_frame` over scans from a file, without the first few, as JSON.
 
     python benchmarks/kiss_loop.py SCANS.npz 5
 
-Nothing else is imported: beside other libraries' thread pools KISS-ICP does not get all the cores.
+No other libraries are imported: with their thread pools, KISS-ICP does not get all cores.
 """
 
 import json
@@ -15,7 +15,7 @@ from kiss_icp.kiss_icp import KissICP
 
 
 def main() -> None:
-    """Print wall and processor seconds, and milliseconds of single scans."""
+    """Print wall and CPU seconds, and milliseconds of single scans."""
     file, warm_up = np.load(sys.argv[1]), int(sys.argv[2])
     scans = [(file[f"points_{i}"], file[f"times_{i}"]) for i in range(len(file["stamps"]))]
     kiss = KissICP(load_config(None))

@@ -1,12 +1,12 @@
-"""What `lidarslam run --odometry kiss-icp --no-mapping` adds to KISS-ICP: accuracy and time, both in one run.
+"""Overhead of `lidarslam run --odometry kiss-icp --no-mapping` over KISS-ICP, in accuracy and time.
 
     python benchmarks/kiss_overhead.py KITTI/sequences/04 2011_09_26/2011_09_26_drive_0005_sync
 
-Each program runs in a process of its own, in turn, on the same files. KISS-ICP is its own pipeline with its defaults,
-reading the files as its KITTI loaders do. Time is the wall time of the loop over the scans, reading included; ours
-also checks every scan, builds the global map and writes scans.csv meanwhile. What comes after the loop (normals, files)
-is a column of its own. KISS-ICP's poses belong to the end of each sweep; they are interpolated at the scans' stamps,
-where ours are, so that both are compared with the truth at the same instants.
+The programs alternate, each in a separate process, on the same files. KISS-ICP is its own pipeline with its defaults,
+reading the files as its KITTI loaders do. Time is the wall time of the loop over the scans, including reading; ours
+also checks every scan, builds the global map and writes scans.csv. The time after the loop (normals, files) is given
+separately. KISS-ICP's poses refer to the end of each sweep; they are interpolated at the scans' stamps, to which ours
+refer, so that both are evaluated at the same instants.
 """
 
 import functools
@@ -26,7 +26,7 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 
 class _KittiFiles:
-    """The scans of a KITTI recording for KISS-ICP's pipeline, read and corrected the way its loaders do."""
+    """The scans of a KITTI recording for KISS-ICP's pipeline, read and corrected as by its loaders."""
 
     def __init__(self, source: Path, has_times: bool) -> None:
         folder = source / "velodyne_points" / "data"
@@ -57,7 +57,7 @@ class Ran:
 
 
 def run_kiss(source: Path) -> Ran:
-    """KISS-ICP's own pipeline on the recording."""
+    """Run KISS-ICP's own pipeline."""
     from kiss_icp.pipeline import OdometryPipeline
 
     recording = open_recording(source)
@@ -77,7 +77,7 @@ def run_kiss(source: Path) -> Ran:
 
 
 def run_ours(source: Path) -> Ran:
-    """Our run on the recording."""
+    """Run `lidarslam run`."""
     from lidarslam.config.settings import load_config
     from lidarslam.core.trajectory import read_tum
     from lidarslam.run.request import RunRequest
@@ -94,14 +94,14 @@ def run_ours(source: Path) -> Ran:
 
 
 def ate_m(trajectories: list[Trajectory], reference: Trajectory) -> list[float]:
-    """ATE of each trajectory, over the scans that all of them have."""
+    """ATE of each trajectory over the scans common to all."""
     common = functools.reduce(np.intersect1d, [trajectory.stamps.round(6) for trajectory in trajectories])
     chosen = [t.select(np.isin(t.stamps.round(6), common)) for t in trajectories]
     return [evaluate_trajectory(trajectory, reference).errors.ate_rmse_m for trajectory in chosen]
 
 
 def compare(source: Path, rounds: int) -> None:
-    """Run both in turn and print a table."""
+    """Run both alternately and print a table."""
     kiss, ours = list[Ran](), list[Ran]()
     for _ in range(rounds):
         kiss.append(in_process(run_kiss, source))
@@ -114,12 +114,12 @@ def compare(source: Path, rounds: int) -> None:
         ms = [result.ms_per_scan for result in results]
         after_s = np.median([result.after_s for result in results])
         print(
-            f"  {name:<20} ATE {ate:.4f} m   {np.median(ms):6.1f} [{min(ms):.1f}, {max(ms):.1f}] ms a scan"
+            f"  {name:<20} ATE {ate:.4f} m   {np.median(ms):6.1f} [{min(ms):.1f}, {max(ms):.1f}] ms per scan"
             f"   {after_s:4.1f} s after the loop"
         )
     ratios = [one.ms_per_scan / other.ms_per_scan for one, other in zip(ours, kiss, strict=True)]
     print(
-        f"  ATE differs by {1e3 * (ates[1] - ates[0]):+.2f} mm; time a scan is"
+        f"  ATE differs by {1e3 * (ates[1] - ates[0]):+.2f} mm; time per scan is"
         f" {np.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}] times KISS-ICP's"
     )
 

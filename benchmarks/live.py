@@ -1,12 +1,12 @@
-"""Whether `lidarslam live` keeps up with a sensor: a bag is played over DDS, in another process of this machine.
+"""Test whether `lidarslam live` keeps up with a sensor: another process on this machine plays a bag over DDS.
 
     python benchmarks/live.py RECORDING [--rate 10] [--pad 65536] [--scans 200] [--rows default,constant-velocity]
 
-The clouds are filled up to the load of an OS1-64 (1024 x 64 points of 48 bytes, 3 MB) and stamped when they are due,
-best effort, as ouster-ros does. Printed are, for each choice of methods: clouds received; missing between them; dropped
-because registration was behind; median and 99th percentile of the latency from the time at which a cloud is due to the
-publication of its pose, and of the time that decoding and registration take; lost scans; and the machine's load before,
-of other programs. Needs the extra `live`.
+The clouds are padded to the load of an OS1-64 (1024 x 64 points of 48 bytes, 3 MB) and stamped with their due times,
+best effort, as by ouster-ros. Printed for each choice of methods: clouds received; missing between them; dropped
+because registration was behind; latency from the due time of a cloud to the publication of its pose, and time of
+decoding and registration, each as median and 99th percentile; lost scans; the load of other programs before. Needs the
+extra `live`.
 """
 
 import argparse
@@ -55,7 +55,7 @@ def follow(given: argparse.Namespace, options: list[str], out: Path) -> str:
 
 
 def read_stages(file: Path) -> list[float]:
-    """Milliseconds from taking up a scan to its pose."""
+    """Milliseconds from reading a scan to its pose."""
     with file.open() as lines:
         rows = list(csv.DictReader(lines))
     return [sum(float(row[f"ms_{stage}"]) for stage in ("read", "odometry", "refine", "check")) for row in rows]
@@ -64,9 +64,9 @@ def read_stages(file: Path) -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, help="a ROS 2 bag, such as of `lidarslam simulate --sensor os1-64`")
-    parser.add_argument("--rate", type=float, default=10.0, help="scans a second")
+    parser.add_argument("--rate", type=float, default=10.0, help="scans per second")
     parser.add_argument("--pad", type=int, default=65_536, metavar="POINTS")
-    parser.add_argument("--scans", type=int, default=200, help="the first so many")
+    parser.add_argument("--scans", type=int, default=200, help="number of scans")
     parser.add_argument("--domain", type=int, default=97)
     parser.add_argument("--rows", default="default,constant-velocity,pose graph,learned alone")
     given = parser.parse_args()

@@ -1,16 +1,15 @@
-"""Search of five neighbours in LOAM's map: Open3D's nearest-neighbour search beside our hash of voxels.
+"""Search of five neighbours in LOAM's map: Open3D's nearest-neighbour search compared with our voxel hash.
 
     python benchmarks/loam_search.py KITTI/sequences/04 office_spin --scans 60
 
-Prints a Markdown table, a row for each recording: median milliseconds a scan (ours on one
-thread, Open3D on all) of
+Prints a Markdown table with a row per recording, in median milliseconds per scan (ours on one thread, Open3D on all):
 
-- Open3D, index: its index of the map's voxels, which every scan changes;
+- Open3D, index: building the index of the map's voxels, which change with every scan;
 - Open3D, search: five neighbours of the scan's planar keypoints, once;
-- ours, insert: the scan's planar points into the finest of the map's grids;
+- ours, insert: the scan's planar points into the finest grid of the map;
 - ours, search: five neighbours and their plane, once.
 
-Ours are looked for in the 27 voxels around a point only: those farther than an edge may be missed.
+Our search is limited to the 27 voxels around a point: neighbours farther than a voxel's edge may be missed.
 """
 
 import time
@@ -37,7 +36,7 @@ from lidarslam.pipeline.threads import in_order
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
-    parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
+    parser.add_argument("--scans", type=int, default=60, help="maximum per recording")
     arguments = parser.parse_args()
     print_header(["recording", "voxels", "Open3D, index", "Open3D, search", "ours, insert", "ours, search"])
     for source in arguments.sources:

@@ -1,14 +1,14 @@
-"""LOAM's mapping with the choices of the published program in place of our own.
+"""LOAM's mapping with the choices of the published program instead of our own.
 
     python benchmarks/loam_variants.py KITTI/sequences/04 --worlds office --motions tracked --scans 200
     python benchmarks/loam_variants.py RECORDING --odometry constant-velocity
 
-Prints a Markdown table, a row for each recording: ATE in metres after SE(3) alignment, with lost and degraded scans, of
+Prints a Markdown table with a row per recording: ATE in metres after SE(3) alignment, with lost and degraded scans, of
 
 - ours;
-- published edges: curvature above 0.1 square metres, whatever the noise of the scan;
-- published planes: of the means of five voxels alone, not of all points in them;
-- discrete: the sweep compensated with the odometry's velocity, not with one that is estimated with the pose.
+- published edges: curvature above 0.1 square metres, independent of the scan's noise;
+- published planes: fitted to the means of five voxels, not to all points in them;
+- discrete: the sweep compensated with the odometry's velocity instead of one estimated with the pose.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,14 +38,14 @@ from lidarslam.mapping.surfels.voxel_hash import Rows
 
 @contextmanager
 def published_edges() -> Iterator[None]:
-    """Edges by the published threshold for a while."""
+    """Use the published threshold for edges."""
     with patch.object(features, "_ABOVE_NOISE", 0.0):
         yield
 
 
 @contextmanager
 def published_planes() -> Iterator[None]:
-    """One point a voxel, the mean of all, for a while."""
+    """Use one point per voxel, the mean of all."""
 
     def add_mean(
         points: FloatArray, views: NDArray[np.float32], elevations: FloatArray, rows: Rows, sums: FloatArray

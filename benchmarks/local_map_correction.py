@@ -1,19 +1,18 @@
-"""The running local map after loop closures: how far two rounds of a place lie apart in it, and what it costs.
+"""The running local map after loop closures: misalignment between two rounds, and time of the correction.
 
     python benchmarks/local_map_correction.py recordings/streets --radius-m 40
     python benchmarks/local_map_correction.py recordings/loop --pairs loop_pairs.txt --radius-m 25
 
-Prints a Markdown table with two rows for each recording, the second one where the local map is drawn anew after loop
-closures:
+Prints a Markdown table with two rows per recording, the second with the local map rebuilt after loop closures:
 
-- apart: each scan of a later round is compared with the scan of the first one nearest to it by ground truth; by how
-  much surfaces, as far away as the median range, are apart in the local map of that moment; root mean square and 95 %,
-  over scans after the first accepted loop closure;
-- ATE in metres after SE(3) alignment, of the poses as registered and as the graph corrects them in the end;
-- closing error, in place of both where there is no ground truth but known relative poses (`--pairs`, rows of `i j` and
-  3 x 4 numbers of T_i_j for scans i and j): median and most, metres;
-- loop closures; how often the map was drawn, the milliseconds of it (on the graph's thread), and those of the exchange
-  (on the thread of registration), of the processor: median and most.
+- apart: each scan of a later round is compared with the nearest scan of the first round by ground truth: distance
+  between their surfaces, at the median range, in the local map of that moment; RMS and 95 %, over the scans after the
+  first accepted loop closure;
+- ATE in metres after SE(3) alignment, of the poses as registered and of the final poses of the graph;
+- closing error, instead of both where there is no ground truth but known relative poses (`--pairs`, rows of `i j` and
+  3 x 4 numbers of T_i_j for scans i and j): median and maximum, metres;
+- loop closures; times that the map was rebuilt; CPU milliseconds of rebuilding it (on the graph's thread) and of the
+  exchange (on the registration's thread): median and maximum.
 """
 
 import time
@@ -43,19 +42,19 @@ from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import in_order
 
-# Scans of another round are within this part of the median range, and at least so much of the way away.
+# Scans of different rounds: maximum distance in median ranges, and minimum distance travelled between them.
 _SAME_PLACE_RANGES, _LATER_M = 0.5, 30.0
 
 
 class _Graph(SlamGraph):
-    """Writes down when the local map was drawn anew, and where submaps lie in it."""
+    """Records when the local map was rebuilt, and the poses of submaps in it."""
 
     def __init__(self, config: PoseGraphConfig, radius_m: float, redraws: bool) -> None:
         super().__init__(config, local_radius_m=radius_m)
         self._redraws = redraws
         self.drawn_ms: list[float] = []
         self.laid: list[tuple[int, FloatArray]] = []  # first scan registered to it, poses of the keyframes so far
-        self.first_closure: int | None = None  # scans before it was found
+        self.first_closure: int | None = None  # number of scans before it
 
     def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
         if self.first_closure is None and any(closure.accepted for closure in self._closures):
@@ -70,7 +69,7 @@ class _Graph(SlamGraph):
         return drawn
 
     def place_in_map(self, scan: int, at: int) -> FloatArray:
-        """(4, 4) where a scan's surfaces lie in the map that another one was registered to."""
+        """(4, 4) pose of a scan's surfaces in the map that scan `at` was registered to."""
         T, keys = self.scan_poses[scan], [keyframe.scan for keyframe in self.keyframes]
         laid = [poses for since, poses in self.laid if since <= at]
         key = int(np.searchsorted(keys, scan, side="right")) - 1
@@ -89,7 +88,7 @@ class _Mapper(Mapper):
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A recording with or without the correction."""
+    """Result with or without the correction."""
 
     trajectory: Trajectory
     corrected: Trajectory
@@ -99,7 +98,7 @@ class Outcome:
 
 
 def take(scans: Sequence[Scan], config: Config, redraws: bool) -> Outcome:
-    """All scans through the pipeline."""
+    """Run the pipeline on all scans."""
     odometry = make_odometry(config.odometry)
     graph = _Graph(config.pose_graph, config.mapping.radius_m, redraws)
     mapper = _Mapper(config.mapping, kept_scans=SCANS_LATER)
@@ -118,20 +117,20 @@ def take(scans: Sequence[Scan], config: Config, redraws: bool) -> Outcome:
 
 
 def rounds(truth: Trajectory, range_m: float) -> NDArray[np.intp]:
-    """(L, 2) pairs of scans: the nearest one of the first visit, and one of a later visit."""
-    positions, way = truth.positions, truth.distances
+    """(L, 2) pairs of scans: the nearest of the first visit, and one of a later visit."""
+    positions, travelled = truth.positions, truth.distances
     tree, pairs = cKDTree(positions), []
     for late, position in enumerate(positions):
         near = tree.query_ball_point(position, _SAME_PLACE_RANGES * range_m)
-        early = [scan for scan in near if way[late] - way[scan] > _LATER_M]
-        early = [scan for scan in early if way[scan] - way[min(early)] < _LATER_M]  # of the first visit
+        early = [scan for scan in near if travelled[late] - travelled[scan] > _LATER_M]
+        early = [scan for scan in early if travelled[scan] - travelled[min(early)] < _LATER_M]  # of the first visit
         if early:
             pairs.append((min(early, key=lambda s: float(np.linalg.norm(positions[s] - position))), late))
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 def apart_m(outcome: Outcome, truth: Trajectory, pairs: NDArray[np.intp], range_m: float, since: int) -> FloatArray:
-    """(L,) how far surfaces of both rounds lie apart in the running local map."""
+    """(L,) distances between surfaces of both rounds in the running local map."""
     apart = []
     for early, late in pairs[pairs[:, 1] >= since]:
         T = inverse(outcome.graph.place_in_map(early, late)) @ outcome.trajectory.T_world_lidar[late]
@@ -141,7 +140,7 @@ def apart_m(outcome: Outcome, truth: Trajectory, pairs: NDArray[np.intp], range_
 
 
 def closing_errors_m(trajectory: Trajectory, pairs: FloatArray) -> FloatArray:
-    """(P,) how far the relative positions are from those known, a row of `--pairs` each."""
+    """(P,) errors of the relative positions, one per row of `--pairs`."""
     first, second = pairs[:, :2].astype(np.intp).T
     T = inverse(trajectory.T_world_lidar[first]) @ trajectory.T_world_lidar[second]
     known = np.tile(np.eye(4), (len(pairs), 1, 1))
@@ -150,8 +149,8 @@ def closing_errors_m(trajectory: Trajectory, pairs: FloatArray) -> FloatArray:
 
 
 def measure_pairs(name: str, scans: Sequence[Scan], pairs: FloatArray, config: Config) -> None:
-    """The rows of a recording with known relative poses."""
-    for label, redraws in (("as it was", False), ("drawn anew", True)):
+    """Print the rows of a recording with known relative poses."""
+    for label, redraws in (("unchanged", False), ("rebuilt", True)):
         outcome = take(scans, config, redraws)
         errors = [closing_errors_m(one, pairs) for one in (outcome.trajectory, outcome.corrected)]
         shown = (f"{np.median(error):.3f}, {error.max():.3f}" for error in errors)
@@ -163,14 +162,14 @@ def measure_pairs(name: str, scans: Sequence[Scan], pairs: FloatArray, config: C
 
 
 def measure(name: str, scans: Sequence[Scan], truth: Trajectory, config: Config) -> None:
-    """The rows of a recording."""
+    """Print the rows of a recording with ground truth."""
     stamps = np.array([scan.stamp for scan in scans])
     true = Trajectory(stamps, truth.at(stamps, BEYOND_TRUTH_S))
     range_m = float(np.median(np.linalg.norm(scans[0].points, axis=1)))
     pairs = rounds(true, range_m)
     outcomes = [take(scans, config, redraws) for redraws in (False, True)]
     since = (outcomes[0].graph.first_closure or len(scans)) + SCANS_LATER
-    for outcome, label in zip(outcomes, ("as it was", "drawn anew"), strict=True):
+    for outcome, label in zip(outcomes, ("unchanged", "rebuilt"), strict=True):
         apart = apart_m(outcome, true, pairs, range_m, since)
         errors = [evaluate_trajectory(one, true).errors.ate_rmse_m for one in (outcome.trajectory, outcome.corrected)]
         print_row([
@@ -200,7 +199,7 @@ def main() -> None:
     )
     print_header([
         "recording", "local map", "scans of later rounds", "apart, RMS / 95 %, m",
-        "ATE as registered, m", "ATE in the end, m", "closures", "drawn", "drawing, ms", "exchange, ms",
+        "ATE as registered, m", "final ATE, m", "closures", "rebuilt", "rebuilding, ms", "exchange, ms",
     ])  # fmt: skip
     for source in options.sources:
         recording = open_recording(source)

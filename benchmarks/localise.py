@@ -1,19 +1,19 @@
-"""Localisation in a finished map from many starts: how soon it is found, how accurate, and whether it is ever wrong.
+"""Localisation in a finished map from many starts: scans until it is found, accuracy, and wrong poses.
 
     python benchmarks/localise.py
     python benchmarks/localise.py --worlds office street --starts 12 --scans 60
     python benchmarks/localise.py --run runs/loop --source vlp16_loop --starts 16 --scans 50
 
-A simulated world is mapped once round from the true poses (one point a voxel, as `lidarslam run` writes maps), with the
-sensor and the carrier of the map. Then recordings begin at `--starts` places of the round, each with another seed of
-sway and noise: with the same sensor, the other way round, with another sensor, and in another world of that kind (other
-seed), where every place that is found is wrong. With `--run` the map is that of a run, and the recording its own
-source; errors are then against the poses of the run.
+A simulated world is mapped in one round from the true poses (one point per voxel, as `lidarslam run` writes maps).
+Recordings then begin at `--starts` places of the round, with other seeds of sway and noise: with the sensor and carrier
+of the map, in the opposite direction, with another sensor, and in another world of the same kind (other seed), where
+every pose found is wrong. With `--run`, the map is that of a run, and the recording its own source; errors are then
+relative to the poses of the run.
 
-Prints a Markdown table, a row for each case. Found: recordings that were found and confirmed. Scans: until the place
-was confirmed, median and largest. Errors are of all scans with a status of ok; after the slash the largest. Wrong:
-scans that are ok or degraded, or placed afterwards, and off by more than 0.5 m or 3 degrees. Lost: scans after the
-first confirmation. Milliseconds are wall time of one scan that is tracked (median), and of a search (largest scan).
+Prints a Markdown table with a row per case. Found: recordings that were found and confirmed. Scans: number until the
+confirmation, median and largest. Errors: of all scans with status ok, median / largest. Wrong: scans that are ok or
+degraded, or placed afterwards, and off by more than 0.5 m or 3 degrees. Lost: scans after the first confirmation.
+Milliseconds: wall time of a tracked scan (median), and of a search (largest scan).
 """
 
 import argparse
@@ -47,12 +47,12 @@ from lidarslam.storage.finished_run import load_map
 
 WRONG_M, WRONG_DEG = 0.5, 3.0
 _MOTIONS = {"street": "car", "terrace": "car", "fields": "car", "tunnel": "tracked", "hall": "tracked"}
-# Scans of the round that the map is made of: one in so many.
+# Every n-th scan of the round is in the map.
 _MAP_EVERY = 5
 
 
 def simulate(world: str, seed: int, motion_seed: int, sensor: str = "vlp-16", is_reversed: bool = False) -> Simulation:
-    """A round of a world, from the simulator."""
+    """A round of a world from the simulator."""
     place = build_world(world, seed)
     if is_reversed:
         place = replace(place, route=replace(place.route, waypoints=place.route.waypoints[::-1].copy()))
@@ -60,7 +60,7 @@ def simulate(world: str, seed: int, motion_seed: int, sensor: str = "vlp-16", is
 
 
 def draw_map(simulation: Simulation) -> FixedMap:
-    """The map of the scans at their true poses, in the simulator's world."""
+    """Map of the scans at their true poses, in the simulator's world."""
     truth, merged = simulation.ground_truth.T_world_lidar, None
     for index in range(0, len(simulation) - 1, _MAP_EVERY):
         velocity = body_velocity(inverse(truth[index]) @ truth[index + 1], simulation.sensor.period_s)
@@ -88,7 +88,7 @@ class Outcome:
     search_ms: list[float] = field(default_factory=list)
 
     def add(self, localiser: MapLocaliser, scans: list[Scan], config: Config, truth: FloatArray | None) -> None:
-        """Localise a recording; truth (N, 4, 4) in the map's frame, None where the map is of another place."""
+        """Localise a recording; truth (N, 4, 4) in the map's frame, None if the map is of another place."""
         with closing(open_odometry(config, None)) as odometry:
             pipeline = Pipeline(odometry, ScanToMap(localiser), config.global_map)
             results = list(pipeline.run(scans))
@@ -117,7 +117,6 @@ class Outcome:
         self.errors_deg += off_deg[ok].tolist()
 
     def cells(self) -> list[str]:
-        """Of the row."""
         found, none = len(self.confirmed), "-"
         return [
             f"{found} of {self.recordings}",
@@ -132,7 +131,7 @@ class Outcome:
 
 
 def cases(world: str) -> Iterator[tuple[str, Simulation, bool]]:
-    """Name, recording, and whether it is of the world that is mapped."""
+    """Name, recording, and whether it is of the mapped world."""
     yield "same way", simulate(world, 0, 1), True
     yield "other way", simulate(world, 0, 2, is_reversed=True), True
     yield "os1-64", simulate(world, 0, 3, "os1-64"), True
@@ -140,12 +139,12 @@ def cases(world: str) -> Iterator[tuple[str, Simulation, bool]]:
 
 
 def starts(count: int, scans: int, available: int) -> list[int]:
-    """First scans of recordings, evenly spread."""
+    """First scans of recordings, evenly spaced."""
     return [int(first) for first in np.linspace(0, max(0, available - scans), count)]
 
 
 def of_worlds(arguments: argparse.Namespace, config: Config) -> None:
-    """Rows of simulated worlds."""
+    """Print the rows of simulated worlds."""
     for world in arguments.worlds:
         fixed_map = draw_map(simulate(world, 0, 0))
         for name, recording, is_there in cases(world):
@@ -158,7 +157,7 @@ def of_worlds(arguments: argparse.Namespace, config: Config) -> None:
 
 
 def of_run(arguments: argparse.Namespace, config: Config) -> None:
-    """The row of a run whose own recording is localised."""
+    """Print the row of a run, whose own recording is localised."""
     cloud, trajectory = load_map(arguments.run), read_tum(arguments.run / "trajectory.tum")
     fixed_map, recording, outcome = (
         FixedMap(cloud.points, cloud.normals), open_recording(arguments.source, config.reader), Outcome(),
@@ -176,8 +175,8 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=8)
     parser.add_argument("--scans", type=int, default=50)
     parser.add_argument("--odometry", default="learned", choices=["learned", "constant-velocity", "kiss-icp"])
-    parser.add_argument("--run", type=Path, help="a run directory, instead of simulated worlds")
-    parser.add_argument("--source", type=Path, help="the recording of that run")
+    parser.add_argument("--run", type=Path, help="run directory, instead of simulated worlds")
+    parser.add_argument("--source", type=Path, help="recording of that run")
     arguments = parser.parse_args()
     config = Config(odometry=OdometryConfig(method=arguments.odometry))
     print_header(

@@ -1,21 +1,20 @@
-"""Whether a run of 20,000 scans and 20 km with loops stays as it begins, and how far off it ends, beside its peers.
+"""Stability and accuracy over a run of 20,000 scans and 20 km with loops, compared with peers.
 
     python benchmarks/long_run.py --out long_run
     python benchmarks/long_run.py --out long_run --scans 3000 --odometry learned --peers
 
-A car drives through the simulated `town`, every street in both directions, then the same again. A process of its own
-simulates; the scans go from memory to memory into the pipeline of `lidarslam run` with its pose graph, which saves its
-state now and then, and to each peer in a process of its own. None is stored, all have the same scans.
+A car drives through every street of the simulated `town` in both directions, then again. A separate process simulates;
+the scans are passed in memory to the pipeline of `lidarslam run` with its pose graph, which saves checkpoints, and to
+each peer in a separate process. No scan is stored, and all methods have the same scans.
 
-Prints a Markdown table, a row every `--every` scans: wall time of a scan, median and 99th percentile over those since
-the row before, of all stages but reading; the same of keyframes, on the graph's own thread; processor time of the whole
-process a scan; resident memory; size of the saved state and seconds to save it; size of the submaps, and of tiles of
-the global map, on disk; cells of the local map, voxels of the global map in memory, keyframes, loops accepted; the
-error of the position as it was registered. Then
-the time of the final optimisation and of drawing the map anew, and ATE and KITTI's drift of all methods. The folder
-has the rows in `rows.jsonl` and the peers' in `NAME.jsonl`, as they come, and the end in `end.json`;
-`benchmarks/long_run_plot.py` draws them. A file `stop` in the folder ends the drive there, and everything is measured
-on the scans so far.
+Prints a Markdown table with a row every `--every` scans: wall time per scan of all stages but reading, median and 99th
+percentile since the previous row; the same of keyframes, on the graph's thread; CPU time of the whole process per scan;
+resident memory; size of the checkpoint, and seconds to save it; size on disk of the submaps and of the tiles of the
+global map; cells of the local map, voxels of the global map in memory, keyframes, accepted loops; position error as
+registered. Then the time of the final optimisation and of rebuilding the map, and ATE and KITTI drift of all methods.
+The rows are saved in `rows.jsonl` and those of the peers in `NAME.jsonl` during the run, the final results in
+`end.json`; `benchmarks/long_run_plot.py` plots them. A file `stop` in the folder ends the drive early, with all results
+for the scans so far.
 
 Linux only: memory is read from /proc.
 """
@@ -62,14 +61,19 @@ from lidarslam.run.summary import ScanLog
 from lidarslam.simulation.sensors import Spinning
 from lidarslam.storage.directory import RunDirectory, Unfinished
 
-# Of the global map in memory.
+_HEADER = (
+    "scans", "km", "wall, ms: median", "p99", "keyframes, ms: median", "p99", "CPU, ms per scan", "memory, MB",
+    "checkpoint, MB", "saving, s", "submaps on disk, MB", "tiles on disk, MB", "cells", "voxels in memory", "keyframes",
+    "loops", "error as registered, m",
+)  # fmt: skip
+# Limit of the global map in memory.
 _MOST_POINTS = 2_000_000
-# Messages to a peer that waits in vain for the next one.
+# Message to a peer after the last scan.
 _END = None
 
 
 class KissIcpEstimator:
-    """KISS-ICP's own loop, `register_frame` with its defaults, behind the protocol of peers."""
+    """KISS-ICP's own loop, `register_frame` with its defaults, as a peer."""
 
     def __init__(self) -> None:
         from kiss_icp.config.parser import load_config
@@ -80,10 +84,10 @@ class KissIcpEstimator:
         self._instants: list[float] = []
 
     def add_imu(self, samples: ImuSamples, number: int) -> None:
-        """It uses no IMU."""
+        """KISS-ICP uses no IMU."""
 
     def load(self, sweep: Sweep) -> Callable[[], None]:
-        """The registration, still to be called; see `lidarslam.compare.peers.libraries` on instants."""
+        """The registration of a sweep, to be called; for the instants see `lidarslam.compare.peers.libraries`."""
         self._instants.append(sweep.end if len(self._instants) >= 2 else sweep.middle)
 
         def register() -> None:
@@ -101,7 +105,7 @@ _KISS_ICP = Peer("kiss-icp", "kiss_icp", "kiss-icp", lambda *_: KissIcpEstimator
 
 
 class FedPeer:
-    """A peer in its process."""
+    """A peer in a separate process."""
 
     def __init__(self, context: SpawnContext, name: str, every: int, log: Path) -> None:
         self.name = name
@@ -111,14 +115,14 @@ class FedPeer:
         other.close()
 
     def take(self, scan: Scan) -> None:
-        """Hand it the next scan; one that died takes no more."""
+        """Send the next scan, unless the process has ended."""
         try:
             self._end.send(scan)
         except OSError:
             self._end.close()
 
     def result(self) -> Trajectory | None:
-        """Its trajectory; None where it failed, which its log says."""
+        """The peer's trajectory; None if it failed, with the error in its log."""
         try:
             self._end.send(_END)
             trajectory: Trajectory = self._end.recv()
@@ -128,7 +132,7 @@ class FedPeer:
 
 
 def feed_peers(scans: Iterator[Scan], peers: list[FedPeer]) -> Iterator[Scan]:
-    """The same scans, each handed to all peers before; whoever is slow is waited for."""
+    """The scans, each sent to all peers first, at the speed of the slowest."""
     for scan in scans:
         for peer in peers:
             peer.take(scan)
@@ -136,7 +140,7 @@ def feed_peers(scans: Iterator[Scan], peers: list[FedPeer]) -> Iterator[Scan]:
 
 
 def _estimate(source: Connection, name: str, every: int, log: Path) -> None:
-    """The peer's process."""
+    """Process of a peer."""
     started = time.process_time()
 
     def progress(number: int) -> None:
@@ -163,7 +167,7 @@ def add_line(path: Path, values: Mapping[str, object]) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """How things stand after so many scans; times are of the scans since the row before."""
+    """State after a number of scans; times are of the scans since the previous row."""
 
     scans: int
     way_km: float
@@ -184,24 +188,22 @@ class Row:
     error_m: float
 
     def cells_of_table(self) -> list[str]:
-        """As text."""
         return [f"{value:,}" if isinstance(value, int) else f"{value:,.1f}" for value in asdict(self).values()]
 
 
 class TimedCheckpoints(Checkpoints):
-    """Measures the time of the last one."""
+    """Checkpoints with the time of the last one."""
 
     save_s = 0.0
 
     def save(self, pipeline: Pipeline) -> None:
-        """Save, and take the time."""
         started = time.perf_counter()
         super().save(pipeline)
         self.save_s = time.perf_counter() - started
 
 
 def simulate(options: argparse.Namespace, sink: Connection) -> None:
-    """The simulator's process: first the truth, then one scan after the other."""
+    """The simulator's process: sends the ground truth, then the scans."""
     simulation = make_simulation("town", "car-fast", "vlp-16", options.scans, 0)
     sensor = simulation.sensor
     if options.columns and isinstance(sensor.pattern, Spinning):
@@ -215,7 +217,7 @@ def simulate(options: argparse.Namespace, sink: Connection) -> None:
 
 
 def received(source: Connection, count: int, stop: Path) -> Iterator[Scan]:
-    """So many scans from the simulator, or fewer once there is a file of that name."""
+    """`count` scans from the simulator, or fewer once the file `stop` exists."""
     for number in range(count):
         if number % 100 == 0 and stop.exists():
             return
@@ -223,7 +225,7 @@ def received(source: Connection, count: int, stop: Path) -> Iterator[Scan]:
 
 
 def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -> dict[str, Any]:
-    """Our own pipeline over all scans, with a row now and then; what there is to report in the end."""
+    """Our pipeline over all scans, with rows in between; returns the final results."""
     config = Config(
         odometry=OdometryConfig(method=options.odometry),
         global_map=GlobalMapConfig(most_points=_MOST_POINTS),
@@ -300,7 +302,7 @@ def _size_mb(file: Path) -> float:
 
 
 def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajectory) -> dict[str, Any]:
-    """Optimise, draw the map anew, and hold the trajectory against the truth, before and after."""
+    """Optimise, rebuild the map, and evaluate the trajectory before and after."""
     stamps, before = log.stamps, log.trajectory
     started = time.perf_counter()
     result = graph.finish()
@@ -324,7 +326,7 @@ def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajector
 
 
 def errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float | None]:
-    """ATE and KITTI's drift."""
+    """ATE and KITTI drift."""
     found: TrajectoryMetrics = evaluate_trajectory(estimate, truth)
     drift = None if found.kitti is None else found.kitti.overall
     return {
@@ -335,17 +337,17 @@ def errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float | None]:
 
 
 def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> dict[str, Any]:
-    """Print the end, with the peers beside ours."""
+    """Print the final results of ours and of the peers."""
     print(
-        f"\nfinal optimisation {found['optimise_s']:.1f} s ({found['loops']} loops kept), map drawn anew in"
-        f" {found['draw_s']:.1f} s ({found['map_points']:,} points), {found['rss_mb']:.0f} MB; local map drawn anew"
+        f"\nfinal optimisation {found['optimise_s']:.1f} s ({found['loops']} loops kept), map rebuilt in"
+        f" {found['draw_s']:.1f} s ({found['map_points']:,} points), {found['rss_mb']:.0f} MB; local map rebuilt"
         f" {found['redraws']} times\n"
     )
     for peer in peers:
         estimate = peer.result()
         if estimate is not None:
             found["methods"][peer.name] = errors(estimate, truth)
-    print_header(["method", "ATE, m", "drift, %", "drift, degrees in 100 m"])
+    print_header(["method", "ATE, m", "drift over 100 to 800 m, %", "degrees per 100 m"])
     for name, measured in found["methods"].items():
         print_row([name, *("" if value is None else f"{value:.3f}" for value in measured.values())])
     return found
@@ -353,11 +355,11 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of what was measured")
-    parser.add_argument("--columns", type=int, help="of a turn, to make less of the sensor")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--columns", type=int, help="columns per revolution, to use fewer")
     parser.add_argument("--scans", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=1_000)
-    parser.add_argument("--odometry", default="constant-velocity", help="in front of the map")
+    parser.add_argument("--odometry", default="constant-velocity", help="odometry method")
     parser.add_argument("--peers", nargs="*", default=["kiss-icp", "kiss-slam"])
     options = parser.parse_args()
     logging.disable(logging.INFO)
@@ -367,7 +369,7 @@ def main() -> None:
     simulator = context.Process(target=simulate, args=(options, sink), daemon=True)
     simulator.start()
     truth = source.recv()
-    print_header(list(Row.__dataclass_fields__))
+    print_header(_HEADER)
     peers = [FedPeer(context, name, options.every, options.out / f"{name}.jsonl") for name in options.peers]
     found = run(options, feed_peers(received(source, options.scans, options.out / "stop"), peers), truth)
     found = report(found, peers, truth)

@@ -1,4 +1,4 @@
-"""Curves of time and memory over the scans of `benchmarks/long_run.py`.
+"""Plots of time and memory over the scans of `benchmarks/long_run.py`.
 
 python benchmarks/long_run_plot.py long_run docs/pictures/long_run.png
 """
@@ -38,7 +38,7 @@ def main() -> None:
         memory.plot(rows["scans"], rows["rss_mb"], "-o", ms=3, label=name)
     counts.plot(ours["scans"], ours["keyframes"], label="keyframes")
     counts.plot(ours["scans"], ours["loops"], label="loop closures")
-    times.set_ylabel("processor ms a scan")
+    times.set_ylabel("CPU, ms per scan")
     memory.set_ylabel("MB")
     counts.set_xlabel(f"scans ({ours['way_km'][-1]:.1f} km)")
     for axes in (times, memory, counts):

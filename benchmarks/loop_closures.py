@@ -1,17 +1,17 @@
-"""The pose graph on simulated laps: what it does to drift, which loops are closed, how exact they are, what they cost.
+"""The pose graph on simulated laps: reduction of drift, loops found and their accuracy, and time.
 
     python benchmarks/loop_closures.py
     python benchmarks/loop_closures.py --worlds office rooms --drift 2
 
-A sensor goes round every world a time and a third. The whole graph of `lidarslam run --pose-graph` is given its scans,
-each compensated with the true motion and thinned, at poses that drift away from the truth; there is no odometry beside
-them. `rooms` is a world of this benchmark: a corridor round a block, along it rooms that are all the same.
+A sensor travels one and a third laps of every world. The whole graph of `lidarslam run --pose-graph` is given the
+scans, compensated with the true motion and thinned, at poses that drift from the ground truth; there is no odometry
+edge. `rooms` is a world of this benchmark: a corridor around a block, along identical rooms.
 
-Prints a Markdown table, a row for each recording. ATE is of all scans, after SE(3) alignment. A closure is false when
-its relative pose is off the truth by more than 0.5 m or 3 degrees; the first number is of those that the detector
-accepted, the second of those that the optimiser kept in the end. A keyframe is a revisit when the truth was within
-half the median range of it before, a loop's least way ago; it is found when a closure was kept within 5 m of way of
-it. Milliseconds are of the processor.
+Prints a Markdown table with a row per recording. ATE is of all scans, after SE(3) alignment. A closure is false if its
+relative pose is off by more than 0.5 m or 3 degrees; the first number is of those accepted by the detector, the second
+of those kept by the optimiser. A keyframe is a revisit if, by ground truth, a keyframe within half the median range is
+earlier by the minimum length of a loop or more; it is found if a closure was kept within 5 m of it along the path.
+Milliseconds are CPU time.
 """
 
 import time
@@ -40,12 +40,12 @@ from lidarslam.simulation.world import WORLDS, Boxes, Route, World, build_world
 ROOMS = "rooms"
 FALSE_M, FALSE_DEG = 0.5, 3.0
 _FOUND_WITHIN_M = 5.0
-# Errors of the estimate stay the same for so much of the way.
+# Distance travelled over which the drift rate is constant.
 _DRIFT_CHANGES_M = 50.0
-# Rounds of a world, and scans from one that is taken to the next.
+# Laps of a world, and the step between used scans.
 _LAPS, _EVERY = 1.34, 3
 _MOTIONS = {"street": "car", "tunnel": "tracked", "hall": "tracked"}
-# What refinement says of a scan's pose.
+# Covariance of a registered pose.
 _REGISTERED = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
 
 
@@ -53,14 +53,14 @@ _REGISTERED = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
 class Lap:
     """A recording of which every third scan is used."""
 
-    name: str  # of world and motion
-    simulation: Simulation  # where scans come from
-    scans: NDArray[np.intp]  # (M,) which are used
+    name: str  # world and motion
+    simulation: Simulation
+    scans: NDArray[np.intp]  # (M,) indices of the used ones
     truth: FloatArray  # (M, 4, 4) T_world_lidar
-    way_m: FloatArray  # (M,) path length
+    way_m: FloatArray  # (M,) distance travelled
 
     def points(self) -> Iterator[FloatArray]:
-        """(N, 3) of one scan after the other, compensated with the true motion."""
+        """(N, 3) of each scan, compensated with the true motion."""
         every = self.simulation.ground_truth.T_world_lidar
         for index in self.scans:
             velocity = body_velocity(inverse(every[index]) @ every[index + 1], self.simulation.sensor.period_s)
@@ -69,7 +69,7 @@ class Lap:
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """What the graph made of a lap; milliseconds (K,) of the processor, one a keyframe."""
+    """Result of the graph for a lap; CPU milliseconds (K,) per keyframe."""
 
     result: Corrected
     milliseconds: FloatArray
@@ -77,8 +77,8 @@ class Followed:
 
 
 def build_rooms(seed: int) -> World:
-    """A corridor of 2 m round a block of 36 x 10 m, with seven like rooms on either long side."""
-    walls = [(0.0, 0.0, 17.9, 4.9)]  # x, y and half sizes of what fills the storey's height
+    """A corridor 2 m wide around a block of 36 x 10 m, with seven identical rooms on either long side."""
+    walls = [(0.0, 0.0, 17.9, 4.9)]  # x, y and half sizes of boxes of the storey's height
     walls += [(side * 20.1, 0.0, 0.1, 7.0) for side in (-1.0, 1.0)]
     for side in (-1.0, 1.0):
         walls.append((0.0, side * 11.1, 20.2, 0.1))
@@ -103,7 +103,7 @@ def build_rooms(seed: int) -> World:
 
 
 def simulate(world: str, motion: str, seed: int) -> Lap:
-    """A recording straight from the simulator."""
+    """A recording from the simulator."""
     place = build_rooms(seed) if world == ROOMS else build_world(world, seed)
     simulation = in_world(place, motion, "vlp-16", None, seed, _LAPS)
     truth = simulation.ground_truth
@@ -112,7 +112,7 @@ def simulate(world: str, motion: str, seed: int) -> Lap:
 
 
 def drifting(truth: FloatArray, way_m: FloatArray, factor: float, seed: int) -> FloatArray:
-    """Estimates (M, 4, 4) with 1 % of the way and, mostly in heading, 2 degrees in 100 m of error, times a factor."""
+    """Poses (M, 4, 4) that drift by 1 % of the distance and, mostly in heading, 2 degrees per 100 m, times a factor."""
     rng = np.random.default_rng([seed, 77])
     motions = inverse(truth[:-1]) @ truth[1:]
     steps = np.diff(way_m)
@@ -123,7 +123,7 @@ def drifting(truth: FloatArray, way_m: FloatArray, factor: float, seed: int) -> 
 
 
 def follow(lap: Lap, estimates: FloatArray, config: PoseGraphConfig) -> Followed:
-    """Give the graph scan after scan."""
+    """Add all scans to the graph."""
     graph = SlamGraph(config)
     milliseconds: list[float] = []
     ranges: list[float] = []
@@ -144,14 +144,14 @@ def follow(lap: Lap, estimates: FloatArray, config: PoseGraphConfig) -> Followed
 
 
 def errors_of(closures: Sequence[LoopClosure], truth: FloatArray) -> FloatArray:
-    """(N, 2) how far closures are off, in metres and degrees."""
+    """(N, 2) errors of closures in metres and degrees."""
     errors = [inverse(truth[c.first]) @ truth[c.second] for c in closures]
     off = [inverse(true) @ c.T_first_second for true, c in zip(errors, closures, strict=True)]
     return np.array([[np.linalg.norm(T[:3, 3]), np.rad2deg(rotation_angle(T))] for T in off]).reshape(-1, 2)
 
 
 def revisits(position: FloatArray, way_m: FloatArray, range_m: float) -> list[int]:
-    """Keyframes (K,) that are close to where the sensor was before."""
+    """Keyframes (K,) close to an earlier position of the sensor."""
     least = max(10.0, 3.0 * range_m)
     found = []
     for index in range(len(way_m)):
@@ -162,7 +162,7 @@ def revisits(position: FloatArray, way_m: FloatArray, range_m: float) -> list[in
 
 
 def ate_m(lap: Lap, T_world_lidar: FloatArray) -> float:
-    """Of all scans, after SE(3) alignment."""
+    """ATE of all scans after SE(3) alignment."""
     stamps = np.arange(len(lap.truth), dtype=np.float64)
     return evaluate_trajectory(Trajectory(stamps, T_world_lidar), Trajectory(stamps, lap.truth)).errors.ate_rmse_m
 
@@ -173,7 +173,6 @@ def is_false(errors: FloatArray) -> NDArray[np.bool_]:
 
 
 def row(lap: Lap, estimates: FloatArray, followed: Followed) -> list[str]:
-    """The cells of one recording."""
     result = followed.result
     truth, way_m = lap.truth[result.keyframe_scans], lap.way_m[result.keyframe_scans]
     accepted = [closure for closure in result.closures if closure.accepted]
@@ -211,7 +210,7 @@ def row(lap: Lap, estimates: FloatArray, followed: Followed) -> list[str]:
 
 
 def _squared(closure: LoopClosure, truth: FloatArray) -> float:
-    """The error against its covariance; 5.3 in the median if that were right."""
+    """Squared error over covariance; its median is 5.3 for a correct covariance."""
     xi = log(inverse(closure.T_first_second) @ inverse(truth[closure.first]) @ truth[closure.second])
     return float(xi @ np.linalg.solve(closure.covariance, xi))
 
@@ -225,15 +224,14 @@ def main() -> None:
         default=[*(world for world in WORLDS if world != "town"), ROOMS],
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--drift", type=float, default=1.0, help="times 1 %% of the way and 2 degrees in 100 m")
+    parser.add_argument("--drift", type=float, default=1.0, help="factor of 1 %% of the distance and 2 deg per 100 m")
     arguments = parser.parse_args()
-    # The defaults, with the drift where there is more.
     drift_percent = max(1.0, arguments.drift) * LoopConfig().drift_percent
     config = PoseGraphConfig(enabled=True, loops=LoopConfig(drift_percent=drift_percent))
     header = ["recording", "path, m", "ATE before / after, m", "ratio", "keyframes", "revisits", "closures"]
     header += ["by appearance", "false, accepted / kept"]
     header += ["off by, median / max", "degrees", "squared over covariance", "revisits found, %"]
-    header += ["ms a keyframe, median / 95 % / mean"]
+    header += ["ms per keyframe, median / 95 % / mean"]
     print_header(header)
     for world in arguments.worlds:
         lap = simulate(world, _MOTIONS.get(world, "handheld"), arguments.seed)

@@ -1,9 +1,9 @@
-"""The check of a run's map against itself, on poses of a run and on the same poses with slips put in.
+"""Map consistency check on the poses of a run, and on the same poses with inserted slips.
 
     python benchmarks/map_check.py KITTI/sequences/04 2011_09_26/2011_09_26_drive_0005_sync
 
-The poses come from `--odometry constant-velocity --set mapping.continuous_time=false`, or from a TUM file beside the
-recording's name after a comma; they are given to `lidarslam run --prior --no-mapping` as they are and distorted.
+The poses come from `--odometry constant-velocity --set mapping.continuous_time=false`, or from a TUM file given after
+the recording's name and a comma; they are passed to `lidarslam run --prior --no-mapping` unchanged and distorted.
 """
 
 import argparse
@@ -24,21 +24,21 @@ _STRETCH = 15
 
 
 def scaled(T_world_lidar: FloatArray, factors: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) whose motions (N - 1,) are so much of what they were."""
+    """Poses (N, 4, 4) with translations between them scaled by factors (N - 1,)."""
     motions = inverse(T_world_lidar[:-1]) @ T_world_lidar[1:]
     motions[:, :3, 3] *= factors[:, None]
     return chain(T_world_lidar[0], motions)
 
 
 def scaled_stretch(T_world_lidar: FloatArray, factor: float) -> FloatArray:
-    """The motions of fifteen scans in the middle scaled."""
+    """Scale the motions of fifteen scans in the middle."""
     factors, middle = np.ones(len(T_world_lidar) - 1), len(T_world_lidar) // 2
     factors[middle : middle + _STRETCH] = factor
     return scaled(T_world_lidar, factors)
 
 
 def offset(T_world_lidar: FloatArray, along_m: float) -> FloatArray:
-    """Fifteen scans in the middle set off forwards."""
+    """Offset fifteen scans in the middle forwards."""
     poses, middle = T_world_lidar.copy(), len(T_world_lidar) // 2
     poses[middle : middle + _STRETCH, :3, 3] += along_m * poses[middle : middle + _STRETCH, :3, 0]
     return poses
@@ -56,13 +56,11 @@ DISTORTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def run(source: Path, out: Path, settings: dict[str, object], prior: Path | None = None) -> RunSummary:
-    """One run."""
     config = Config.model_validate(settings)
     return execute(RunRequest(source, out, config, prior=prior, resumable=False), lambda *_: None).summary
 
 
 def row(name: str, distortion: str, summary: RunSummary) -> str:
-    """A line of the table."""
     found = summary.contradictions
     clearest = max(found, key=lambda one: one.votes - one.votes_at_pose, default=None)
     what = "none" if clearest is None else f"{clearest.shift_m:+.1f} m, {sum(one.pairs for one in found)} pairs"

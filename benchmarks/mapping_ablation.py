@@ -1,13 +1,12 @@
-"""What each part of scan-to-map refinement contributes: the same recordings with parts of it switched off.
+"""Ablation of scan-to-map registration: the same recordings with parts of it disabled.
 
     python benchmarks/mapping_ablation.py
 
-Every row of the Markdown table is a variant: surfels and LOAM's features, with the velocity of the sweep estimated
-(continuous time) or taken from the poses (discrete); each without any odometry, with the learned one, and with one
-that is wrong at every scan (see `mapping_accuracy.py`). The columns are the ATE of
-each recording in metres after SE(3) alignment, lost scans in brackets, the mean, and the median time of a scan's
-registration and map update. All variants have the same scans; what each recording gives goes to standard error as it
-comes, as the table needs them all.
+The rows of the Markdown table are variants: surfels and LOAM's features, with the velocity of the sweep estimated
+(continuous time) or taken from the poses (discrete); each without an odometry, with the learned one, and with one that
+is wrong at every scan (see `mapping_accuracy.py`). The columns are the ATE of each recording in metres after SE(3)
+alignment, with lost scans in brackets, the mean, and the median time of registration and map update per scan. All
+variants have the same scans; the results of each recording go to standard error during the run.
 """
 
 import sys
@@ -38,7 +37,7 @@ _PARTS: dict[str, MappingConfig] = {
 
 
 def run_variants(recorded: Recorded, seed: int) -> list[Outcome]:
-    """One recording through all variants, without odometry, with the learned and with the wrong one."""
+    """All variants on one recording: without an odometry, with the learned and with the wrong one."""
     prior, mappings = wrong_odometry(recorded, seed), _PARTS.values()
     alone = [localise(recorded, config_of("constant-velocity", mapping)) for mapping in mappings]
     learned = [localise(recorded, config_of("learned", mapping)) for mapping in mappings]
@@ -67,7 +66,7 @@ def main() -> None:
         columns.append(run_variants(recorded, arguments.seed))
         ates = " ".join(f"{outcome.ate_m:.3f}" for outcome in columns[-1])
         print(f"{recorded.name}: {ates}", file=sys.stderr, flush=True)
-    header = ["variant", "odometry", *names, "mean", "ms a scan"]
+    header = ["variant", "odometry", *names, "mean", "ms per scan"]
     print_header(header)
     for label, outcomes in zip(_labels(), zip(*columns, strict=True), strict=True):
         print_row([label, *_cells(outcomes)])

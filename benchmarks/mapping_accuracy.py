@@ -1,19 +1,19 @@
-"""Scan-to-map refinement beside KISS-ICP: how far each one's trajectory is from the truth, on the same scans.
+"""Accuracy of scan-to-map registration compared with KISS-ICP, by ground truth on the same scans.
 
     python benchmarks/mapping_accuracy.py KITTI/sequences/04 2011_09_26/2011_09_26_drive_0005_sync
     python benchmarks/mapping_accuracy.py --worlds office tunnel --motions handheld tracked
 
-Prints a Markdown table, a row for each recording: ATE in metres after SE(3) alignment, over all scans, of
+Prints a Markdown table with a row per recording: ATE in metres after SE(3) alignment, over all scans, of
 
 - KISS-ICP with its defaults;
-- KISS-ICP with the voxel size, of `--voxels`, that makes its ATE on this very recording smallest;
-- scan-to-map refinement without any odometry;
-- the same with an odometry that is wrong by 2 degrees and 0.1 m at every scan, in random directions: the truth's
-  motions with these errors, given as an external odometry; how far it gets by itself is in a column too.
+- KISS-ICP with the voxel size, of `--voxels`, that minimises its ATE on this recording;
+- scan-to-map registration without an odometry;
+- the same with an odometry that is wrong by 2 degrees and 0.1 m at every scan, in random directions: the true motions
+  with these errors, given as an external odometry; its own ATE has a column, too.
 
-Ours have the scans that were lost and degraded beside them. All of them run in the pipeline of `lidarslam run` with its
-defaults. Sources are whatever `lidarslam run` reads and has ground truth for; simulated recordings go straight from the
-simulator into memory.
+Ours have the numbers of lost and degraded scans with the ATE. All methods run in the pipeline of `lidarslam run` with
+its defaults. Sources are recordings that `lidarslam run` reads, with ground truth; simulated recordings are passed in
+memory.
 """
 
 import argparse
@@ -51,7 +51,7 @@ from lidarslam.simulation.sensors import SENSORS, find_sensor
 from lidarslam.simulation.world import WORLDS, World, build_world
 
 T = TypeVar("T")
-# How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
+# Maximum extrapolation of the ground truth beyond its own stamps.
 BEYOND_TRUTH_S = 0.2
 # Errors of the wrong odometry at every scan.
 WRONG_DEG, WRONG_M = 2.0, 0.1
@@ -59,7 +59,7 @@ WRONG_DEG, WRONG_M = 2.0, 0.1
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """A recording in memory, so that every method has the same scans and none waits for them."""
+    """A recording in memory, so that every method has the same scans without waiting for them."""
 
     name: str
     scans: Sequence[Scan]
@@ -69,7 +69,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method made of a recording; `refine_ms` is the median time of laying a scan on the map, if it did."""
+    """Result of a method on a recording; `refine_ms` is the median time of registration to the map, if any."""
 
     ate_m: float
     length_m: float
@@ -78,7 +78,7 @@ class Outcome:
     refine_ms: float | None
 
     def text(self) -> str:
-        """The ATE, and what went wrong on the way."""
+        """ATE with lost and degraded scans."""
         return f"{self.ate_m:.3f} ({self.lost} lost, {self.degraded} degraded)"
 
 
@@ -86,7 +86,7 @@ def read(source: Path) -> Recorded:
     """A recording from disk.
 
     Raises:
-        InputError: it cannot be read, or comes without ground truth.
+        InputError: it cannot be read, or has no ground truth.
     """
     recording = open_recording(source)
     truth = recording.ground_truth
@@ -96,31 +96,31 @@ def read(source: Path) -> Recorded:
 
 
 def simulate(world: str, motion: str, sensor: str, scans: int, seed: int) -> Recorded:
-    """A recording straight from the simulator."""
+    """A recording from the simulator."""
     simulation = make_simulation(world, motion, sensor, scans, seed)
     return Recorded(f"{world}, {motion}", list(simulation.scans()), simulation.ground_truth)
 
 
 def make_simulation(world: str, motion: str, sensor: str, scans: int, seed: int) -> Simulation:
-    """An upright sensor going round a world's route."""
+    """An upright sensor on a world's route."""
     return in_world(build_world(world, seed), motion, sensor, scans, seed)
 
 
 def in_world(place: World, motion: str, sensor: str, scans: int | None, seed: int, laps: float = 1.0) -> Simulation:
-    """The same in a world at hand; without a number of scans, so many laps."""
+    """The same in a given world; without a number of scans, for a number of laps."""
     carried, model = motion_along_route(motion, place, seed), find_sensor(sensor)
     scans = int(laps * carried.duration_s * model.rate_hz) if scans is None else scans
     return Simulation(place, model, carried, mount_pose("upright", carried.sensor_height_m), scans, seed)
 
 
 def true_trajectory(recorded: Recorded) -> Trajectory:
-    """The truth at the scans' stamps."""
+    """Ground truth at the scans' stamps."""
     stamps = np.array([scan.stamp for scan in recorded.scans])
     return Trajectory(stamps, recorded.truth.at(stamps, BEYOND_TRUTH_S))
 
 
 def wrong_odometry(recorded: Recorded, seed: int) -> Trajectory:
-    """The truth at the scans' stamps, every motion changed by a rotation and a translation in random directions."""
+    """Ground truth at the scans' stamps, each motion perturbed by a rotation and a translation in random directions."""
     rng = np.random.default_rng(seed)
     truth = true_trajectory(recorded)
     stamps = truth.stamps
@@ -131,7 +131,7 @@ def wrong_odometry(recorded: Recorded, seed: int) -> Trajectory:
 
 
 def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> Outcome:
-    """Take a recording through the pipeline, and hold the trajectory against the truth."""
+    """Run the pipeline on a recording and evaluate the trajectory."""
     results = pipeline_results(recorded.scans, config, prior)
     errors = errors_of(trajectory_of(results), recorded)
     statuses = [result.status for result in results]
@@ -146,23 +146,23 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
 
 
 def pipeline_results(scans: Sequence[Scan], config: Config, prior: Trajectory | None = None) -> list[ScanEstimate]:
-    """Take scans through the pipeline of `lidarslam run`."""
+    """Run the pipeline of `lidarslam run` on scans."""
     with closing(where_needed(make_odometry(config.odometry, prior), config)) as odometry:
         return list(Pipeline(odometry, make_localiser(config), config.global_map).run(scans))
 
 
 def trajectory_of(results: Sequence[ScanEstimate]) -> Trajectory:
-    """The poses as they came."""
+    """The poses as registered."""
     return Trajectory(np.array([one.stamp for one in results]), np.array([one.T_world_lidar for one in results]))
 
 
 def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
-    """How far a trajectory is from a recording's truth."""
+    """Errors of a trajectory by a recording's ground truth."""
     return evaluate_trajectory(estimate, recorded.truth).errors
 
 
 def config_of(odometry: OdometryName, mapping: MappingConfig) -> Config:
-    """The configuration of an odometry in front of scan-to-map refinement."""
+    """Configuration of scan-to-map registration with an odometry."""
     return Config(odometry=OdometryConfig(method=odometry), mapping=mapping)
 
 
@@ -183,7 +183,6 @@ def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
 
 
 def row(recorded: Recorded, voxels: Sequence[float], seed: int) -> list[str]:
-    """The cells of one recording."""
     kiss = run_kiss(recorded, KissConfig())
     outcomes = [(run_kiss(recorded, KissConfig(voxel_size_m=voxel_m)), voxel_m) for voxel_m in voxels]
     tuned, voxel_m = min(outcomes, key=lambda one: one[0].ate_m)
@@ -210,7 +209,7 @@ def main() -> None:
     add_simulation_arguments(parser)
     parser.add_argument("--voxels", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0], help="metres, for KISS-ICP")
     arguments = parser.parse_args()
-    wrong = f"{WRONG_DEG:g} deg, {WRONG_M:g} m a scan"
+    wrong = f"{WRONG_DEG:g} deg, {WRONG_M:g} m per scan"
     header = ["recording", "scans", "path, m", "KISS-ICP", "KISS-ICP, best voxel", "ours, no odometry"]
     header += [f"odometry wrong by {wrong}", "ours with it", "ours, % of the path: without / with it"]
     print_header(header)
@@ -219,20 +218,20 @@ def main() -> None:
 
 
 def in_process(call: Callable[..., T], *arguments: object) -> T:
-    """What a call returns in a process of its own."""
+    """Result of a call in a separate process."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(call, *arguments).result()
 
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:
-    """The parser of a benchmark's command line, whose help is the text of its module."""
+    """Parser of a benchmark's command line, with the module's docstring as help."""
     return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def add_simulation_arguments(
     parser: argparse.ArgumentParser, worlds: Sequence[str] = (), motions: Sequence[str] = tuple(CARRIERS)
 ) -> None:
-    """Which recordings are simulated."""
+    """Arguments that choose simulated recordings."""
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=worlds)
     parser.add_argument("--motions", nargs="+", choices=list(CARRIERS), default=motions)
     parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
@@ -248,7 +247,7 @@ def simulated_recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
 
 
 def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterator[Recorded]:
-    """All that are asked for, or of all worlds, one in memory at a time; of those on disk at most so many scans."""
+    """Chosen recordings, by default of all worlds, one in memory at a time; at most `most` scans of those on disk."""
     if not arguments.sources and not arguments.worlds:
         arguments.worlds = list(WORLDS)
     for source in arguments.sources:
@@ -258,12 +257,12 @@ def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterat
 
 
 def print_row(cells: Sequence[str]) -> None:
-    """One row of a Markdown table."""
+    """Print a row of a Markdown table."""
     print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def print_header(cells: Sequence[str]) -> None:
-    """The first row of a Markdown table, and the line below it."""
+    """Print the header of a Markdown table."""
     print_row(cells)
     print_row(["---"] * len(cells))
 

@@ -1,24 +1,23 @@
-"""How long scan-to-map refinement takes a scan, stage by stage, beside KISS-ICP's `register_frame` on the same scans.
+"""Time of scan-to-map registration per scan, by stage, compared with KISS-ICP's `register_frame` on the same scans.
 
     python benchmarks/mapping_speed.py KITTI/sequences/04
     python benchmarks/mapping_speed.py KITTI/sequences/04 --methods surfels loam
     python benchmarks/mapping_speed.py --simulate hdl-64e:street:car os1-128:street:car --scans 60
 
-Everything runs in one process, one scan after the other, without reading and without the pipeline's two threads: ours
-(without odometry, to the pose and the updated map), each mapping of `--methods`, then KISS-ICP with its defaults, for
-`--rounds` rounds, each from an empty map, so that whatever else the machine does meets all of them.
-The first `--warm-up` scans of every pass do not count. Wall time and CPU time
-(of all threads) of every scan; median and 95th percentile over all passes; the ratio is that of the medians of
-passes next to each other, its median, smallest and largest.
+Everything runs in sequence in one process, without reading and without the pipeline's threads: ours (without odometry,
+to the pose and the updated map) with each mapping of `--methods`, alternating with KISS-ICP with its defaults, for
+`--rounds` rounds, each from an empty map, so that other load affects all of them. The first `--warm-up` scans of every
+pass do not count. Printed are wall time and CPU time (of all threads) per scan, median and 95th percentile over all
+passes; the ratio is that of the medians of adjacent passes: median, smallest and largest.
 
-Ours runs with BLAS on one thread, as `lidarslam run` has it; KISS-ICP uses as many threads as it likes. A stage's time
-is without the stages inside it:
+Ours runs with BLAS on one thread, as in `lidarslam run`; KISS-ICP uses any number of threads. The time of a stage
+excludes the stages inside it:
 
 - thin: choosing the points of the scan; LOAM's features;
-- registration: finding the surfaces and solving for the pose;
-- fit: holding the result against the map;
-- map update: compensating the scan, adding it, forgetting what is far;
-- rest: prediction and judgement, and the search when a scan is lost.
+- registration: finding correspondences and solving for the pose;
+- fit: residuals of the result in the map;
+- map update: compensating the scan, adding it, removing distant cells;
+- rest: prediction and status, and the search when a scan is lost.
 """
 
 import functools
@@ -49,7 +48,7 @@ from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.threads import in_order
 
 _METHODS: tuple[MappingName, ...] = ("surfels", "loam")
-# Stage -> what is timed for it: the object that holds the function, and its name there.
+# Stage -> owner and name of the timed function.
 _STAGES: dict[str, tuple[Any, str]] = {
     "thin": (Sampler, "sample"),
     "registration": (scan_matcher, "register"),
@@ -61,14 +60,14 @@ _STAGES: dict[str, tuple[Any, str]] = {
 
 @dataclass
 class Stopwatch:
-    """Seconds of each stage without the stages that ran inside it: wall, of all threads, of the calling thread."""
+    """Seconds of each stage without the stages inside it: wall, CPU of all threads, CPU of the calling thread."""
 
     seconds: dict[str, FloatArray] = field(default_factory=lambda: defaultdict(lambda: np.zeros(3)))
     _inside: list[FloatArray] = field(default_factory=list)
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
-        """Count the time within for the stage."""
+        """Add the time within to the stage."""
         self._inside.append(np.zeros(3))
         begun = _clocks()
         try:
@@ -90,7 +89,7 @@ class Stopwatch:
         return timed
 
     def replacement(self, stage: str, owner: Any, name: str) -> Any:
-        """What to put in the place of a function or a method, so that it is timed."""
+        """Timed replacement of a function or a method."""
         is_static = isinstance(inspect.getattr_static(owner, name), staticmethod)
         timed = self.wrap(stage, getattr(owner, name))
         return staticmethod(timed) if is_static else timed
@@ -102,7 +101,7 @@ def _clocks() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """One method over all scans: milliseconds of each scan, wall and CPU (N, 2), in all and stage by stage."""
+    """One method over all scans: milliseconds per scan, wall and CPU (N, 2), in total and by stage."""
 
     total_ms: FloatArray
     stage_ms: dict[str, FloatArray] = field(default_factory=dict)
@@ -110,7 +109,7 @@ class _Pass:
 
 
 def run_ours(scans: Sequence[Scan], method: MappingName, warm_up: int) -> _Pass:
-    """Scan-to-map refinement without odometry."""
+    """Scan-to-map registration without odometry."""
     ours = Mapper(MappingConfig(method=method))
     watches, bad = [], 0
     with threadpool_limits(1, "blas"):
@@ -142,8 +141,8 @@ def run_kiss(scans: Sequence[Scan], warm_up: int) -> _Pass:
 
 
 def compare(name: str, scans: Sequence[Scan], methods: Sequence[MappingName], rounds: int, warm_up: int) -> None:
-    """Run all in turn, and print what they took."""
-    for method in methods:  # loops are compiled when they are first called on a machine
+    """Run all alternately and print their times."""
+    for method in methods:  # compiles loops
         run_ours(scans[:8], method, 0)
     ours: dict[MappingName, list[_Pass]] = {method: [] for method in methods}
     kiss: dict[MappingName, list[_Pass]] = {method: [] for method in methods}
@@ -151,13 +150,13 @@ def compare(name: str, scans: Sequence[Scan], methods: Sequence[MappingName], ro
         ours[label].append(run_ours(scans, label, warm_up))
         kiss[label].append(run_kiss(scans, warm_up))
     points = np.median([len(scan) for scan in scans])
-    print(f"\n{name}: {len(scans)} scans of {points:,.0f} points, {rounds} rounds; milliseconds a scan\n")
+    print(f"\n{name}: {len(scans)} scans of {points:,.0f} points, {rounds} rounds; milliseconds per scan\n")
     print_header(
         ["", "wall median", "wall p95", "CPU median", "CPU p95", "Hz", "wall / KISS-ICP's", "CPU / KISS-ICP's"]
     )
     for label, passes in ours.items():
-        beside = [_ratio(passes, kiss[label], kind) for kind in range(2)]
-        print_row([label, *_times([one.total_ms for one in passes]), *beside])
+        ratios = [_ratio(passes, kiss[label], kind) for kind in range(2)]
+        print_row([label, *_times([one.total_ms for one in passes]), *ratios])
     everything = [one.total_ms for passes in kiss.values() for one in passes]
     print_row(["KISS-ICP", *_times(everything), "1", "1"])
     for label, passes in ours.items():
@@ -172,7 +171,7 @@ def _print_stages(label: str, passes: Sequence[_Pass]) -> None:
 
 
 def _times(passes: Sequence[Any]) -> list[str]:
-    """Cells: median and 95th percentile of wall and CPU time, and the rate that the median of wall time makes."""
+    """Cells: median and 95th percentile of wall and CPU time, and the rate at the median wall time."""
     wall, cpu = np.concatenate(passes).T
     cells = [f"{value:.1f}" for kind in (wall, cpu) for value in (np.median(kind), np.percentile(kind, 95.0))]
     return [*cells, f"{1e3 / max(float(np.median(wall)), 1e-6):.0f}"]
@@ -189,7 +188,7 @@ def main() -> None:
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
     parser.add_argument("--methods", nargs="+", choices=_METHODS, default=["surfels"])
-    parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
+    parser.add_argument("--scans", type=int, default=60, help="maximum per recording")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--warm-up", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)

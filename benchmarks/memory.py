@@ -1,20 +1,20 @@
-"""Whether a long run takes more and more memory.
+"""Growth of memory over a long run.
 
     python benchmarks/memory.py lap --world hall --motion tracked --scans 20000
     python benchmarks/memory.py rooms --scans 20000 [--lost-every 600]
     python benchmarks/memory.py still --scans 100000
 
-- lap: a sensor goes round and round in a simulated place;
-- rooms: it stands in a made-up room, and with `--lost-every` wakes up in another one every so many scans, where after
-  20 lost scans a map begins;
-- still: a few hundred points per scan, always the same but for the noise, without mapping: what a run keeps of each.
-  The global map merges its points after 20,000 instead of a million, or its saw teeth would hide everything else.
+- lap: a sensor circles in a simulated place;
+- rooms: it stands in a synthetic room, and with `--lost-every N` in another one every N scans, where a map begins after
+  20 lost scans;
+- still: a few hundred points per scan, always the same but for the noise, without mapping: data that a run keeps per
+  scan. The global map merges its points after 20,000 instead of a million, whose sawtooth would hide everything else.
 
 The scans go from memory into the pipeline of `lidarslam run`, which logs them and saves its state, in a temporary
-folder. Prints a Markdown table, a row every `--every` scans: resident memory of the process, the largest since the row
-before, size of the saved state, cells of the local map, points of the global map; scans lost, degraded, and maps begun
-since the row before, how far the pose is from the truth (the first poses put together), and the wall time of a scan,
-simulator included. Below it, what grew over the second half. Linux only: memory is read from /proc.
+folder. Prints a Markdown table with a row every `--every` scans: resident memory of the process, and its peak since the
+previous row; size of the saved state; cells of the local map; points of the global map; scans lost and degraded, and
+maps started since the previous row; position error, with the first poses aligned; wall time per scan, including the
+simulator. Below it, the growth over the second half. Linux only: memory is read from /proc.
 """
 
 import argparse
@@ -50,11 +50,15 @@ from lidarslam.storage.directory import RunDirectory, Unfinished
 
 _NOISE_M, _ROOM_POINTS, _STILL_POINTS = 0.005, 1_000, 300
 _WITHOUT_ODOMETRY = ["odometry.method=constant-velocity"]
+_HEADER = (
+    "scans", "memory, MB", "peak, MB", "state, MB", "cells", "map points", "lost", "degraded", "maps started",
+    "error, m", "ms per scan",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Row:
-    """How things stand after so many scans."""
+    """State after a number of scans."""
 
     scans: int
     memory_mb: float
@@ -71,7 +75,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is run: the scans, the settings, a prior trajectory or none, and the error of a result, NaN if unknown."""
+    """Scans, settings, a prior trajectory or none, and the error of a result, NaN if unknown."""
 
     scans: Iterable[Scan]
     config: Config
@@ -80,7 +84,7 @@ class Case:
 
 
 def lap(options: argparse.Namespace) -> Case:
-    """Round and round a simulated place."""
+    """Laps of a simulated place."""
     simulation = make_simulation(options.world, options.motion, "vlp-16", options.scans, 0)
 
     def error_m(result: ScanEstimate) -> float:
@@ -104,7 +108,7 @@ def rooms(options: argparse.Namespace) -> Case:
 
 
 def _room(rng: np.random.Generator) -> FloatArray:
-    """Points (N, 3) on the walls of a room, as seen from somewhere in it."""
+    """Points (N, 3) on the walls of a room, from a random pose in it."""
     half = rng.uniform([3.0, 3.0, 1.2], [6.0, 6.0, 2.0])
     walls = rng.uniform(-1.0, 1.0, (_ROOM_POINTS, 3))
     walls[np.arange(_ROOM_POINTS), rng.integers(0, 3, _ROOM_POINTS)] = rng.choice([-1.0, 1.0], _ROOM_POINTS)
@@ -132,7 +136,7 @@ def still(options: argparse.Namespace) -> Case:
 
 
 def watch(case: Case, every: int) -> list[Row]:
-    """Run, and print a row now and then."""
+    """Run and print rows."""
     rows: list[Row] = []
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
@@ -175,19 +179,19 @@ def resident_mb() -> float:
 
 
 def growth(rows: list[Row]) -> str:
-    """What straight lines through the second half rise by, in words."""
+    """Slopes of straight lines through the second half, in words."""
     half = rows[len(rows) // 2 :]
     if len(half) < 3:
-        return "Too few rows to tell what grows."
+        return "Too few rows for a slope."
     scans = [row.scans for row in half]
 
     def slope(name: str) -> float:
         return float(np.polyfit(scans, [getattr(row, name) for row in half], 1)[0])
 
     return (
-        f"By straight lines through the second half, for each scan: {2**20 * slope('memory_mb'):.0f} bytes of memory,"
-        f" {2**20 * slope('state_mb'):.0f} of saved state; {1e3 * slope('cells'):.0f} cells and"
-        f" {1e3 * slope('map_points'):.0f} points every 1,000 scans."
+        f"Slopes of straight lines through the second half: {2**20 * slope('memory_mb'):.0f} bytes of memory and"
+        f" {2**20 * slope('state_mb'):.0f} of saved state per scan; {1e3 * slope('cells'):.0f} cells and"
+        f" {1e3 * slope('map_points'):.0f} points per 1,000 scans."
     )
 
 
@@ -201,7 +205,7 @@ def main() -> None:
     parser.add_argument("--motion", choices=list(CARRIERS), default="handheld")
     parser.add_argument("--lost-every", type=int, help="scans from one room to the next")
     options = parser.parse_args()
-    print_header(list(Row.__dataclass_fields__))
+    print_header(_HEADER)
     print(f"\n{growth(watch(cases[options.case](options), options.every))}")
 
 

@@ -1,11 +1,11 @@
-"""Recordings in turned axes: errors and lost scans as they are, as guessed, and with `reader.mounting` set.
+"""Recordings in rotated axes: ATE and lost scans as recorded, with a guessed and with a given `reader.mounting`.
 
     python benchmarks/mounting.py recordings/street --scans 40 --starts 0 60
     python benchmarks/mounting.py KITTI --sequence 04 --methods learned constant-velocity+map kiss-icp
 
-Every scan and the ground truth are turned about the sensor before the program sees them. `as it is` is
-`reader.mounting=upright`; `guessed` is the default, with what it came to. A recording without ground truth is compared
-with the trajectory of the same method on it as it was recorded.
+Every scan and the ground truth are rotated about the sensor before the program reads them. `as it is` is
+`reader.mounting=upright`; `guessed` is the default, with the rotation found; `set` is the true rotation. A recording
+without ground truth is compared with the trajectory of the same method in the original axes.
 """
 
 import warnings
@@ -87,7 +87,7 @@ def main() -> None:
         truths = {method: reference(upright, method, arguments.scans) for method in arguments.methods}
         for name in arguments.turns:
             turned = MountedRecording(upright, TURNS[name])
-            with warnings.catch_warnings(action="ignore"):  # at 90 degrees of pitch, one of several angles is taken
+            with warnings.catch_warnings(action="ignore"):  # gimbal lock at 90 degrees of pitch
                 back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
             given: RollPitchYaw = tuple(np.round(back, 6).tolist())
             settings: dict[str, Mounting] = {"as it is": "upright", "guessed": "auto", "set": given}
@@ -100,7 +100,7 @@ def main() -> None:
 
 
 def shown(recording: MountedRecording, setting: str, mounting: Mounting) -> str:
-    """The setting, and a guess by what became of z."""
+    """The setting, for a guess with the tilt of z."""
     if mounting != "auto":
         return setting
     tilt_deg = np.rad2deg(np.arccos(np.clip(recording.T_upright_recorded[2, 2], -1.0, 1.0)))
@@ -114,13 +114,13 @@ def reference(recording: Recording, method: str, count: int) -> Trajectory:
 
 
 def cell(recording: MountedRecording, method: str, count: int, truth: Trajectory) -> str:
-    """The error of a method over the first scans, and how many were lost; positions do not depend on the mounting."""
+    """ATE and lost scans of a method; positions do not depend on the mounting."""
     trajectory, lost = tracked(recording, method, count)
     return f"{evaluate_trajectory(trajectory, truth).errors.ate_rmse_m:.3f} / {lost}"
 
 
 def tracked(recording: Recording, method: str, count: int) -> tuple[Trajectory, int]:
-    """The trajectory of the first scans by a method, and how many were lost."""
+    """Trajectory of the first scans by a method, and the number of lost ones."""
     odometry, _, mapping = method.partition("+")
     config = load_config(settings=[f"odometry.method={odometry}", f"mapping.method={'surfels' if mapping else 'off'}"])
     scans = islice(take_in(recording, range(count), Faults()), count)

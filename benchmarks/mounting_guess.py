@@ -1,12 +1,12 @@
-"""How often the guess of the mounting finds it, warns, leaves a recording as it is, or turns it wrongly.
+"""Outcomes of the guess of the mounting: correct, a warning, left as recorded, or wrong.
 
     python benchmarks/mounting_guess.py KITTI --sequence 04
     python benchmarks/mounting_guess.py --worlds street office --sensors vlp-16 os1-64
 
-Guesses are made from several starts in a recording. Recordings on disk are taken to be upright and are turned about the
-sensor as a whole (`axes`). In simulated ones the sensor is mounted so too, and sees what it sees then (`mounted`). Each
-cell has four counts: turned upright / warned / left as recorded / turned wrongly, by more than 30 degrees from upright.
-Upright and tilted recordings are to be left as recorded, and the last count is to be 0.
+Guesses are made from several starts of a recording. Recordings on disk are assumed to be upright and are rotated about
+the sensor as a whole (`axes`). In simulated ones, the sensor is also mounted in that pose, with the resulting view
+(`mounted`). Each cell has four counts: turned upright / warned / left as recorded / turned wrongly, by more than 30
+degrees from upright. Upright and tilted recordings should be left as recorded, and the last count should be 0.
 """
 
 from collections import Counter
@@ -37,7 +37,7 @@ POSES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "upside down": ((180, 0, 0), (160, 15, 0)),
 }
 OUTCOMES = ("turned", "warned", "left", "wrong")
-STEP, LOOK = 4, 17  # scans from one that is looked at to the next, as the program does, and of all
+STEP, LOOK = 4, 17  # step between the scans used, as in the program, and their span
 WRONG_DEG = 30.0
 
 
@@ -45,7 +45,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("sources", type=Path, nargs="*")
     parser.add_argument("--sequence")
-    parser.add_argument("--every", type=int, default=8, help="scans from one start to the next, of recordings on disk")
+    parser.add_argument("--every", type=int, default=8, help="scans between starts, of recordings on disk")
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=[])
     parser.add_argument("--sensors", nargs="+", choices=list(SENSORS), default=list(SENSORS))
     parser.add_argument("--starts", type=int, default=2, help="of simulated recordings")
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def row(name: str, turned: str, columns: Iterator[Iterator[tuple[Guess, float]]]) -> None:
-    """Print a row, with the guesses of each pose."""
+    """Print a row with the guesses of each pose."""
     cells = []
     for guesses in columns:
         counts = Counter(outcome(*guess) for guess in guesses)
@@ -70,14 +70,14 @@ def row(name: str, turned: str, columns: Iterator[Iterator[tuple[Guess, float]]]
 
 
 def outcome(guess: Guess, tilt_deg: float) -> str:
-    """What a guess came to, with the tilt of the scans after it."""
+    """Outcome of a guess, by the tilt of the scans after it."""
     if guess.mounting == "upright":
         return "left" if guess.warning is None else "warned"
     return "turned" if tilt_deg < WRONG_DEG else "wrong"
 
 
 def on_disk(recorded: ScanSequence, pose: str, every: int) -> Iterator[tuple[Guess, float]]:
-    """The guesses from every start, with the tilts after them."""
+    """Guesses from every start, with the tilts after them."""
     for start in range(0, max(1, len(recorded) - LOOK), every):
         scans = [scan.points for scan in recorded.scans(start, start + LOOK, STEP)]
         for angles in POSES[pose]:
@@ -85,7 +85,7 @@ def on_disk(recorded: ScanSequence, pose: str, every: int) -> Iterator[tuple[Gue
 
 
 def simulations(world: str, sensors: Sequence[str]) -> Iterator[Simulation]:
-    """A world's recordings with each sensor, upright in a hand."""
+    """Handheld upright recordings of a world with each sensor."""
     built = build_world(world, 0)
     caster = Caster(built)
     for sensor in sensors:
@@ -95,7 +95,7 @@ def simulations(world: str, sensors: Sequence[str]) -> Iterator[Simulation]:
 
 
 def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -> Iterator[tuple[Guess, float]]:
-    """The guesses from starts over the whole route, with the tilts after them."""
+    """Guesses from starts along the whole route, with the tilts after them."""
     for upright in made:
         for start in np.linspace(0, len(upright) - LOOK, starts + 1, dtype=int)[:-1].tolist():
             looks = range(start, start + LOOK, STEP)
@@ -110,7 +110,7 @@ def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -
 
 
 def mounted(upright: Simulation, R: FloatArray, looks: range) -> tuple[Iterator[FloatArray], FloatArray, FloatArray]:
-    """The scans of a sensor that is mounted so, no more turn, and upwards (3,) as recorded."""
+    """Scans of a sensor mounted with rotation R, the identity, and the up vector (3,) as recorded."""
     T = upright.T_body_lidar @ make_transform(R.T, np.zeros(3))
     simulation = replace(upright, T_body_lidar=T)
     vars(simulation)["_caster"] = upright._caster  # building one takes longer than the scans
@@ -119,14 +119,14 @@ def mounted(upright: Simulation, R: FloatArray, looks: range) -> tuple[Iterator[
 
 
 def guessed(scans: Iterable[FloatArray], R: FloatArray, up: FloatArray) -> tuple[Guess, float]:
-    """The guess from scans turned by R, with the tilt after it; upwards (3,) is before the turn."""
+    """Guess from scans rotated by R, with the tilt after it; the up vector (3,) is before the rotation."""
     guess = guess_mounting(points @ R.T for points in scans)
     after = transform_of(guess.mounting)[:3, :3] @ R @ up
     return guess, float(np.rad2deg(np.arccos(np.clip(after[2], -1.0, 1.0))))
 
 
 def matrix(angles: Sequence[float]) -> FloatArray:
-    """The rotation by roll, pitch and yaw."""
+    """Rotation matrix of roll, pitch and yaw."""
     return np.asarray(Rotation.from_euler("xyz", angles, degrees=True).as_matrix())
 
 

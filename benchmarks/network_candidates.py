@@ -1,11 +1,11 @@
-"""The network alone, before alignment: are its candidates right on real drives, at several rates?
+"""Accuracy of the network's candidates, before alignment, on real drives at several rates.
 
     python benchmarks/network_candidates.py DRIVE --weights base.safetensors tuned.safetensors --steps 1 3 5
 
-Prints a Markdown table, a row for each weights and step: the error of the best candidate's turn about z (median) and of
-its translation in the plane (median, 95th percentile, largest), and how often the best candidate, or any, is right:
-within 4 degrees and 0.8 m, from where alignment finds its way. The reference is the trajectory that mapping at constant
-velocity finds at full rate, or with `--truth` the recording's own.
+Prints a Markdown table with a row per weights and step: errors of the best candidate's turn about z (median) and of its
+translation in the plane (median, 95th percentile, largest), and how often the best candidate, or any, is right: within
+4 degrees and 0.8 m, from where alignment converges. The reference is the trajectory of scan-to-map registration at
+constant velocity and full rate, or with `--truth` the recording's ground truth.
 """
 
 from collections.abc import Sequence
@@ -28,8 +28,8 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("--weights", type=Path, nargs="+", required=True)
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 3, 5])
-    parser.add_argument("--scans", type=int, default=60, help="at most, at each step")
-    parser.add_argument("--truth", action="store_true", help="the reference is the recording's truth")
+    parser.add_argument("--scans", type=int, default=60, help="maximum at each step")
+    parser.add_argument("--truth", action="store_true", help="use the recording's ground truth as reference")
     options = parser.parse_args()
     recorded = with_truth(options.source) if options.truth else mapped(options.source)
     columns = ("recording", "every", "weights", "turn, deg: median", "translation, m: median", "95 %", "largest")
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def _errors(recorded: Recorded, step: int, most: int, weights: Path) -> list[FloatArray]:
-    """Errors (K, 2) of the candidates of each pair, the best first: degrees and metres."""
+    """Errors (K, 2) of the candidates of each pair, best first, in degrees and metres."""
     checkpoint = load_checkpoint(weights)
     imager, search = Imager(checkpoint.images), torch_search(network_of(checkpoint))
     poses = true_trajectory(recorded).T_world_lidar[::step][:most]

@@ -1,14 +1,13 @@
-"""Where the milliseconds of the learned odometry go, and its network beside DeLORA's in the same run.
+"""Time of the learned odometry by stage, and of its network compared with DeLORA's.
 
     python benchmarks/network_speed.py --threads 1 --sensors vlp-16 hdl-64e
     python benchmarks/network_speed.py --recordings KITTI/sequences/04 vlp16_loop --sensors os1-128 --scans 50
 
-Prints a table of networks, a pair of images of 16 x 720 each: medians of 30 repeats, wall time and processor time. A
-network is timed as it is used: what is kept of the scan before is not computed again. Then a table of stages, a column
-for each recording: processor milliseconds of the odometry's thread, without those of the stages inside, from scan to
-scan through the first `--scans` of the recording. Of five passes the shortest time of every scan and stage is
-taken, because other work on the machine only adds to it; then the mean over all scans. The sensors' recordings are
-simulated, a car in a street.
+Prints a table of networks, for a pair of images of 16 x 720 each: medians of 30 repeats, wall time and CPU time.
+Networks are timed as used: results kept from the previous scan are not computed again. Then a table of stages with a
+column per recording: CPU milliseconds of the odometry's thread, without the stages inside, over the first `--scans`
+scans. Of five passes, the shortest time of every scan and stage is used, because other load only adds to it, then the
+mean over all scans. The recordings of the sensors are simulated, with a car in a street.
 """
 
 import itertools
@@ -41,9 +40,9 @@ from lidarslam.odometry.registry import default_weights, make_odometry, shipped_
 from lidarslam.pipeline.threads import in_order
 
 SCANS = 12
-# Of the comparison of a pair, and passes through a recording.
+# Comparisons of a pair, and passes over a recording.
 _REPEATS, _ROUNDS = 30, 5
-# The first scan is not compared with any, and the second without a motion before.
+# The first scan has no pair, and the second no previous motion.
 _WARM_UP = 2
 
 _STAGES: dict[str, list[tuple[Any, str]]] = {
@@ -94,7 +93,7 @@ def main() -> None:
 
 
 def _networks(threads: int) -> list[tuple[str, Search, int]]:
-    """DeLORA's with its first weights, which takes as long as with trained ones, and the shipped one in two ways."""
+    """DeLORA's with initial weights, as fast as with trained ones, and the included one with two runtimes."""
     delora = make_network(NetworkConfig(name="delora")).eval()
     shipped = network_of(load_checkpoint(default_weights()))
     sizes = [sum(p.numel() for p in network.parameters()) for network in (delora, shipped)]
@@ -114,11 +113,11 @@ def _print_stages(recordings: dict[str, list[Scan]], threads: int) -> None:
     print(f"\n| stage, ms | {' | '.join(recordings)} |\n| --- |{' ---: |' * len(recordings)}")
     for stage in (*_STAGES, "rest"):
         print(f"| {stage} | {' | '.join(f'{times.get(stage, 0.0):.2f}' for times in found.values())} |")
-    print(f"| all of the odometry | {' | '.join(f'{sum(times.values()):.2f}' for times in found.values())} |")
+    print(f"| odometry, total | {' | '.join(f'{sum(times.values()):.2f}' for times in found.values())} |")
 
 
 def _stage_times(scans: Sequence[Scan], threads: int) -> dict[str, float]:
-    """Milliseconds a scan of each stage."""
+    """Milliseconds per scan of each stage."""
     passes = []
     for _ in range(_ROUNDS):
         odometry = make_odometry(OdometryConfig(method="learned", learned=LearnedConfig(threads=threads)))
@@ -143,7 +142,7 @@ def _stage_times(scans: Sequence[Scan], threads: int) -> dict[str, float]:
 
 
 def _timed(work: Callable[[], object]) -> tuple[float, float]:
-    """Median wall and processor milliseconds, after two rounds that do not count."""
+    """Median wall and CPU milliseconds, after two rounds that do not count."""
     walls, cpus = [], []
     for _ in range(_REPEATS + 2):
         wall, cpu = time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""Open3D's methods for the parts that the project has its own for."""
+"""Open3D's methods for steps that the project implements itself."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,21 +11,21 @@ from lidarslam.core.geometry import FloatArray, adjoint
 from lidarslam.mapping.loops.verification import CORRELATION, SubmapCloud
 
 POINT_TO_PLANE, GENERALISED, MULTI_SCALE = "point-to-plane ICP", "generalised ICP", "multi-scale ICP"
-# As many as `refine` fits planes to on both sides.
+# Number of planes that `refine` fits on both sides.
 _SOURCE_POINTS = 6000
 _PLANE_POINTS = 12
 _CRITERIA = (1e-6, 1e-6, 30)
 
 
 def planes_of(cloud: SubmapCloud) -> Any:
-    """The points of a submap on planes, with their normals."""
+    """Points of a submap on planes, with their normals."""
     made = _cloud(cloud.points[~cloud.is_line])
     made.normals = o3d.utility.Vector3dVector(cloud.axes[~cloud.is_line])
     return made
 
 
 def dense_clouds(target: FloatArray, source: FloatArray, kind: str) -> tuple[Any, Any]:
-    """Both with the normals that a method needs, the source with as many points as `refine` has residuals."""
+    """Both clouds with the normals that a method needs, the source with as many points as `refine` has residuals."""
     clouds = _cloud(target), _cloud(source)
     for cloud in clouds if kind == GENERALISED else clouds[:1]:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_PLANE_POINTS))
@@ -35,7 +35,7 @@ def dense_clouds(target: FloatArray, source: FloatArray, kind: str) -> tuple[Any
 def icp(
     kind: str, target: Any, source: Any, T: FloatArray, levels: Sequence[tuple[float, float]], cell_m: float
 ) -> FloatArray:
-    """`T_target_source` (4, 4), with gates and scales of the Geman-McClure kernel in cells, level after level."""
+    """`T_target_source` (4, 4); levels are gates and scales of the Geman-McClure kernel in cells."""
     if kind == MULTI_SCALE:
         return _multi_scale(target, source, T, levels, cell_m)
     module = o3d.pipelines.registration
@@ -71,7 +71,7 @@ def _multi_scale(
 
 
 def information(target: Any, source: Any, T: FloatArray, gate_m: float) -> FloatArray:
-    """(6, 6) of a motion from the right: Open3D's of the correspondences, with their variance and correlation."""
+    """(6, 6) of a perturbation from the right: Open3D's of the correspondences, with their variance and correlation."""
     module = o3d.pipelines.registration
     sums = module.get_information_matrix_from_point_clouds(source, target, gate_m, T)
     variance = module.evaluate_registration(source, target, gate_m, T).inlier_rmse ** 2 / 3.0
@@ -80,7 +80,7 @@ def information(target: Any, source: Any, T: FloatArray, gate_m: float) -> Float
 
 
 def match_features(target: FloatArray, source: FloatArray, cell_m: float, fast: bool) -> FloatArray:
-    """`T_target_source` (4, 4) by FPFH and RANSAC or fast global registration, radii as for the alignment of maps."""
+    """`T_target_source` (4, 4) by FPFH and RANSAC or fast global registration; radii as for the alignment of maps."""
     module, described = o3d.pipelines.registration, []
     for points in (source, target):
         cloud = _cloud(points).voxel_down_sample(cell_m)
@@ -122,7 +122,7 @@ def thinned_tensor(points: FloatArray, cell_m: float) -> FloatArray:
 
 
 def normals(points: FloatArray, neighbours: int, radius_m: float | None) -> FloatArray:
-    """Normals (N, 3) from the nearest points, within a radius where there is one."""
+    """Normals (N, 3) from the nearest points, within a radius if given."""
     cloud = _tensor_cloud(points)
     cloud.estimate_normals(neighbours, radius_m)
     return np.asarray(cloud.point.normals.numpy())
@@ -141,7 +141,7 @@ def cloud_distances(points: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def neighbours(points: FloatArray, others: FloatArray, radius_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the others within a radius of each point, in turn, and how many (N,) each has."""
+    """Indices of the others within a radius of each point, in order, and their number (N,) per point."""
     search = o3d.core.nns.NearestNeighborSearch(_tensor(others))
     search.fixed_radius_index(radius_m)
     found, _, splits = search.fixed_radius_search(_tensor(points), radius_m, False)

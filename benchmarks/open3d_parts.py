@@ -1,21 +1,22 @@
-"""Open3D's registration, global alignment, thinning, normals and neighbour searches beside our own, on the same input.
+"""Open3D's registration, alignment, thinning, normals and neighbour searches compared with ours, on the same input.
 
     python benchmarks/open3d_parts.py --worlds street office --recordings VLP16_DRIVE --scans KITTI/sequences/04
     python benchmarks/open3d_parts.py --worlds office --parts normals neighbours
 
-A lap and a third of a world with a VLP-16, at poses that drift by 1 % of the way and 2 degrees in 100 m, or a
-recording, whose reference is the trajectory of `learned+map`. Submaps and keyframes are those of the pose graph; the
-later keyframe of a pair revisits the place of the earlier. Milliseconds are of the processor, of all threads.
+The input is one and a third laps of a world with a VLP-16, at poses that drift by 1 % of the distance travelled and 2
+degrees per 100 m, or a recording, whose reference is the trajectory of `learned+map`. Submaps and keyframes are those
+of the pose graph; the later keyframe of a pair revisits the place of the earlier. Milliseconds are CPU time of all
+threads.
 
 - registration: sparse submaps, from the reference with an error of a tenth of the median range and of 0.1 rad in yaw,
-  by `register`, and by ICP of Open3D on the points on planes, with the same normals, gates and kernels;
-- refinement: dense submaps, from the verified pose, by `refine`, and by ICP of Open3D with the same gates, kernel and
-  number of residuals; NEES, 5.3 in the median for exact covariances, is with the same prior and drift for all;
+  by `register`, and by Open3D's ICP on the points on planes, with the same normals, gates and kernels;
+- refinement: dense submaps, from the verified pose, by `refine`, and by Open3D's ICP with the same gates, kernel and
+  number of residuals; NEES (median 5.3 for exact covariances) has the same prior and drift for all;
 - alignment: keyframes without a guess, by correlation of bird's-eye views, and by FPFH with RANSAC or fast global
   registration (FGR), before `register`; a pose is right within 0.5 m and 3 degrees;
-- relocalisation: a keyframe's scan in the map of those a loop's way before it, at an unknown heading; a place is right
-  within one and a half of the view's cells and 10 degrees, `any` is of all that are proposed;
-- thinning: the first scan of `--scans`, of a simulated street without, to cells of 0.25 m;
+- relocalisation: a keyframe's scan in the map of those at least a loop's length before it, at an unknown heading; a
+  place is right within one and a half of the view's cells and 10 degrees; `any` counts all proposals;
+- thinning: the first scan of each of `--scans`, by default of a simulated street, to cells of 0.25 m;
 - normals: of the map of all scans at the reference, against the nearest true surface;
 - neighbours: one half of that map's points in the other: distances to the nearest, and all within 0.3 m.
 """
@@ -122,7 +123,7 @@ _THINNING = ["points", "cells with a point, %", "ms"]
 
 
 def scans(paths: list[Path]) -> list[tuple[str, FloatArray]]:
-    """Names and points (N, 3) of the first scan of recordings, of a simulated street without any."""
+    """Names and points (N, 3) of the first scans of recordings, by default of a simulated street."""
     found = [(path.name, next(iter(open_recording(path).scans())).points) for path in paths]
     sensors = () if paths else ("hdl-64e", "vlp-16")
     made = [(sensor, make_simulation("street", "car", sensor, 1, 1).scan(0).scan.points) for sensor in sensors]

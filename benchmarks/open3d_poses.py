@@ -1,6 +1,6 @@
 """Poses of pairs of keyframes by our methods and by Open3D's: rows of the tables of `open3d_parts.py`.
 
-Keyframes, with the submaps around them, are those of simulated laps and of recordings; pairs are of one place.
+Keyframes and their submaps are from simulated laps and recordings; the keyframes of a pair are at the same place.
 """
 
 import time
@@ -40,9 +40,9 @@ _FINE = ((2.0, 0.3), (1.0, 0.3))
 _ICP = (theirs.POINT_TO_PLANE, theirs.GENERALISED, theirs.MULTI_SCALE)
 _FEATURES = {"FPFH, RANSAC": False, "FPFH, FGR": True}
 _FEATURE_CELLS = 2.0
-# Of a recording, at most.
+# Maximum per recording.
 _PAIRS = 20
-# As relocalisation asks for them.
+# As in relocalisation.
 _VIEW_CELLS, _VIEW_RANGES, _PLACES = 4.0, 3.0, 24
 
 
@@ -64,7 +64,7 @@ class Keyframes:
         return np.asarray(inverse(self.truth[first]) @ self.truth[second])
 
     def before(self, index: int) -> list[int]:
-        """Keyframes a loop's least way and more before one."""
+        """Keyframes at least a loop's minimum length before one."""
         way_m, least_m = self.database.track.way_m, max(10.0, 3.0 * self.database.submaps[index].range_m)
         return np.flatnonzero(way_m < way_m[index] - least_m).tolist()
 
@@ -75,7 +75,7 @@ class Keyframes:
         return points[one_per_cell(points, 0.5 * self.database.submaps[index].cell_m)]
 
     def dense(self, index: int, cell_m: float, max_range_m: float) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 3) of a submap and its two neighbours, as refinement has them, and their drift (6, 6)."""
+        """Points (N, 3) of a submap and its two neighbours, as in refinement, and their drift (6, 6)."""
         track = self.database.track
         around = range(max(0, index - 1), min(len(self.submaps), index + 2))
         parts = [(track.between(index, k), self.submaps[k]) for k in around]
@@ -84,7 +84,7 @@ class Keyframes:
 
 
 def simulated(world: str) -> Keyframes:
-    """A lap and a third with a VLP-16, at poses that drift."""
+    """One and a third laps with a VLP-16, at poses that drift."""
     lap = simulate(world, "car" if world == "street" else "handheld", seed=1)
     estimates = drifting(lap.truth, lap.way_m, 1.0, seed=1)
     return _keyframes(lap.name, list(lap.points()), lap.truth, estimates, lap.simulation)
@@ -133,7 +133,7 @@ def _keyframes(
 
 
 def timed(call: Callable[[], Any], repeats: int = 1) -> tuple[Any, float]:
-    """What a call returns, and its median milliseconds."""
+    """Result of a call, and its median CPU milliseconds."""
     times = []
     for _ in range(repeats):
         started = time.process_time()
@@ -143,7 +143,7 @@ def timed(call: Callable[[], Any], repeats: int = 1) -> tuple[Any, float]:
 
 
 def off(T: FloatArray | None, true: FloatArray) -> tuple[float, float]:
-    """How far a pose is off, in metres and degrees; half a turn and infinitely far where there is none."""
+    """Errors of a pose in metres and degrees; infinity and 180 degrees for none."""
     if T is None:
         return np.inf, 180.0
     error = inverse(true) @ T
@@ -158,7 +158,7 @@ def two(values: FloatArray, digits: int) -> str:
 def over_pairs(
     k: Keyframes, of_pair: Callable[[int, int], tuple[Calls, Callable[[Any], Sequence[float]]] | None]
 ) -> Iterator[tuple[str, FloatArray]]:
-    """Of every method (P, E + 1): what the judge says of each pair, and milliseconds."""
+    """(P, E + 1) of every method: the judge's errors of each pair, and milliseconds."""
     rows: dict[str, list[list[float]]] = {}
     for made in (of_pair(*pair) for pair in k.pairs):
         if made is None:

@@ -1,10 +1,10 @@
-"""Peers of `lidarslam compare` on scans in memory; each run is a process of its own. At which instants do poses stand?
+"""Instants of the poses of peers of `lidarslam compare`, on scans in memory; each run is a separate process.
 
     python benchmarks/peers.py --peers ct-icp genz-icp --world office --motion handheld
 
-Prints a Markdown table of the ATE in metres after SE(3) alignment, a row for each peer, on a simulated recording. A
-column says by how many milliseconds the stamps are shifted before the comparison with the exact truth; where the
-instants are right, the least error stands at zero.
+Prints a Markdown table of the ATE in metres after SE(3) alignment on a simulated recording, with a row per peer. The
+columns are shifts of the stamps before the comparison with the exact ground truth; where the instants are right, the
+error is smallest at zero.
 """
 
 import sys
@@ -21,7 +21,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 SHIFTS_MS = (-100, -50, -25, 0, 25, 50, 100)
-# Those that need no IMU.
+# Peers that need no IMU.
 NAMES = tuple(name for name, peer in PEERS.items() if not peer.needs_imu)
 
 
@@ -60,7 +60,7 @@ def main() -> None:
         except PeerError as error:
             print(f"{name}: {error}", file=sys.stderr, flush=True)
             continue
-        # The truth is exact within the recording.
+        # The ground truth is exact within the recording.
         inside = found.select((found.stamps > 0.1) & (found.stamps < simulation.stamps[-1] - 0.1))
         truths = [simulation.ground_truth_at(inside.stamps + 1e-3 * shift).T_world_lidar for shift in SHIFTS_MS]
         errors = [evaluate_trajectory(inside, Trajectory(inside.stamps, truth)).errors for truth in truths]

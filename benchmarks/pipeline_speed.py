@@ -1,18 +1,18 @@
-"""How long a whole run takes a scan, beside KISS-ICP's own loop and other peers on the same scans.
+"""Time of whole runs per scan, compared with KISS-ICP's own loop and other peers on the same scans.
 
     python benchmarks/pipeline_speed.py KITTI/sequences/04
     python benchmarks/pipeline_speed.py --simulate hdl-64e:street:car vlp-16:street:car os1-128:street:car --scans 100
     python benchmarks/pipeline_speed.py --simulate vlp-16:office:handheld --scans 400 --peers mad-icp small-gicp
 
-Methods are named as for `lidarslam compare`. Ours go through the pipeline of `lidarslam run`, each stage on a thread of
-its own; the global map, which the others do not make, is included, and for recordings so is reading the files.
-KISS-ICP's `register_frame` runs in a plain loop over scans in memory, in a process of its own, with its defaults, on as
-many threads as it likes; so do the peers (`pip install 'lidarslam[peers]'`), of which the registration alone is timed.
+Methods are named as for `lidarslam compare`. Ours run in the pipeline of `lidarslam run`, each stage on its own thread;
+the global map, which the others do not build, is included, and for recordings reading the files. KISS-ICP's
+`register_frame` runs in a plain loop over scans in memory, in a separate process, with its defaults and any number of
+threads; so do the peers (`pip install 'lidarslam[peers]'`), of which only the registration is timed.
 
-Methods take turns for `--rounds` rounds. Wall and processor time are over all scans but the first `--warm-up`, divided
-by their number; the ratio is to the KISS-ICP of the same round: its median, smallest and largest. The median and the
-99th percentile are of single scans: of ours the sum of the stages, which work on several scans at once; below the table
-is the median of each stage.
+Methods alternate for `--rounds` rounds. Wall and CPU time are over all scans but the first `--warm-up`, divided by
+their number; the ratio is to KISS-ICP in the same round: median, smallest and largest. The median and the 99th
+percentile are of single scans: of ours the sum of the stages, which work on several scans at once. The median of each
+stage follows the table.
 """
 
 import argparse
@@ -51,10 +51,10 @@ Scans = Callable[[], Iterable[Scan]]
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of one run after its first few scans."""
+    """Seconds of one run after its warm-up."""
 
     wall: float
-    processor: float  # of all threads; NaN where it cannot be separated from other work
+    processor: float  # CPU of all threads; NaN where it cannot be separated from other work
     scan_ms: list[float]  # of single scans
     stage_ms: dict[str, list[float]] = field(default_factory=dict)  # of the stages of ours, of single scans
 
@@ -80,12 +80,12 @@ def main() -> None:
 
 
 def _read(recording: Recording, count: int) -> Iterator[Scan]:
-    """The scans as a run reads them."""
+    """The scans as read by a run."""
     return prefetch(in_order(recording.scans(0, count)))
 
 
 def _measure(name: str, scans: Sequence[Scan], source: Scans, options: argparse.Namespace) -> None:
-    for method in options.methods:  # loops are compiled when they are first called on a machine
+    for method in options.methods:  # compiles loops
         _run_ours(method, scans[:_FEW], 1)
     with tempfile.TemporaryDirectory() as folder:
         file = _saved(scans, Path(folder))
@@ -132,7 +132,7 @@ def _run_ours(method: str, scans: Iterable[Scan], warm_up: int) -> Times:
         if len(results) == warm_up:
             clock = _clock()
     if pipeline.map.global_map is not None:
-        pipeline.map.global_map.points()  # what waits to be merged is part of the work
+        pipeline.map.global_map.points()  # merging the pending points is part of the work
     if graph is not None and pipeline.map.global_map is not None:
         optimised = graph.finish()
         assert optimised is not None
@@ -145,7 +145,7 @@ def _run_ours(method: str, scans: Iterable[Scan], warm_up: int) -> Times:
 
 
 def _saved(scans: Sequence[Scan], folder: Path) -> Path:
-    """The scans in a file, for processes of their own."""
+    """The scans in a file, for separate processes."""
     arrays: dict[str, NDArray[Any]] = {f"points_{i}": scan.points for i, scan in enumerate(scans)}
     none = np.empty(0)
     arrays |= {f"times_{i}": none if scan.time_offsets is None else scan.time_offsets for i, scan in enumerate(scans)}
@@ -156,26 +156,26 @@ def _saved(scans: Sequence[Scan], folder: Path) -> Path:
 
 
 def _run_kiss(file: Path, warm_up: int) -> Times:
-    """KISS-ICP's loop in a process of its own, where it has all the cores."""
+    """KISS-ICP's loop in a separate process, where it has all cores."""
     command = [sys.executable, str(Path(__file__).with_name("kiss_loop.py")), str(file), str(warm_up)]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return Times(**json.loads(printed.splitlines()[-1]))
 
 
 def _run_peer(name: str, file: Path, warm_up: int) -> Times:
-    """A peer's registration; its conversion of scans is not timed, and so its processor time is not known."""
+    """A peer's registration; its conversion of scans is not timed, so that its CPU time is unknown."""
     scan_ms = list(estimate(PEERS[name], saved_scans(file)).register_ms.values())[warm_up:]
     return Times(sum(scan_ms) / 1e3, float("nan"), scan_ms)
 
 
 def _clock() -> Timer:
-    """Tells wall and processor seconds since now."""
+    """Wall and CPU seconds since now."""
     wall, cpu = time.perf_counter(), time.process_time()
     return lambda: (time.perf_counter() - wall, time.process_time() - cpu)
 
 
 def saved_scans(file: Path) -> Iterator[Scan]:
-    """The scans of a file as of `_saved`."""
+    """The scans of a file of `_saved`."""
     arrays = np.load(file)
     for i, stamp in enumerate(arrays["stamps"].tolist()):
         times, rings = arrays[f"times_{i}"], arrays[f"rings_{i}"]

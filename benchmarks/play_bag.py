@@ -1,9 +1,9 @@
-"""A robot that is not there: the clouds of a ROS 2 bag over DDS, at a fixed rate, as `ros2 bag play` sends them.
+"""Simulated robot: publishes the clouds of a ROS 2 bag over DDS at a fixed rate, as `ros2 bag play` does.
 
     python benchmarks/play_bag.py RECORDING --topic /points [--domain 0] [--rate 10] [--restamp] [--pad 65536]
 
-Needs the extra `live`. Publishing begins when somebody subscribes. --restamp stamps each message with the time at which
-it is due, --pad fills clouds up with points at the origin, as organised clouds have where there is no return.
+Needs the extra `live`. Publishing begins with the first subscriber. --restamp stamps each message with its due time;
+--pad adds points at the origin, as organised clouds have without a return.
 """
 
 import argparse
@@ -25,29 +25,23 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 TYPE = "sensor_msgs/msg/PointCloud2"
-_STAMP_AT = 4  # behind the encapsulation
+_STAMP_AT = 4  # after the encapsulation
 
 
 @dataclass
 class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """A stamp."""
-
     sec: types.int32
     nanosec: types.uint32
 
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """Stamp and frame."""
-
     stamp: Time
     frame_id: str
 
 
 @dataclass
 class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
-    """A field of a point."""
-
     name: str
     offset: types.uint32
     datatype: types.uint8
@@ -71,7 +65,7 @@ class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
     raw = b""
 
     def serialize(self, *_: Any, **__: Any) -> bytes:
-        """The message, which is serialised already."""
+        """The message, which is already serialised."""
         return self.raw
 
 
@@ -84,7 +78,7 @@ def read_messages(recording: Path) -> Iterator[bytes]:
 
 
 def pad(raw: bytes, points: int) -> bytes:
-    """The cloud with points at the origin behind its own, up to a number of points in 64 rows."""
+    """The cloud padded with points at the origin to a number of points in 64 rows."""
     store = get_typestore(Stores.ROS2_JAZZY)
     cloud: Any = store.deserialize_cdr(raw, TYPE)
     data = np.zeros(points * cloud.point_step, np.uint8)
@@ -100,7 +94,7 @@ def stamped(raw: bytes, stamp_ns: int) -> bytes:
 
 
 def make_writer(topic: str, domain: int, is_reliable: bool) -> Any:
-    """Publishes clouds with the quality of service of sensor data, or reliably."""
+    """Writer of clouds with the quality of service of sensor data, or reliable."""
     participant = DomainParticipant(domain)
     reliability = Policy.Reliability.Reliable(duration(seconds=1)) if is_reliable else Policy.Reliability.BestEffort
     representation = Policy.DataRepresentation(use_cdrv0_representation=True)
@@ -109,17 +103,16 @@ def make_writer(topic: str, domain: int, is_reliable: bool) -> Any:
 
 
 def main() -> None:
-    """Play a bag."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--topic", default="/points")
     parser.add_argument("--domain", type=int, default=0)
-    parser.add_argument("--rate", type=float, default=10.0, help="messages a second")
-    parser.add_argument("--scans", type=int, help="the first so many")
+    parser.add_argument("--rate", type=float, default=10.0, help="messages per second")
+    parser.add_argument("--scans", type=int, help="number of scans")
     parser.add_argument("--restamp", action="store_true")
     parser.add_argument("--reliable", action="store_true")
     parser.add_argument("--pad", type=int, metavar="POINTS")
-    parser.add_argument("--linger", type=float, default=1.0, help="seconds before it leaves")
+    parser.add_argument("--linger", type=float, default=1.0, help="seconds before exit")
     given = parser.parse_args()
     messages = list(zip(range(given.scans or 10**9), read_messages(given.recording), strict=False))
     writer = make_writer(given.topic, given.domain, given.reliable)

@@ -1,11 +1,11 @@
-"""A robot's loop: scans come at a fixed rate, and `register_frame` has to keep up; beside KISS-ICP's.
+"""A robot's loop: scans arrive at a fixed rate, and `register_frame` has to keep up; compared with KISS-ICP.
 
     python benchmarks/python_loop.py RECORDING [--set odometry.method=constant-velocity] [--rate 10] [--scans 200]
 
-Each method runs in a process of its own, one after the other, over scans that are in memory. Printed are the time of a
-call, from the arrival of a scan to its pose (`late`: the scan had to wait for the one before), overruns (the pose came
-after the next scan), the errors of the poses as they were returned, and memory in the middle and at the end. KISS-ICP's
-poses belong to the end of a sweep and are compared there.
+Methods run one after the other, each in a separate process, over scans in memory. Printed are the time of a call; the
+time from the arrival of a scan to its pose (`late`, which includes waiting for the previous scan); overruns (poses
+later than the next scan); ATE of the poses as returned; memory in the middle and at the end. KISS-ICP's poses refer to
+the end of a sweep and are compared there.
 """
 
 import argparse
@@ -29,7 +29,7 @@ _WARM_UP = 3
 
 @dataclass(frozen=True, eq=False)
 class Paced:
-    """One method's loop; arrays have an entry a scan."""
+    """Result of one method; arrays have one entry per scan."""
 
     call_ms: FloatArray  # (N,) wall time of each call
     answer_ms: FloatArray  # (N,) from the arrival of a scan to its pose
@@ -42,7 +42,7 @@ Method = Callable[[list[lidarslam.Scan], float], Paced]
 
 
 def pace(register: Register, scans: list[lidarslam.Scan], period_s: float) -> Paced:
-    """Register each scan when it is due, or as soon as the one before is done."""
+    """Register each scan when it is due, or as soon as the previous one is done."""
     memory, process = [0.0, 0.0], psutil.Process()
     call_ms, answer_ms, poses = [], [], []
     begin = time.perf_counter() + period_s
@@ -61,7 +61,7 @@ def pace(register: Register, scans: list[lidarslam.Scan], period_s: float) -> Pa
 
 
 def run_slam(scans: list[lidarslam.Scan], period_s: float, settings: dict[str, str]) -> Paced:
-    """lidarslam's, with these settings."""
+    """Run lidarslam with these settings."""
     with lidarslam.Slam(settings) as warm:
         for scan in scans[:_WARM_UP]:
             warm.register_frame(scan)
@@ -72,7 +72,7 @@ def run_slam(scans: list[lidarslam.Scan], period_s: float, settings: dict[str, s
 
 
 def run_kiss_icp(scans: list[lidarslam.Scan], period_s: float) -> Paced:
-    """KISS-ICP's, with its defaults."""
+    """Run KISS-ICP with its defaults."""
     from kiss_icp.config.parser import load_config
     from kiss_icp.kiss_icp import KissICP
 
@@ -94,7 +94,6 @@ def run_kiss_icp(scans: list[lidarslam.Scan], period_s: float) -> Paced:
 
 
 def describe(paced: Paced, truth: lidarslam.Trajectory | None, period_s: float) -> str:
-    """One row of the table."""
     overruns = int((paced.answer_ms > 1e3 * period_s).sum())
     poses = lidarslam.Trajectory(paced.stamps, inverse(paced.T_world_lidar[0]) @ paced.T_world_lidar)
     error = "-"
@@ -111,8 +110,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--sequence")
-    parser.add_argument("--rate", type=float, default=10.0, help="scans a second")
-    parser.add_argument("--scans", type=int, help="the first so many")
+    parser.add_argument("--rate", type=float, default=10.0, help="scans per second")
+    parser.add_argument("--scans", type=int, help="number of scans")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of lidarslam")
     given = parser.parse_args()
     recording = lidarslam.open(given.recording, sequence=given.sequence, stop=given.scans)

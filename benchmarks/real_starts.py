@@ -1,24 +1,23 @@
-"""Every method from many starts of real recordings: does a run that ends well have the right trajectory?
+"""Every method from many starts of real recordings: do runs with exit status 0 have a correct trajectory?
 
     python benchmarks/real_starts.py 2011_09_26/2011_09_26_drive_0005_sync KITTI/sequences/04
     python benchmarks/real_starts.py RECORDING --steps 1 2 3 5 --every 20 --methods learned+map ct-icp --all
     python benchmarks/real_starts.py RECORDING --every 100000 --scans 1000 --yaws 0 30 60 --methods learned+map
 
-Prints a Markdown table, a row for each recording, method and scan step. A run takes `--scans` scans from each start,
-every `--every`-th scan of the recording; near the end of the recording it takes what is left, if that is half of it.
-With `--yaws`, our methods start again with the axes turned by each angle: the same points fall into other cells.
+Prints a Markdown table with a row per recording, method and scan step. Runs have `--scans` scans and begin at every
+`--every`-th scan of the recording; near its end they have what is left, if that is half of `--scans` or more. With
+`--yaws`, our methods run again with the axes turned by each angle: the same points fall into other cells.
 
 - worst, median ATE: metres, after SE(3) alignment, over the starts; with ground truth only;
-- worst start: the scan that the worst run starts at, by ATE, or by length where there is no truth;
-- worst length error: of the path's length against the truth's, without truth against KISS-ICP's, in % of the latter or
-  of 10 metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
-  whose truth is satellite navigation with errors of several percent over such short runs;
-- lost, degraded: scans, of all runs;
-- ok: runs that end with exit status 0;
-- ok but wrong: of these, the runs whose length is wrong by more than 3 %.
+- worst start: first scan of the worst run, by ATE, or by path length without ground truth;
+- worst length error: of the path length against ground truth, or without it against KISS-ICP's, in % of the latter or
+  of 10 metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings whose ground
+  truth is satellite navigation with errors of several percent over such short runs;
+- lost, degraded: scans of all runs;
+- exit 0: runs with exit status 0, and the number of these whose length is wrong by more than 3 %.
 
-Our methods and KISS-ICP run as `lidarslam run` does, with its exit status; for KISS-ICP that is `--no-mapping`, where
-each scan is held against the one before. Other peers know no status, and are ok when their process comes to its end.
+Our methods and KISS-ICP run as in `lidarslam run`, with its exit status; for KISS-ICP that is `--no-mapping`, where
+each scan is compared with the previous one. Other peers have no status; they count as 0 if their process completes.
 """
 
 import argparse
@@ -45,7 +44,7 @@ from lidarslam.evaluation.trajectory.alignment import associate
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.pipeline.threads import in_order
 
-# Methods that `lidarslam run` has, and the options that choose them.
+# Methods of `lidarslam run`, and their options.
 OPTIONS: dict[str, tuple[str, ...]] = {
     "learned+map": (),
     "learned+loam": ("--mapping", "loam"),
@@ -57,16 +56,16 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 METHODS = (*OPTIONS, *PEERS)
 DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "ct-icp")
 REFERENCE = "KISS-ICP"
-# The least length that errors of it are in % of; a run whose length is wrong by more is wrong.
+# Minimum length to which length errors are relative; limit of the length error.
 SHORTEST_M, WRONG_PERCENT = 10.0, 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Ended:
-    """A run that has ended."""
+    """A completed run."""
 
     trajectory: Trajectory | None
-    # lost, degraded: scans; None for a method that knows no status
+    # lost, degraded: scans; None for a method without a status
     lost: int | None
     degraded: int | None
     status: int  # exit status
@@ -75,7 +74,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Judged:
-    """A run from one start, beside the truth or the reference; None where that cannot be said."""
+    """A run from one start, evaluated by ground truth or the reference; None where unknown."""
 
     start: int
     scans: int
@@ -87,19 +86,19 @@ class Judged:
 
     @property
     def badness(self) -> float:
-        """What runs are ordered by."""
+        """Sorting key of runs."""
         value = self.length_error_percent if self.ate_m is None else self.ate_m
         return float("inf") if value is None else abs(value)
 
 
 def starts_of(scans: int, every: int, wanted: int, step: int) -> list[range]:
-    """The scans of each run; the first is there however short, others have half of what is wanted at the least."""
+    """The scans of each run; all but the first have at least half of the wanted number."""
     runs = [range(start, min(start + wanted * step, scans), step) for start in range(0, scans, every)]
     return [run for run in runs if run.start == 0 or 2 * len(run) >= wanted]
 
 
 def run_ours(method: str, source: Path, scans: range, yaw_deg: float = 0.0) -> Ended:
-    """A run as the command line makes it, with the axes turned by an angle."""
+    """A run of the command line, with the axes turned by an angle."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         where = ["--start", str(scans.start), "--stop", str(scans.stop), "--step", str(scans.step)]
@@ -124,7 +123,7 @@ def run_other(method: str, recording: Recording, scans: range) -> Ended:
 
 
 def judge(ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None) -> Judged:
-    """Hold a run against the truth, and the length of its path against that of another trajectory."""
+    """Evaluate a run by ground truth, and its path length by that of another trajectory."""
     trajectory = ended.trajectory
     ate_m = length_error_percent = None
     if trajectory is not None and of_length is not None:
@@ -135,7 +134,7 @@ def judge(ended: Ended, scans: range, truth: Trajectory | None, of_length: Traje
 
 
 def length_error(trajectory: Trajectory, reference: Trajectory) -> float:
-    """How much longer a path is than the reference's at the same instants, in percent."""
+    """Error of a path length relative to the reference at the same instants, in percent."""
     matched = associate(trajectory, reference)
     true_m = matched.reference.length_m
     return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, SHORTEST_M)
@@ -144,7 +143,7 @@ def length_error(trajectory: Trajectory, reference: Trajectory) -> float:
 def judged_runs(
     source: Path, recording: Recording, step: int, arguments: argparse.Namespace
 ) -> Iterator[tuple[str, Judged]]:
-    """Every method from every start, with its name."""
+    """Runs of every method from every start, with its name."""
     truth = recording.ground_truth
     methods = sorted(arguments.methods, key=lambda name: name != REFERENCE)
     uses_reference = truth is None or arguments.lengths_of == REFERENCE
@@ -172,7 +171,6 @@ def _report(text: str) -> None:
 
 
 def row(name: str, method: str, step: int, runs: Sequence[Judged]) -> list[str]:
-    """The cells of one method."""
     worst = max(runs, key=lambda run: run.badness)
     ates = [run.ate_m for run in runs if run.ate_m is not None]
     errors = [run.length_error_percent for run in runs if run.length_error_percent is not None]
@@ -208,7 +206,7 @@ def _total(counts: Sequence[int | None]) -> str:
 
 
 def print_starts(name: str, step: int, runs: dict[str, list[Judged]]) -> None:
-    """A table with a row for each run."""
+    """Print a table with a row per run."""
     print_header(["recording", "step", "method", "start", "scans", "ATE, m", "length, %", "lost", "degraded", "exit"])
     for method, judged in runs.items():
         for run in judged:
@@ -223,18 +221,16 @@ def main() -> None:
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=DEFAULT_METHODS)
     parser.add_argument("--steps", nargs="+", type=int, default=[1], help="take every n-th scan")
-    parser.add_argument("--every", type=int, default=10, help="scans from one start to the next")
-    parser.add_argument("--scans", type=int, default=50, help="of a run")
-    parser.add_argument(
-        "--lengths-of", choices=["truth", REFERENCE], default="truth", help="what lengths are held against"
-    )
+    parser.add_argument("--every", type=int, default=10, help="scans between starts")
+    parser.add_argument("--scans", type=int, default=50, help="per run")
+    parser.add_argument("--lengths-of", choices=["truth", REFERENCE], default="truth", help="reference of path lengths")
     parser.add_argument(
         "--yaws", nargs="+", type=float, default=[0.0], help="angles by which the axes are turned, degrees"
     )
-    parser.add_argument("--all", action="store_true", help="every run too")
+    parser.add_argument("--all", action="store_true", help="print every run, too")
     options = parser.parse_args()
     rows = []
-    logging.basicConfig(stream=sys.stderr, level=logging.ERROR)  # not to the streams of a run, which end with it
+    logging.basicConfig(stream=sys.stderr, level=logging.ERROR)  # not to a run's streams, which end with it
     for source in options.sources:
         recording = open_recording(source)
         for step in options.steps:
@@ -245,7 +241,8 @@ def main() -> None:
                 print_starts(recording.name, step, runs)
             rows += [row(recording.name, method, step, judged) for method, judged in runs.items()]
     header = ["recording", "step", "method", "starts", "worst ATE, m", "median ATE, m", "worst start"]
-    header += ["worst length error, %", "lost", "degraded", "ok", "ok but wrong"]
+    header += ["worst length error, %", "lost", "degraded", "exit 0"]
+    header += [f"of these, length wrong by more than {WRONG_PERCENT:g} %"]
     print_header(header)
     for cells in rows:
         print_row(cells)

@@ -1,15 +1,15 @@
-"""The slowest scans of scan-to-map registration where tracking is lost, with and without a budget of a scan.
+"""The slowest scans of scan-to-map registration where tracking is lost, with and without a time budget per scan.
 
     python benchmarks/scan_budget.py
     python benchmarks/scan_budget.py --faults carried --places office --budgets-ms 0 60
 
-Prints a Markdown table, a row for each fault, place and budget (`mapping.budget_ms`; 0: none), without an odometry:
+Prints a Markdown table with a row per fault, place and budget (`mapping.budget_ms`; 0: none), without an odometry:
 
-- median, p99, most: of the scans from the sixth on; one registration: the longest single one;
+- median, p99, max: of the scans from the sixth on; one registration: the longest single one;
 - lost: scans; back: scans from the end of the fault to the first that is not lost, and to the first that is ok;
-- off: of the last scan's position against the truth, in the world of the first scan.
+- off: error of the last scan's position, in the world of the first scan.
 
-Milliseconds are CPU time of the thread, and so is the clock of the budget here: other programs do not matter.
+Milliseconds are CPU time of the thread, as is the clock of the budget here, so that other programs have no effect.
 """
 
 import time
@@ -37,7 +37,7 @@ _SCANS, _AT, _WARM_UP = 150, 90, 5
 
 
 def recorded(fault: str, simulation: Simulation) -> Faulty:
-    """A recording with a fault in it."""
+    """A recording with a fault."""
     if fault == "covered":
         return covered(simulation, _AT, _AT + 20, "empty")
     if fault == "carried":
@@ -48,7 +48,7 @@ def recorded(fault: str, simulation: Simulation) -> Faulty:
 
 
 def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Iterator[list[str]]:
-    """The cells of each budget."""
+    """Rows of all budgets."""
     for budget_ms in budgets_ms:
         registration_ms = []
 
@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=list(_PLACES))
     parser.add_argument("--budgets-ms", nargs="+", type=float, default=[0.0, 100.0, 50.0])
     arguments = parser.parse_args()
-    header = ["fault", "place", "budget", "median", "p99", "most", "one registration"]
+    header = ["fault", "place", "budget", "median", "p99", "max", "one registration"]
     print_header([*header, "lost", "back: found", "back: ok", "off, m"])
     with threadpool_limits(1, "blas"):
         for place in arguments.places:

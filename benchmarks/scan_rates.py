@@ -1,16 +1,15 @@
-"""Scans farther and farther apart: every simulated world at 1, 2, 3 and 5 times the scan interval.
+"""Lower scan rates: every simulated world at 1, 2, 3 and 5 times the scan interval.
 
     python benchmarks/scan_rates.py
     python benchmarks/scan_rates.py RECORDING
     python benchmarks/scan_rates.py RECORDING --worlds office street --motions car --steps 1 5 --methods ct-icp
 
-Prints a Markdown table, a row for each recording and step: how far the sensor moves and turns from scan to scan (the
-95th percentile), and of each method the ATE in metres after SE(3) alignment with the scans that were lost and degraded.
-A failed peer is reported on standard error and in its cell; ct-icp itself has no status.
+Prints a Markdown table with a row per recording and step: translation and rotation of the sensor between scans (95th
+percentile), and for each method the ATE in metres after SE(3) alignment, with the lost and degraded scans. A failed
+peer is reported on standard error and in its cell; ct-icp has no status.
 
-Without recordings, all worlds are simulated. Simulated recordings go straight from the simulator into memory. At n
-times the scan interval every n-th scan is taken, each with all its points. `--scans` is for the single interval; of
-recordings on disk it is the most that are taken.
+Without recordings, all worlds are simulated, in memory. At n times the scan interval, every n-th scan is used, with all
+its points. `--scans` is for the single interval, and the maximum for recordings on disk.
 """
 
 import sys
@@ -39,12 +38,12 @@ from lidarslam.core.geometry import rotation_angle
 
 
 def every_nth(recorded: Recorded, step: int) -> Recorded:
-    """The recording with its scans `step` times as far apart."""
+    """The recording with every `step`-th scan."""
     return replace(recorded, scans=recorded.scans[::step])
 
 
 def result(method: str, recorded: Recorded) -> str:
-    """What a method makes of a recording."""
+    """Cell of a method."""
     if method in METHODS:
         return localise(recorded, METHODS[method]).text()
     try:
@@ -55,7 +54,6 @@ def result(method: str, recorded: Recorded) -> str:
 
 
 def row(recorded: Recorded, step: int, methods: Sequence[str]) -> list[str]:
-    """The cells of one recording at one step."""
     chosen = every_nth(recorded, step)
     motions = true_trajectory(chosen).relative_motions()
     moved_m = float(np.percentile(np.linalg.norm(motions[:, :3, 3], axis=1), 95.0))
@@ -74,7 +72,7 @@ def main() -> None:
     parser.add_argument("--steps", nargs="+", type=int, default=[1, 2, 3, 5], help="times the scan interval")
     parser.add_argument("--methods", nargs="+", choices=[*METHODS, *NAMES], default=[*DEFAULT_METHODS, "ct-icp"])
     options = parser.parse_args()
-    print_header(["recording", "step", "scans", "moved, m", "turned, deg", *options.methods])
+    print_header(["recording", "step", "scans", "moved per scan, m", "turned, deg", *options.methods])
     for recorded in recordings(options, options.scans):
         for step in options.steps:
             print_row(row(recorded, step, options.methods))

@@ -1,7 +1,7 @@
-"""Recordings in which tracking is hard: faults of a sensor in the field, and places without features.
+"""Recordings that are difficult to track: faults of a sensor in the field, and places without features.
 
-A sensor is covered, carried off, hemmed in by traffic, or scans are dropped; each fault takes a simulation and gives
-the scans with the truth about them. Along an even tunnel or an open plain the surfaces do not constrain the position.
+A sensor is covered, carried away or surrounded by traffic, or scans are dropped; each fault takes a simulation and
+returns the scans with ground truth. In an even tunnel or an open plain, surfaces do not constrain the position.
 """
 
 from collections.abc import Collection
@@ -24,7 +24,7 @@ Cover = Literal["empty", "near", "stray"]
 _NEAR_M = 0.3
 _STRAY_POINTS = 25
 _STRAY_M = 20.0
-# Ends of the even stretch on the x axis, of what is full of things before and behind it, and of the place.
+# Half width, height and thickness of the walls of the tunnel; extent of a place beyond the ends of the drive.
 _WIDE_M, _HIGH_M = 3.0, 4.5
 _THICK_M = 0.5
 _BEYOND_M = 60.0
@@ -32,16 +32,16 @@ _BEYOND_M = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Faulty:
-    """A recording with a fault in it."""
+    """A recording with a fault."""
 
-    scans: tuple[Scan, ...]  # N of them, stamps increasing
+    scans: tuple[Scan, ...]  # N, with increasing stamps
     truth: Trajectory  # T_world_lidar at their stamps
-    concerned: NDArray[np.bool_]  # (N,) the scans that the fault shows in; none where it lies between two scans
-    after: int  # the first scan for which all is well again
+    concerned: NDArray[np.bool_]  # (N,) scans affected by the fault; none where it is between two scans
+    after: int  # first scan after the fault
 
 
 def covered(simulation: Simulation, start: int, stop: int, cover: Cover, seed: int = 0) -> Faulty:
-    """Something lies over the sensor during scans `start` to `stop` - 1.
+    """The sensor is covered during scans `start` to `stop` - 1.
 
     It returns nothing, echoes from within 0.3 m all around, or a few stray points.
     """
@@ -64,21 +64,21 @@ def _cover(scan: Scan, cover: Cover, rng: np.random.Generator) -> Scan:
     return replace(few, points=rng.uniform(-_STRAY_M, _STRAY_M, (_STRAY_POINTS, 3)))
 
 
-# Longer than a sensor that was tracked is within reach of its motion.
+# Too long for a prediction from the motion.
 CARRYING_S = 1.2
 
 
-def carried_off(simulation: Simulation, at: int, goes_on_at: int, turned_deg: float = 0.0) -> Faulty:
-    """Lifted after scan `at` - 1, and set down where the simulation is at scan `goes_on_at`, turned about its z axis.
+def carried_off(simulation: Simulation, at: int, resume_at: int, turned_deg: float = 0.0) -> Faulty:
+    """Lifted after scan `at` - 1, and set down at the pose of scan `resume_at`, turned about the z axis.
 
-    Carrying takes a while, in which nothing is recorded; the recording goes on from there with noise of its own.
+    Nothing is recorded while the sensor is carried; the recording then continues with independent noise.
     """
     T_lidar_turned = exp(np.array([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0]))
     later = replace(simulation, T_body_lidar=simulation.T_body_lidar @ T_lidar_turned, seed=simulation.seed + 1)
-    count = min(len(simulation) - at, len(simulation) - goes_on_at)
+    count = min(len(simulation) - at, len(simulation) - resume_at)
     stamps = simulation.stamps[: at + count] + CARRYING_S * (np.arange(at + count) >= at)
-    there = [replace(later.scan(goes_on_at + k).scan, stamp=float(stamps[at + k])) for k in range(count)]
-    poses = [simulation.ground_truth.T_world_lidar[:at], later.ground_truth.T_world_lidar[goes_on_at:][:count]]
+    there = [replace(later.scan(resume_at + k).scan, stamp=float(stamps[at + k])) for k in range(count)]
+    poses = [simulation.ground_truth.T_world_lidar[:at], later.ground_truth.T_world_lidar[resume_at:][:count]]
     scans = (*simulation.scans(0, at), *there)
     concerned = np.zeros(len(scans), dtype=np.bool_)
     concerned[at] = True
@@ -86,14 +86,14 @@ def carried_off(simulation: Simulation, at: int, goes_on_at: int, turned_deg: fl
 
 
 def index_back(simulation: Simulation, index: int, distance_m: float) -> int:
-    """The scan, of those before `index`, whose place is nearest to so far from that of the scan before `index`."""
+    """The scan before `index` whose distance from scan `index` - 1 is closest to `distance_m`."""
     positions = simulation.ground_truth.positions
     away = np.linalg.norm(positions[:index] - positions[index - 1], axis=1)
     return int(np.abs(away - distance_m).argmin())
 
 
 def dropped(simulation: Simulation, missing: Collection[int]) -> Faulty:
-    """Some scans never came."""
+    """Some scans are missing."""
     kept = [index for index in range(len(simulation)) if index not in missing]
     scans = tuple(simulation.scan(index).scan for index in kept)
     after = sum(index < min(missing) for index in kept)
@@ -102,7 +102,7 @@ def dropped(simulation: Simulation, missing: Collection[int]) -> Faulty:
 
 
 def standing_still(position: FloatArray, yaw: float, sensor_height_m: float) -> Motion:
-    """A body that stays at a place (3,) on the ground."""
+    """A body at rest at a place (3,) on the ground."""
     base = np.zeros((3, len(CHANNELS)))
     base[:, :3], base[:, 5] = position, yaw
     return Motion("still", np.array([0.0, 1.0, 2.0]), base, sensor_height_m, repeats=False)
@@ -111,14 +111,14 @@ def standing_still(position: FloatArray, yaw: float, sensor_height_m: float) -> 
 def passing_by(
     place: FloatArray, yaw: float, size: FloatArray, beside_m: FloatArray, speed_mps: float, reach_m: float
 ) -> tuple[Mover, ...]:
-    """Boxes that go up and down beside a place (3,) on the ground, along a heading.
+    """Boxes that move back and forth beside a place (3,) on the ground, along a heading.
 
     Args:
-        place, yaw: where, and which way they go.
+        place, yaw: position and heading.
         size: (3,) length, width and height of each.
-        beside_m: (K,) how far to the left of the place each goes.
-        speed_mps: of each, some faster and some slower by up to a fifth.
-        reach_m: how far ahead and behind they turn back.
+        beside_m: (K,) lateral offset of each, to the left of the place.
+        speed_mps: of each, varied by up to a fifth.
+        reach_m: distance ahead and behind at which they turn back.
     """
     body = Boxes(np.array([[0.0, 0.0, 0.5 * size[2] + 0.1]]), 0.5 * size[None], np.eye(3)[None])
     ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
@@ -131,7 +131,7 @@ def passing_by(
 
 
 def even_tunnel(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> World:
-    """A straight tunnel along x, even from `begin_m` to `end_m`; before and behind that, niches and cabinets."""
+    """A straight tunnel along x, even from `begin_m` to `end_m`, with niches and cabinets before and after."""
     builder, middle, length = Builder(), 0.5 * length_m, length_m + 2.0 * _BEYOND_M
     for z in (-0.5 * _THICK_M, _HIGH_M + 0.5 * _THICK_M):
         builder.box((middle, 0.0, z), (length, 12.0, _THICK_M))
@@ -147,7 +147,7 @@ def even_tunnel(begin_m: float, end_m: float, length_m: float, seed: int = 0) ->
 
 
 def open_plain(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> World:
-    """Level ground without end; trunks and sheds stand before `begin_m` and behind `end_m` of the x axis."""
+    """Unlimited level ground, with trunks and sheds before `begin_m` and after `end_m` on the x axis."""
     side_m = 150.0
     cells = np.zeros((2 + int((length_m + 2 * side_m) / 10.0), 2 + int(2 * side_m / 10.0)))
     ground = HeightField(np.array([-side_m, -side_m]), 10.0, cells)
@@ -165,7 +165,7 @@ def open_plain(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> 
 
 
 def straight_drive(length_m: float, speed_mps: float, sensor_height_m: float) -> Trajectory:
-    """Along the x axis, at first and in between at three quarters of the speed, so that no speed goes on for ever."""
+    """Along the x axis, at a speed that varies between three quarters and all of `speed_mps`."""
     times = np.arange(0.0, 2.0 * length_m / speed_mps, 0.1)
     speed = speed_mps * (0.875 - 0.125 * np.cos(2.0 * np.pi * times / 8.0))
     speed *= np.clip(times / 4.0, 0.0, 1.0)
@@ -177,7 +177,7 @@ def straight_drive(length_m: float, speed_mps: float, sensor_height_m: float) ->
 
 
 def _places(rng: np.random.Generator, begin_m: float, end_m: float, length_m: float, apart_m: float) -> FloatArray:
-    """Where on the x axis things stand, unevenly."""
+    """Unevenly spaced positions of objects on the x axis."""
     spans = ((-_BEYOND_M, begin_m), (end_m, length_m + _BEYOND_M))
     return np.concatenate([rng.uniform(low, high, int((high - low) / apart_m)) for low, high in spans])
 

@@ -2,8 +2,8 @@
 
     python benchmarks/simulated_worlds.py
 
-Prints a Markdown table: ATE in metres after SE(3) alignment, and the length of the path. Nothing is written to disk;
-the scans go from the simulator through memory into the pipeline of `lidarslam run`.
+Prints a Markdown table: ATE in metres after SE(3) alignment, and the path length. The scans go in memory from the
+simulator to the pipeline of `lidarslam run`; nothing is written to disk.
 """
 
 from mapping_accuracy import add_simulation_arguments, make_parser, print_header, print_row, run_kiss, simulate

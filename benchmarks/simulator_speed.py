@@ -1,8 +1,8 @@
-"""How fast the simulator makes sweeps: milliseconds each, and how many times faster than the sensor itself.
+"""Speed of the simulator: milliseconds per sweep, and the factor over real time.
 
     python benchmarks/simulator_speed.py --world tunnel --motion tracked
 
-Real time is a factor of 1. What is wanted on two cores: 1 or more for vlp-16, 0.2 or more for os1-128.
+A factor of 1 is real time. Targets on two cores: 1 or more for vlp-16, 0.2 or more for os1-128.
 """
 
 import time
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--motion", default="handheld", choices=CARRIERS)
     options = parser.parse_args()
     world = build_world(options.world, 0)
-    print(f"{'sensor':10}{'rays':>10}{'points':>10}{'ms a sweep':>12}{'factor':>8}")
+    print(f"{'sensor':10}{'rays':>10}{'points':>10}{'ms/sweep':>12}{'factor':>8}")
     for name in _SENSORS:
         simulation = in_world(world, options.motion, name, _SCANS + 1, 0)
         sensor = simulation.sensor

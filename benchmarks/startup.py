@@ -1,12 +1,11 @@
-"""Time from the command to the first scan's result: on a machine's first run, on later ones, and of KISS-ICP.
+"""Time from the command to the first scan's result: first run on a machine, later runs, and KISS-ICP.
 
     python benchmarks/startup.py KITTI --sequence 04
     python benchmarks/startup.py office.mcap --runs 5
 
-Each program runs in processes of its own, on two scans; times are wall times from the start of the process, the median
-of the later runs. `first run` is one with an empty folder for compiled code. KISS-ICP is its own pipeline with the
-loader that it chooses for the source. The first process of each program is not counted: it brings the files of the
-libraries into memory.
+Each program runs in separate processes, on two scans; times are wall times from the start of the process, the median of
+the later runs. `first run` has an empty folder for compiled code. KISS-ICP is its own pipeline with the loader that it
+chooses for the source. The first process of each program does not count: it reads the libraries from disk.
 """
 
 import argparse
@@ -23,7 +22,7 @@ BEGUN = "LIDARSLAM_BENCHMARK_BEGUN"
 
 
 def run_ours(source: Path, sequence: str | None) -> None:
-    """`lidarslam run`, with a note of the time at the first scan."""
+    """`lidarslam run`, with the time of the first scan."""
     from lidarslam.cli import main
     from lidarslam.run import progress
 
@@ -67,7 +66,7 @@ def run_kiss(source: Path, sequence: str | None) -> None:
 
 
 def _now() -> tuple[float, float]:
-    """Seconds since the process began, and of processor time."""
+    """Wall seconds since the process began, and CPU seconds."""
     times = os.times()
     cpu_s = times.user + times.system + times.children_user + times.children_system
     return time.time() - float(os.environ[BEGUN]), cpu_s
@@ -78,7 +77,7 @@ def _report(first: tuple[float, float], *_: tuple[float, float]) -> None:
 
 
 def measure(program: str, source: Path, sequence: str | None, compiled: str) -> list[float]:
-    """Of a process of its own, to the first scan and to the end of two: seconds, and seconds of processor time."""
+    """Wall and CPU seconds of a separate process, to the first scan and to the end of two."""
     chosen = [] if sequence is None else ["--sequence", sequence]
     command = [sys.executable, __file__, str(source), *chosen, "--only", program]
     environment = os.environ | {"NUMBA_CACHE_DIR": compiled, BEGUN: repr(time.time())}
@@ -100,7 +99,8 @@ def main() -> None:
     if options.only is not None:
         (run_ours if options.only == "ours" else run_kiss)(*chosen)
         return
-    print("| program | first scan, s | processor time | two scans, s | processor time |\n|---|---:|---:|---:|---:|")
+    print("| program | first scan, s | processor time, s | two scans, s | processor time, s |")
+    print("|---|---:|---:|---:|---:|")
     with tempfile.TemporaryDirectory() as warm, tempfile.TemporaryDirectory() as empty:
         measure("ours", *chosen, warm)
         _print("lidarslam run, first run", [measure("ours", *chosen, empty)])

@@ -1,20 +1,19 @@
-"""What becomes of tracking when something goes wrong, beside KISS-ICP on the same scans.
+"""Tracking under faults, compared with KISS-ICP on the same scans.
 
     python benchmarks/tracking_faults.py
     python benchmarks/tracking_faults.py --faults carried traffic --places office
 
-Prints a Markdown table, a row for each fault, place and method. Every recording is simulated in memory, the fault in
-its midst, and goes through the pipeline of `lidarslam run` with its defaults. The world is that of the first scan, so
-that errors are those of the poses as they come, without any alignment:
+Prints a Markdown table with a row per fault, place and method. Every recording is simulated in memory, with the fault
+in the middle, and processed by the pipeline of `lidarslam run` with its defaults. The world is that of the first scan,
+and errors are those of the poses as registered, without alignment:
 
-- concerned: of the scans that the fault shows in, how many are reported lost and degraded;
-- elsewhere: of all others, the same;
-- believed and wrong: scans with status ok whose position is off by more than 0.2 m;
-- worst, after: the largest error of the scans from ten after the end of the fault, whatever their status;
-- shape, after: RMS error of the same scans, after SE(3) alignment of them alone;
-- polluted: share of the points of the map farther than 0.2 m from every true surface, when the map is laid on the truth
-  by the true pose of the first scan. The map is without what was seen through, as `lidarslam run` writes it, unless
-  `--keep-moved` asks for all.
+- concerned: lost and degraded scans among those affected by the fault;
+- elsewhere: lost and degraded scans among all others;
+- ok but wrong: scans with status ok whose position is off by more than 0.2 m;
+- worst, after: the largest error from the tenth scan after the fault on, whatever the status;
+- shape, after: RMSE of the same scans, after SE(3) alignment of these alone;
+- polluted: share of the map's points farther than 0.2 m from all true surfaces, when the map is aligned with the ground
+  truth by the true pose of the first scan. Moved points are removed, as by `lidarslam run`, except with `--keep-moved`.
 """
 
 import argparse
@@ -55,10 +54,10 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world
 
 _POLLUTED_M, _WRONG_M = 0.2, 0.2
-# The first scans after a fault may still be on their way back.
+# Scans after a fault in which tracking may still recover.
 _BACK_AFTER = 10
 
-# World, sensor, carrier, scans; where the fault begins.
+# World, sensor, carrier, number of scans; first scan of the fault.
 _PLACES = {
     "office": ("office", "vlp-16", "tracked", 150, 90),
     "tunnel": ("tunnel", "vlp-16", "legged", 150, 90),
@@ -69,7 +68,7 @@ _PLACES = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A recording with a fault, and how far points are from the true surfaces of its world."""
+    """A recording with a fault, and the distance of points from the true surfaces of its world."""
 
     fault: str
     place: str
@@ -77,8 +76,8 @@ class Case:
     distances: Callable[[FloatArray], FloatArray]
 
 
-def on_the_way(place: str, kind: str) -> Iterator[Case]:
-    """Faults of a kind that befall a sensor on its way through a world."""
+def in_motion(place: str, kind: str) -> Iterator[Case]:
+    """Faults of a kind during motion through a world."""
     world, sensor, carrier, scans, at = _PLACES[place]
     simulation = make_simulation(world, carrier, sensor, scans, 0)
     name = f"{world}, {sensor}, {carrier}"
@@ -117,7 +116,7 @@ _FAULTS: dict[str, Callable[[Simulation, int], Iterator[tuple[str, Faulty]]]] = 
 
 
 def _still(place: str, scans: int, crowded: bool) -> Case:
-    """Standing where the carrier begins; crowded by vehicles outdoors and by people indoors."""
+    """At rest where the carrier begins; crowded by vehicles outdoors and by people indoors."""
     world_name, sensor, carrier, _, _ = _PLACES[place]
     moving = make_simulation(world_name, carrier, sensor, 1, 0)
     T_world_body = moving.motion.pose_at(np.zeros(1))[0]
@@ -139,7 +138,7 @@ def _still(place: str, scans: int, crowded: bool) -> Case:
 
 
 def _featureless(kind: str) -> Case:
-    """From structure through nothing to structure."""
+    """From structure through a featureless stretch to structure."""
     begin_m, end_m, length_m = 20.0, 95.0, 120.0
     world = (even_tunnel if kind == "tunnel" else open_plain)(begin_m, end_m, length_m)
     motion = motion_along(straight_drive(length_m, 5.0, 1.5))
@@ -152,11 +151,11 @@ def _featureless(kind: str) -> Case:
     nothing = (x > begin_m + reach_m) & (x < end_m - reach_m)
     after = int(np.flatnonzero(x > end_m)[0])
     recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, nothing, after)
-    return Case("nothing to see for 25 m", f"{world.name}, vlp-16", recorded, simulation.distance_to_surfaces)
+    return Case("featureless for 25 m", f"{world.name}, vlp-16", recorded, simulation.distance_to_surfaces)
 
 
 def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
-    """A recording through the pipeline: the results, and the points (M, 3) of the map."""
+    """Results of the pipeline, and the points (M, 3) of the map."""
     with closing(open_odometry(config, None)) as odometry:
         pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
         results = list(pipeline.run(case.recorded.scans))
@@ -168,7 +167,6 @@ def run(case: Case, config: Config) -> tuple[list[ScanEstimate], FloatArray]:
 
 
 def row(case: Case, name: str, keep_moved: bool) -> list[str]:
-    """The cells of one method on one recording."""
     kept = GlobalMapConfig(leave_out_moved=not keep_moved)
     results, points = run(case, METHODS[name].model_copy(update={"global_map": kept}))
     recorded, truth = case.recorded, case.recorded.truth.T_world_lidar
@@ -182,14 +180,14 @@ def row(case: Case, name: str, keep_moved: bool) -> list[str]:
     shape = evaluate_trajectory(estimate, Trajectory(truth_stamps, truth[after])).errors.ate_rmse_m
     polluted = case.distances(transform_points(truth[0], points)) > _POLLUTED_M
     there, elsewhere = status[recorded.concerned], status[~recorded.concerned]
-    believed = (status == Status.OK.value) & (distance > _WRONG_M)
+    wrong = (status == Status.OK.value) & (distance > _WRONG_M)
     return [
         case.fault,
         case.place,
         name,
         _counts(there),
         _counts(elsewhere),
-        str(int(believed.sum())),
+        str(int(wrong.sum())),
         f"{distance[after].max():.3f} m, {angle[after].max():.2f} deg",
         f"{shape:.3f}",
         f"{100.0 * polluted.mean():.2f}" if len(points) else "no map",
@@ -202,7 +200,7 @@ def _counts(status: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> str:
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
-    """What is asked for, one recording in memory at a time."""
+    """The chosen cases, one recording in memory at a time."""
     for kind in arguments.faults:
         if kind == "featureless":
             yield from map(_featureless, ("tunnel", "plain"))
@@ -211,7 +209,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
             if kind in ("traffic", "still"):
                 yield _still(place, 200, kind == "traffic")
             else:
-                yield from on_the_way(place, kind)
+                yield from in_motion(place, kind)
 
 
 def main() -> None:
@@ -220,9 +218,9 @@ def main() -> None:
     parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=["office", "tunnel", "street"])
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=DEFAULT_METHODS)
-    parser.add_argument("--keep-moved", action="store_true", help="what was seen through stays in the map")
+    parser.add_argument("--keep-moved", action="store_true", help="keep moved points in the map")
     arguments = parser.parse_args()
-    header = ["fault", "place", "method", "concerned", "elsewhere", "believed and wrong", "worst, after"]
+    header = ["fault", "place", "method", "concerned", "elsewhere", "ok but wrong", "worst, after"]
     header += ["shape, after, m", "polluted, %"]
     print_header(header)
     for case in cases(arguments):
