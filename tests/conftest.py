@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp
@@ -30,6 +30,14 @@ os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.envir
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 
+Drive = Callable[[FloatArray], FloatArray]
+
+
+def fuzzed(examples: int) -> settings:
+    """Examples that follow from the test's name alone, so that a failure is found again."""
+    unimportant = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    return settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=unimportant)
+
 
 def lidarslam(*arguments: object) -> Result:
     """A command, carried out in this process."""
@@ -47,7 +55,6 @@ def succeeds(*arguments: object) -> str:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """A seeded source of random numbers."""
     return np.random.default_rng(2021)
 
 
@@ -129,7 +136,7 @@ class Room:
             distance = np.minimum(distance, np.abs(beside))
         return distance
 
-    def sweep(self, T_room_lidar_at: Callable[[FloatArray], FloatArray], stamp: float, stamp_at: float = 0.5) -> Scan:
+    def sweep(self, T_room_lidar_at: Drive, stamp: float, stamp_at: float = 0.5) -> Scan:
         """A rolling sweep: every ray is cast from the pose (N, 4, 4) at its own time (N,).
 
         `stamp_at` says where in the sweep the stamp lies: 0 at its start, 1 at its end.
@@ -138,9 +145,7 @@ class Room:
         offsets = (fraction - stamp_at) * self.period_s
         return Scan.from_raw(self._measured(T_room_lidar_at, directions, stamp + offsets), stamp, offsets)
 
-    def ring_sweep(
-        self, T_room_lidar_at: Callable[[FloatArray], FloatArray], stamp: float, rings: int = 32, columns: int = 480
-    ) -> Scan:
+    def ring_sweep(self, T_room_lidar_at: Drive, stamp: float, rings: int = 32, columns: int = 480) -> Scan:
         """A sweep of a scanner with rings, column after column, clockwise from behind, stamped in its middle."""
         offsets = ((np.arange(columns) + 0.5) / columns - 0.5).repeat(rings)
         elevation, azimuth = np.tile(np.deg2rad(np.linspace(-28.0, 28.0, rings)), columns), -2.0 * np.pi * offsets
@@ -149,18 +154,14 @@ class Room:
         points = self._measured(T_room_lidar_at, np.stack(rays, axis=-1), stamp + times)
         return Scan.from_raw(points, stamp, times, np.tile(np.arange(rings), columns))
 
-    def _measured(
-        self, T_room_lidar_at: Callable[[FloatArray], FloatArray], directions: FloatArray, times: FloatArray
-    ) -> FloatArray:
+    def _measured(self, T_room_lidar_at: Drive, directions: FloatArray, times: FloatArray) -> FloatArray:
         """Points (N, 3) along directions (N, 3) of the LiDAR frame, each from the pose at its own time (N,)."""
         T = T_room_lidar_at(times)
         ranges = self.cast(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], directions))
         return directions * ranges[:, None]
 
 
-def write_recording(
-    folder: Path, scans: Iterable[Scan], truth: Trajectory | None = None, is_timed: bool = False
-) -> Path:
+def write_recording(folder: Path, scans: Iterable[Scan], truth: Trajectory | None = None, is_timed=False) -> Path:
     """Scans as .npy files, on request with times and rings of their points; their stamps, and the ground truth."""
     folder.mkdir()
     stamps = []
@@ -191,12 +192,11 @@ def write_run(folder: Path, trajectory: Trajectory, cloud: PointCloud | None = N
 
 @pytest.fixture(scope="session")
 def room() -> Room:
-    """The room."""
     return Room()
 
 
 @pytest.fixture(scope="session")
-def drive() -> Callable[[FloatArray], FloatArray]:
+def drive() -> Drive:
     """A smooth path through the room: poses (N, 4, 4) at times (N,); about 0.8 m/s, turning 17 degrees a second."""
 
     def T_room_lidar_at(time: FloatArray) -> FloatArray:
@@ -207,14 +207,14 @@ def drive() -> Callable[[FloatArray], FloatArray]:
 
 
 @pytest.fixture(scope="session")
-def room_truth(drive: Callable[[FloatArray], FloatArray]) -> Trajectory:
+def room_truth(drive: Drive) -> Trajectory:
     """The true poses at the stamps of `room_scans`."""
     stamps = 0.1 * np.arange(1, 21)
     return Trajectory(stamps, drive(stamps))
 
 
 @pytest.fixture(scope="session")
-def room_scans(room: Room, drive: Callable[[FloatArray], FloatArray], room_truth: Trajectory) -> list[Scan]:
+def room_scans(room: Room, drive: Drive, room_truth: Trajectory) -> list[Scan]:
     """Twenty rolling sweeps along the drive, stamped in their middle."""
     return [room.sweep(drive, float(stamp)) for stamp in room_truth.stamps]
 
@@ -234,5 +234,4 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def through_disk(tmp_path: Path) -> Callable[[State], Saved]:
-    """Writes a state and reads it back."""
     return lambda state: (write_state(tmp_path / "state.npz", state), read_state(tmp_path / "state.npz"))[1]

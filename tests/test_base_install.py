@@ -1,4 +1,4 @@
-"""The commands without the extra `train`: its libraries are hidden behind modules that are not found."""
+"""The commands without the extras `train` and `live`: their libraries are hidden behind modules that are not found."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 
 from lidarslam.odometry.registry import default_weights
 
-HIDDEN = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript")
+HIDDEN = ("torch", "tensorboard", "safetensors", "onnx", "onnxscript", "cyclonedds")
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +61,9 @@ def test_every_command_but_training_and_export_does_without(base_install, tmp_pa
         (["export", "--out", "exported"], "an export"),
         (["run", "scans", "--out", "run", "--weights", str(default_weights())], "a file of weights"),
         (["run", "scans", "--out", "run", "--set", "odometry.learned.device=cuda"], "odometry.learned.device=cuda"),
+        (["live", "--out", "run"], "live"),
     ],
-    ids=["train", "export", "weights", "accelerator"],
+    ids=["train", "export", "weights", "accelerator", "live"],
 )
 def test_what_needs_the_extra_says_so_in_one_line(arguments, purpose, base_install, tmp_path):
     scans = tmp_path / "scans"
@@ -71,8 +72,9 @@ def test_what_needs_the_extra_says_so_in_one_line(arguments, purpose, base_insta
         (scans / f"{number}.bin").write_bytes(b"\x00\x00\x80\x3f" * 4 * 500)
     done = run(["-m", "lidarslam", *arguments], base_install, tmp_path)
     (line,) = done.stderr.splitlines()
-    assert f"torch is not installed, which {purpose} needs; pip install 'lidarslam[train]'" in line
-    assert "CPU build" in line
+    library, extra = ("cyclonedds", "live") if purpose == "live" else ("torch", "train")
+    assert f"{library} is not installed, which {purpose} needs; pip install 'lidarslam[{extra}]'" in line
+    assert ("CPU build" in line) == (extra == "train")
     assert done.returncode == 1
     assert not (tmp_path / "trained").exists()
     assert not (tmp_path / "exported").exists()

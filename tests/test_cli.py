@@ -103,14 +103,10 @@ def test_mistakes_get_one_line(recording, tmp_path, arguments, status, message):
     assert not places["out"].exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "method"),
-    [
-        (["--mapping"], "surfels"),
-        (["--mapping", "loam"], "loam"),
-        (["--set", "mapping.method=loam", "--no-mapping"], "off"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "method"), [
+    (["--mapping"], "surfels"), (["--mapping", "loam"], "loam"),
+    (["--set", "mapping.method=loam", "--no-mapping"], "off"),
+])  # fmt: skip
 def test_the_mapping_is_chosen_on_the_command_line(recording, arguments, method):
     context = run.make_context("run", [str(recording), *arguments, "--out", "run"])
     assert take_config(context.params, recording).mapping.method == method
@@ -217,15 +213,10 @@ def test_verbose_says_what_is_chosen_before_the_command_or_after(recording, tmp_
     assert not caplog.records
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("run --mapping ", ["plain surfels", "plain loam", "plain off"]),
-        ("run -c ind", ["file ind", "plain indoor"]),
-        ("compare --benchmark sim", ["file sim", "plain simulated"]),
-        ("run x -o r", ["file r"]),
-    ],
-)
+@pytest.mark.parametrize(("line", "expected"), [
+    ("run --mapping ", ["plain surfels", "plain loam", "plain off"]), ("run -c ind", ["file ind", "plain indoor"]),
+    ("compare --benchmark sim", ["file sim", "plain simulated"]), ("run x -o r", ["file r"]),
+])  # fmt: skip
 def test_words_are_completed(line, expected):
     *words, last = line.split(" ")
     completions = BashComplete(main, {}, "lidarslam", "_LIDARSLAM_COMPLETE").get_completions(words, last)

@@ -124,17 +124,12 @@ def test_a_number_is_decimal_or_a_text(text):
     assert parse_yaml(f"'{text}'") == text
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a: {b: 1, b: 2}", "the key 'b' occurs twice"),
-        ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
-        ("a: 2021-13-45", "not YAML: month must be"),
-        ("a: " + "[" * 3_000 + "]" * 3_000, "not YAML: maximum recursion"),
-        ("a: \x00", "not YAML"),
-        ("? [a]\n: 1", "unhashable key"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("a: {b: 1, b: 2}", "the key 'b' occurs twice"),
+    ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
+    ("a: 2021-13-45", "not YAML: month must be"), ("a: " + "[" * 3_000 + "]" * 3_000, "not YAML: maximum recursion"),
+    ("a: \x00", "not YAML"), ("? [a]\n: 1", "unhashable key"),
+])  # fmt: skip
 def test_anything_else_is_an_error_in_one_line(text, message):
     with pytest.raises(YamlError, match=message) as raised:
         parse_yaml(text)

@@ -16,7 +16,7 @@ from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_kitti_poses, read_tum
-from lidarslam.pipeline.estimates import STAGES, ScanEstimate
+from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.storage.directory import FILES, MAPS
@@ -24,18 +24,12 @@ from lidarslam.storage.finished_run import load_run
 
 from .conftest import write_recording
 
-KISS_ICP = [
-    "odometry.method=kiss-icp",
-    "mapping.method=off",
-    "odometry.kiss_icp.voxel_size_m=0.2",
-    "odometry.kiss_icp.max_range_m=30",
-    "global_map.voxel_size_m=0.1",
-]
 MAPPING = ["global_map.voxel_size_m=0.1"]
 KITTI = ["odometry.method=kiss-icp", "mapping.method=off"]
+KISS_ICP = [*KITTI, *MAPPING, "odometry.kiss_icp.voxel_size_m=0.2", "odometry.kiss_icp.max_range_m=30"]
 
 
-def quiet(number: int, total: int, result: ScanEstimate) -> None:
+def quiet(*_: object) -> None:
     """No progress bar."""
 
 
@@ -104,9 +98,7 @@ def test_what_config_yaml_says_gives_the_same_run_again(recording, tmp_path):
     np.testing.assert_allclose(first.T_world_lidar, second.T_world_lidar, atol=1e-6)
 
 
-def test_by_default_scans_are_laid_on_the_map_and_a_pose_graph_is_built_when_it_is_asked_for(
-    recording, tmp_path, room, room_truth
-):
+def test_by_default_scans_are_laid_on_a_map_and_a_pose_graph_is_built_on_request(recording, tmp_path, room, room_truth):
     """The room is too small for a loop: what the map said stays, and the map drawn from submaps is as exact."""
     out = tmp_path / "run"
     settings = (*MAPPING, "pose_graph.enabled=true", "pose_graph.keyframes.distance_m=0.4")

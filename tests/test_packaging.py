@@ -16,7 +16,6 @@ REPOSITORY = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
-    """The wheel of the source distribution."""
     folder = tmp_path_factory.mktemp("built")
     build = [sys.executable, "-m", "hatchling", "build", "--directory", str(folder)]
     subprocess.run([*build, "--target", "sdist"], cwd=REPOSITORY, check=True, capture_output=True, timeout=120)

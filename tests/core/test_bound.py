@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.core.tasks import bound
-
 ROOT = Path(__file__).parents[2]
 SLEEP = "import time; time.sleep(60)"
 # Print its own process and that of its child, and sleep.
@@ -54,26 +52,13 @@ time.sleep(60)
 @pytest.mark.parametrize("killed_by", [signal.SIGKILL, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
 @pytest.mark.parametrize("code", [SUPERVISED, COMPILING, KISS], ids=["supervised", "compiling", "kiss"])
 def test_who_is_killed_leaves_no_process_behind(code, killed_by, still_runs):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    paths = os.environ | {"PYTHONPATH": str(ROOT)}
     # Under nohup, a hang-up would be ignored.
     start = "import os, signal, sys, time; signal.signal(signal.SIGHUP, signal.SIG_DFL)"
     command = [sys.executable, "-c", f"{start}\n{code}"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
-    ) as parent:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=paths, start_new_session=True) as parent:
         children = [int(word) for word in parent.stdout.readline().split()]
         assert children
         time.sleep(0.2)  # until it is watched
         parent.send_signal(killed_by)
     assert not [child for child in children if still_runs(child)]
-
-
-def test_a_process_and_its_children_end_with_the_context(still_runs):
-    with (
-        subprocess.Popen(
-            [sys.executable, "-c", FAMILY], stdout=subprocess.PIPE, text=True, start_new_session=True
-        ) as process,
-        bound(process),
-    ):
-        family = [int(word) for word in process.stdout.readline().split()]
-    assert not [one for one in family if still_runs(one)]

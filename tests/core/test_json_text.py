@@ -9,18 +9,10 @@ from lidarslam.core import json_text
 from lidarslam.core.json_text import ANY_OBJECT, parse_json, read_json
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[" * 100_000, "nested too deeply"),
-        ('{"a": [1e999]}', "not finite"),
-        ('{"a": NaN}', "not finite"),
-        ('{"a": ' + "9" * 5_000 + "}", "4300 digits"),
-        ("", "Expecting value"),
-        ("[1]", "valid dictionary"),
-    ],
-    ids=range(6),
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("[" * 100_000, "nested too deeply"), ('{"a": [1e999]}', "not finite"), ('{"a": NaN}', "not finite"),
+    ('{"a": ' + "9" * 5_000 + "}", "4300 digits"), ("", "Expecting value"), ("[1]", "valid dictionary"),
+], ids=range(6))  # fmt: skip
 def test_what_is_not_plain_is_a_value_error_of_one_line(text, message):
     with pytest.raises(ValueError, match=message) as refused:
         parse_json(text, ANY_OBJECT)

@@ -94,9 +94,7 @@ def test_construction_is_checked():
 
 @pytest.mark.parametrize("chosen", [np.array([True, False, True, False]), np.array([0, 2])], ids=["mask", "indices"])
 def test_select_keeps_everything_in_step(chosen):
-    scan = Scan.from_raw(
-        np.arange(1.0, 16.0).reshape(5, 3) * [[1], [1], [0], [1], [1]], 3.0, np.arange(5.0), np.arange(5)
-    )
+    scan = Scan.from_raw(np.arange(1.0, 16.0).reshape(5, 3) * np.c_[[1, 1, 0, 1, 1]], 3.0, np.arange(5.0), np.arange(5))
     part = scan.select(chosen)
     np.testing.assert_array_equal(part.points, [[1, 2, 3], [10, 11, 12]])
     assert part.time_offsets.tolist() == [0.0, 3.0]

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,18 +19,8 @@ SQUARES = [0.0, 1.0, 4.0, 9.0, 16.0]
 
 
 class BadError(InputError):
-    """An error that does not survive pickling."""
-
     def __init__(self, first: str, second: int) -> None:
         super().__init__(f"{first} {second}")
-
-
-def by_value(function: Any) -> Any:
-    """The function as Ray pickles it whole: its processes cannot import a test."""
-    from ray import cloudpickle
-
-    cloudpickle.register_pickle_by_value(sys.modules[function.__module__])
-    return function
 
 
 def square(value: float) -> float:
@@ -49,7 +38,6 @@ def environment(name: str) -> str:
 
 
 def interrupted(file: str) -> str:
-    """What a task makes of Ctrl-C."""
     Path(file).touch()
     try:
         for _ in range(300):  # Ray interrupts between two steps of Python, not within one
@@ -62,8 +50,8 @@ def interrupted(file: str) -> str:
 @pytest.fixture(params=["serial", "ray"], scope="module")
 def tasks(request: pytest.FixtureRequest) -> Iterator[Tasks]:
     if request.param == "ray":
-        pytest.importorskip("ray")
-        by_value(square)
+        # Ray pickles what is in this module whole: its processes cannot import a test.
+        pytest.importorskip("ray.cloudpickle").register_pickle_by_value(sys.modules[__name__])
     with open_tasks(Where(2 if request.param == "ray" else 1)) as opened:
         yield opened
 

@@ -11,57 +11,38 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lidarslam.core import text as texts
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.text import (
-    as_typed,
-    command_line,
-    joined,
-    one_line,
-    printable,
-    require_name,
-    safe_name,
-    stays_below,
-    up_to,
-)
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("lidar_top", "lidar_top"),
-        ("Größe 测试 ★", "Größe 测试 ★"),
-        ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
-        ("a\nb\r\tc", "a\\nb\\r\\tc"),
-        ("abc\u202egnp.exe", "abc\\u202egnp.exe"),
-        ("\x9b31m", "\\x9b31m"),
-        ("bad\udcff", "bad\\udcff"),
-        ("a\u2028b", "a\\u2028b"),
-    ],
-)
+@pytest.mark.parametrize(("text", "shown"), [
+    ("lidar_top", "lidar_top"), ("Größe 测试 ★", "Größe 测试 ★"), ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
+    ("a\nb\r\tc", "a\\nb\\r\\tc"), ("abc\u202egnp.exe", "abc\\u202egnp.exe"), ("\x9b31m", "\\x9b31m"),
+    ("bad\udcff", "bad\\udcff"), ("a\u2028b", "a\\u2028b"),
+])  # fmt: skip
 def test_what_a_terminal_would_act_on_is_spelt_out(text, shown):
-    assert one_line(text) == shown
+    assert texts.one_line(text) == shown
 
 
 @given(st.text())
 def test_no_text_holds_a_control_character_afterwards(text):
-    for shown in (one_line(text), printable(text).replace("\n", "")):
+    directions = {"LRE", "RLE", "LRO", "RLO", "LRI", "RLI", "FSI"}
+    for shown in (texts.one_line(text), texts.printable(text).replace("\n", "")):
         assert not [c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp")]
-        assert not [
-            c for c in shown if unicodedata.bidirectional(c) in ("LRE", "RLE", "LRO", "RLO", "LRI", "RLI", "FSI")
-        ]
+        assert not [c for c in shown if unicodedata.bidirectional(c) in directions]
         shown.encode("utf-8")
 
 
 def test_lines_of_ours_stay_lines_and_line_breaks_in_names_become_none():
-    assert printable("source  a\ntopic  \x1b[2J\n") == "source  a\ntopic  \\x1b[2J\n"
-    assert joined(["written to a\nb", "next"]) == "written to a\\nb\nnext"
+    assert texts.printable("source  a\ntopic  \x1b[2J\n") == "source  a\ntopic  \\x1b[2J\n"
+    assert texts.joined(["written to a\nb", "next"]) == "written to a\\nb\nnext"
 
 
 @pytest.mark.parametrize(
     "name", ["new\nline", "it's\t\\ \x1b[2J", "plain", "a b", "$HOME\r`x`", os.fsdecode(b"bad\xff'"), "abc\u202egnp"]
 )
 def test_a_command_with_any_name_is_one_line_that_a_shell_reads_back(name):
-    typed = command_line("printf", "%s", name)
+    typed = texts.command_line("printf", "%s", name)
     assert typed.isprintable()
     printed = subprocess.run(["bash", "-c", typed], capture_output=True, check=True, env={"LC_ALL": "C.UTF-8"}).stdout
     assert printed == os.fsencode(name)
@@ -74,28 +55,28 @@ UNSAFE = ["", " ", ".", "..", "...", ".hidden", "/abs/path", "../../x", "a/b", "
 @pytest.mark.parametrize("name", UNSAFE)
 def test_unsafe_names_are_refused_by_name(name):
     with pytest.raises(ConfigError, match=r"method .* cannot be the name of a folder"):
-        require_name(name, "method")
+        texts.require_name(name, "method")
 
 
 @pytest.mark.parametrize(
     "name", ["04", "kiss-icp@0.5", "a+map+graph", "p2pl + pl2pl", "stra\u00dfe", "a..b", "x" * 120]
 )
 def test_other_names_stay(name):
-    assert require_name(name, "method") == name
-    assert safe_name(name) == name
+    assert texts.require_name(name, "method") == name
+    assert texts.safe_name(name) == name
 
 
 def test_a_path_that_stays_below_its_folder():
-    assert [path for path in ("a", "a/b.bin", "./a", "a..b/..c") if not stays_below(path)] == []
-    assert [path for path in ("..", "../a", "a/../../b", "/a", "//a", "a/..") if stays_below(path)] == []
+    assert [path for path in ("a", "a/b.bin", "./a", "a..b/..c") if not texts.stays_below(path)] == []
+    assert [path for path in ("..", "../a", "a/../../b", "/a", "//a", "a/..") if texts.stays_below(path)] == []
 
 
 @given(st.text(max_size=300))
 def test_a_safe_name_stays_in_its_folder(text):
-    name = safe_name(text)
+    name = texts.safe_name(text)
     path = Path("/folder") / name
     assert path.parent == Path("/folder")
-    assert name == require_name(name, "recording")
+    assert name == texts.require_name(name, "recording")
 
 
 @pytest.fixture
@@ -113,14 +94,14 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_program_is_named_by_its_file_where_the_shell_does_not_find_it(environment, tmp_path, monkeypatch):
-    assert as_typed("lidarslam") == "./.venv/bin/lidarslam"
-    assert as_typed("rerun") == "rerun", "it is not beside"
+    assert texts.as_typed("lidarslam") == "./.venv/bin/lidarslam"
+    assert texts.as_typed("rerun") == "rerun", "it is not beside"
     other = shutil.copytree(environment, tmp_path / "other")
     for path, typed in ((environment, "lidarslam"), (other, "./.venv/bin/lidarslam")):
         monkeypatch.setenv("PATH", str(path))
-        assert as_typed("lidarslam") == typed
+        assert texts.as_typed("lidarslam") == typed
     monkeypatch.chdir("/usr")
-    assert as_typed("lidarslam") == str(environment / "lidarslam")
+    assert texts.as_typed("lidarslam") == str(environment / "lidarslam")
 
 
 @pytest.mark.parametrize(
@@ -128,4 +109,4 @@ def test_a_program_is_named_by_its_file_where_the_shell_does_not_find_it(environ
     [(0.0, "less than 0.1 mm"), (8.6e-14, "less than 0.1 mm"), (0.0005, "up to 0.5 mm"), (0.24, "up to 24 cm")],
 )
 def test_a_bound_of_a_length(metres, text):
-    assert up_to(metres) == text
+    assert texts.up_to(metres) == text

@@ -79,9 +79,8 @@ def test_chain_inverts_relative_motions(random_trajectory):
 def test_interpolation_is_exact_for_constant_body_velocity():
     trajectory = moving([0.0, 0.1, 0.35, 0.4, 1.0])
     stamps = np.array([0.72, 0.0, 0.05, 1.0, 0.1, 0.39])
-    np.testing.assert_allclose(
-        trajectory.at(stamps), moving(np.sort(stamps)).T_world_lidar[[4, 0, 1, 5, 2, 3]], atol=1e-12
-    )
+    expected = moving(np.sort(stamps)).T_world_lidar[[4, 0, 1, 5, 2, 3]]
+    np.testing.assert_allclose(trajectory.at(stamps), expected, atol=1e-12)
     assert trajectory.at(np.zeros(0)).shape == (0, 4, 4)
 
 
@@ -102,8 +101,6 @@ QUARTER_TURN_TUM = "12.5 1.5 -2 0.25 0 0 0.70710678118654757 0.70710678118654757
 
 @pytest.fixture
 def written(tmp_path):
-    """Write text to a file and return its path."""
-
     def write(text: str | bytes, name: str = "poses.txt") -> Path:
         path = tmp_path / name
         path.write_bytes(text if isinstance(text, bytes) else text.encode())

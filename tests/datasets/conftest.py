@@ -2,7 +2,7 @@
 
 import sqlite3
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
@@ -18,13 +18,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.datasets.registry import READERS
-from lidarslam.datasets.ros import made_messages
-from lidarslam.datasets.ros.bag_message import (
-    CUSTOM_MESSAGE_DEFINITION,
-    CUSTOM_POINT_DEFINITION,
-    TRANSFORMS_DEFINITION,
-    TRANSFORMS_TYPE,
-)
+from lidarslam.datasets.ros import bag_message, made_messages
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -40,7 +34,6 @@ COMPRESSIONS = [
 
 
 def stamps_ns(count: int) -> list[int]:
-    """Stamps of scans at 10 Hz."""
     return [STAMP_NS + number * PERIOD_NS for number in range(count)]
 
 
@@ -70,42 +63,29 @@ _OUSTER = {"intensity": ("f4", 16), "t": ("u4", 20), "reflectivity": ("u2", 24),
 _OUSTER |= {"ambient": ("u2", 28), "range": ("u4", 32)}
 
 
-def _relative(dtype, factor):
-    def times(seconds, stamp_ns):
-        return np.round(seconds * factor, 0 if factor > 1 else 9).astype(dtype)
-
-    return times
-
-
-def _epoch_seconds(seconds, stamp_ns):
-    return stamp_ns / 10**9 + seconds
-
-
-def _epoch_nanoseconds(seconds, stamp_ns):
-    return (stamp_ns + np.round(seconds * 1e9).astype(np.int64)).astype(np.float64)
-
-
 # Driver -> record type, time field, its unit, its reference, and how it fills it.
 _DRIVERS = {
     "velodyne": (
         _layout(22, **_XYZ, intensity=("f4", 12), ring=("u2", 16), time=("f4", 18)),
-        ("time", "s", "relative", _relative("f4", 1)),
+        ("time", "s", "relative", lambda seconds, _: np.round(seconds, 9).astype("f4")),
     ),
-    "ouster": (_layout(48, **_XYZ, **_OUSTER), ("t", "ns", "relative", _relative("u4", 1e9))),
+    "ouster": (
+        _layout(48, **_XYZ, **_OUSTER),
+        ("t", "ns", "relative", lambda seconds, _: np.round(seconds * 1e9).astype("u4")),
+    ),
     "hesai": (
         _layout(48, **_XYZ, intensity=("f4", 16), timestamp=("f8", 24), ring=("u2", 32)),
-        ("timestamp", "s", "absolute", _epoch_seconds),
+        ("timestamp", "s", "absolute", lambda seconds, ns: ns / 10**9 + seconds),
     ),
     "livox": (
         _layout(26, **_XYZ, intensity=("f4", 12), tag=("u1", 16), line=("u1", 17), timestamp=("f8", 18)),
-        ("timestamp", "ns", "absolute", _epoch_nanoseconds),
+        ("timestamp", "ns", "absolute", lambda seconds, ns: (ns + np.round(seconds * 1e9).astype("i8")).astype("f8")),
     ),
 }
 
 
 @pytest.fixture(params=list(_DRIVERS))
 def driver(request: pytest.FixtureRequest) -> str:
-    """The name of a driver, every one in turn."""
     return request.param
 
 
@@ -161,21 +141,19 @@ class BagKit:
         self.folder = folder
         self.store = get_typestore(Stores.ROS2_HUMBLE if self.ros2 else Stores.ROS1_NOETIC)
         for package in ("livox_ros_driver", "livox_ros_driver2"):
-            self.store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, f"{package}/msg/CustomPoint"))
-            self.store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, f"{package}/msg/CustomMsg"))
+            self.store.register(get_types_from_msg(bag_message.CUSTOM_POINT_DEFINITION, f"{package}/msg/CustomPoint"))
+            self.store.register(get_types_from_msg(bag_message.CUSTOM_MESSAGE_DEFINITION, f"{package}/msg/CustomMsg"))
         if not self.ros2:  # which rosbags has for ROS 2 alone
-            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+            self.store.register(get_types_from_msg(bag_message.TRANSFORMS_DEFINITION, bag_message.TRANSFORMS_TYPE))
 
     def new(self, type_name: str, /, **values: Any) -> Any:
         """A message of a type given as package/Name."""
         return self.store.types[type_name.replace("/", "/msg/")](**values)
 
     def header(self, stamp_ns: int) -> Any:
-        """A std_msgs/Header."""
         return made_messages.header(self.store, stamp_ns, "lidar", sequence=7)
 
     def cloud(self, records: np.ndarray, stamp_ns: int, row_padding: int = 0, **changes: Any) -> Any:
-        """A sensor_msgs/PointCloud2 of records (height, width)."""
         height, width = records.shape
         point_step = records.dtype.itemsize
         rows = np.zeros((height, width * point_step + row_padding), np.uint8)
@@ -188,7 +166,6 @@ class BagKit:
     def livox(
         self, points: np.ndarray, offset_ns: np.ndarray, lines: np.ndarray, stamp_ns: int, timebase: int, package: str
     ) -> Any:
-        """A Livox CustomMsg."""
         named = [dict(zip("xyz", map(float, point), strict=True)) for point in points]
         return self.new(
             f"{package}/CustomMsg",
@@ -204,7 +181,6 @@ class BagKit:
         )
 
     def imu(self, stamp_ns: int, frame_id: str, angular_velocity: np.ndarray, acceleration: np.ndarray) -> Any:
-        """A sensor_msgs/Imu."""
         return self.new(
             "sensor_msgs/Imu",
             header=made_messages.header(self.store, stamp_ns, frame_id),
@@ -217,7 +193,6 @@ class BagKit:
         )
 
     def serialize(self, message: Any) -> bytes:
-        """The bytes of a message."""
         serialize = self.store.serialize_cdr if self.ros2 else self.store.serialize_ros1
         return bytes(serialize(message, message.__msgtype__))
 
@@ -245,9 +220,8 @@ class BagKit:
             for topic, messages in topics.items():
                 message_type = messages if isinstance(messages, str) else messages[0][1].__msgtype__
                 missing = {"msgdef": "", "rihs01" if self.ros2 else "md5sum": "*"}
-                connection = writer.add_connection(
-                    topic, message_type, **({"typestore": self.store} if definitions else missing)
-                )
+                definition = {"typestore": self.store} if definitions else missing
+                connection = writer.add_connection(topic, message_type, **definition)
                 if not isinstance(messages, str):
                     pending += [(record_ns, connection, message) for record_ns, message in messages]
             if extra is not None:
@@ -257,13 +231,11 @@ class BagKit:
         return path
 
     def storage_file(self, path: Path) -> Path:
-        """The file with the messages."""
         return path / f"{path.name}.{self.kind}" if path.is_dir() else path
 
 
 @pytest.fixture(params=["bag", "db3", "mcap"])
 def bag_kit(request: pytest.FixtureRequest, tmp_path: Path) -> BagKit:
-    """Every kind of bag in turn."""
     return BagKit(request.param, tmp_path)
 
 
@@ -293,15 +265,25 @@ def velodyne_clouds(make_sweep: Callable[..., SimpleNamespace]) -> Callable[[Bag
 
 @pytest.fixture
 def make_bag_kit(tmp_path: Path) -> Callable[[str], BagKit]:
-    """A bag of a given kind."""
     return lambda kind: BagKit(kind, tmp_path)
+
+
+def write_pcap(path: Path, payloads: Iterable[bytes], stamps: Iterable[float]) -> Path:
+    """A capture of UDP packets over Ethernet."""
+    with path.open("wb") as file:
+        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
+        for payload, stamp in zip(payloads, stamps, strict=True):
+            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+            ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, b"\xc0\xa8\1\xc9", b"\xff" * 4)
+            frame = b"\xff" * 6 + b"\1" * 6 + b"\x08\x00" + ip + udp
+            file.write(struct.pack("<IIII", *divmod(round(1e6 * stamp), 10**6), len(frame), len(frame)) + frame)
+    return path
 
 
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "u4": "uint", "i4": "int"}
 
 
 def pcd_bytes(table: np.ndarray, data: str = "binary") -> bytes:
-    """A PCD file."""
     kinds = {"f": "F", "u": "U", "i": "I"}
     types = [table.dtype[name] for name in table.dtype.names]
     lines = [
@@ -319,17 +301,13 @@ def pcd_bytes(table: np.ndarray, data: str = "binary") -> bytes:
     if data == "binary":
         return header + table.tobytes()
     columns = b"".join(np.ascontiguousarray(table[name]).tobytes() for name in table.dtype.names)
-    packed = _lzf_literals(columns)
+    # LZF without copies, as a compressor writes what does not repeat.
+    packed = b"".join(bytes([len(part := columns[i : i + 32]) - 1]) + part for i in range(0, len(columns), 32))
     return header + struct.pack("<II", len(packed), len(columns)) + packed
 
 
 def _ascii(table: np.ndarray) -> bytes:
     return "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in table).encode()
-
-
-def _lzf_literals(data: bytes) -> bytes:
-    """An LZF stream without copies, as a compressor writes what does not repeat."""
-    return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
 
 
 def ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes = b"", faces: bool = False) -> bytes:
@@ -339,7 +317,5 @@ def ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes 
     header += "element face 1\nproperty list uchar int vertex_indices\n" * faces + "end_header\n"
     if encoding == "ascii":
         return header.encode() + prefix + _ascii(table) + b"3 0 1 2\n" * faces
-    order = "<" if "little" in encoding else ">"
-    return (
-        header.encode() + prefix + table.astype(table.dtype.newbyteorder(order)).tobytes() + (b"\3" + bytes(12)) * faces
-    )
+    rows = table.astype(table.dtype.newbyteorder("<" if "little" in encoding else ">"))
+    return header.encode() + prefix + rows.tobytes() + (b"\3" + bytes(12)) * faces

@@ -34,11 +34,8 @@ def sweep(first_s, compensated=False, direction=-1.0, start=2.2, speed=SPEED, tu
     if compensated:
         heading_0, position_0 = _pose(np.full(len(times), first_s + 0.5 * PERIOD_S), speed, turn_rate)
         points = _turned(_turned(points, heading) + position - position_0, -heading_0)
-    orders = {
-        "firing": np.arange(len(ring)),
-        "rings": np.argsort(ring, kind="stable"),
-        "none": np.random.default_rng(0).permutation(len(ring)),
-    }
+    shuffled = np.random.default_rng(0).permutation(len(ring))
+    orders = {"firing": np.arange(len(ring)), "rings": np.argsort(ring, kind="stable"), "none": shuffled}
     chosen = orders[order][column[orders[order]] % 7 != 2]
     return points[chosen], times[chosen], ring[chosen]
 
@@ -55,7 +52,6 @@ def _turned(points, angles):
 
 
 def record(folder: Path, every=1, stamps=True, rings=True, count=12, **options) -> Path:
-    """A folder of scans without times."""
     folder.mkdir()
     for number in range(count):
         points, _, ring = sweep(number * every * PERIOD_S, **options)
@@ -93,18 +89,10 @@ def test_a_recording_as_measured_gets_times(tmp_path, order):
         np.testing.assert_allclose(scan.time_offsets, times - times.min(), atol=2 * PERIOD_S / COLUMNS)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compensated": True},
-        {"every": 2},
-        {"every": 3, "stamps": False},
-        {"order": "rings", "compensated": True},
-        {"order": "rings", "rings": False},
-        {"order": "none"},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [
+    {"compensated": True}, {"every": 2}, {"every": 3, "stamps": False}, {"order": "rings", "compensated": True},
+    {"order": "rings", "rings": False}, {"order": "none"},
+], ids=str)  # fmt: skip
 def test_others_get_none(tmp_path, options):
     recording = open_recording(record(tmp_path / "scans", **options))
     assert next(recording.scans()).time_offsets is None

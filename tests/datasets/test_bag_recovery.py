@@ -178,10 +178,7 @@ def chunks_of(file):
         with Rosbag1Reader(file) as reader:
             return [(chunk.datapos, chunk.datasize) for chunk in reader.chunks.values()]
     with Rosbag2Reader(file) as reader:
-        return [
-            (chunk.chunk_start_offset + 49 + len(chunk.compression), chunk.compressed_size)
-            for chunk in reader.storage.chunks
-        ]
+        return [(c.chunk_start_offset + 49 + len(c.compression), c.compressed_size) for c in reader.storage.chunks]
 
 
 def overwrite(file, begin, content):
@@ -289,14 +286,12 @@ def test_frames_are_unpacked_one_after_the_other(rng):
 
 
 @pytest.mark.parametrize(("kind", "compression"), COMPRESSIONS)
-@pytest.mark.parametrize("is_indexed", [True, False])
-def test_chunks_and_messages_that_unpack_to_too_much_are_refused(
-    write_drive, monkeypatch, kind, compression, is_indexed
-):
+@pytest.mark.parametrize("indexed", [True, False])
+def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, monkeypatch, kind, compression, indexed):
     """A scan has some kilobytes here."""
     monkeypatch.setattr("lidarslam.datasets.ros.bag_file.MOST_BYTES", 1_000)
     file, source, _ = write_drive(kind, compression=compression)
-    if not is_indexed:
+    if not indexed:
         file.write_bytes(file.read_bytes()[:-9])
     with pytest.raises(InputError) as caught:
         list(open_recording(source).scans())

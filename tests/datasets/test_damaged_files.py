@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarslam.core.errors import InputError
@@ -17,6 +17,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.registry import open_recording
 
+from ..conftest import fuzzed
 from .conftest import pcd_bytes, ply_bytes, point_table
 from .test_kitti_odometry import write_sequence
 from .test_kitti_raw import write_drive
@@ -27,13 +28,6 @@ HEADER_WORDS = (
     "", "0", "-1", "1", "3", "119", "121", "4294967295", "1000000000000", "9" * 30, "nan", "x y z", "x", "_", "F", "8",
     "ascii", "binary", "binary_compressed", "binary_big_endian", "vertex", "list", "float", "double", "\u00e9", "('x',",
 )  # fmt: skip
-
-fuzzed = settings(
-    max_examples=12,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
 
 
 def check(source: Path) -> int:
@@ -102,7 +96,6 @@ FORMATS = ("plain.bin", "structured.npy", "ascii.pcd", "binary.pcd", "binary_com
 
 
 def encode(name: str, points: np.ndarray) -> bytes:
-    """The bytes of a file of points, by its name."""
     kind, _, suffix = name.partition(".")
     if suffix in ("pcd", "ply"):
         return (pcd_bytes if suffix == "pcd" else ply_bytes)(points, kind)
@@ -114,7 +107,7 @@ def encode(name: str, points: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@fuzzed
+@fuzzed(12)
 @given(damage=damages(), place=st.integers(0, SCANS - 1))
 def test_folder_of_damaged_scans(tmp_path, table, name, damage, place):
     data = encode(name, table)
@@ -150,7 +143,7 @@ def sequence(tmp_path, rng) -> Path:
 
 
 @pytest.mark.parametrize("name", ["times.txt", "calib.txt", "../../poses/04.txt", "velodyne/000002.bin"])
-@fuzzed
+@fuzzed(12)
 @given(damage=damages())
 def test_damaged_kitti_sequence(sequence, name, damage):
     count = check_damaged(sequence, name, damage)
@@ -173,7 +166,7 @@ RAW_FILES = (
 
 
 @pytest.mark.parametrize("name", RAW_FILES)
-@fuzzed
+@fuzzed(12)
 @given(damage=damages())
 def test_damaged_kitti_raw_drive(drive, name, damage):
     check_damaged(drive, name, damage)
@@ -186,7 +179,7 @@ def bag(bag_kit, velodyne_clouds) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in (file, file.with_name("metadata.yaml")) if path.exists()}
 
 
-@fuzzed
+@fuzzed(12)
 @given(damage=damages(), what=st.sampled_from(["file", "metadata"]))
 def test_damaged_bags(bag, damage, what):
     for path, content in bag.items():

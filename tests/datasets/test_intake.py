@@ -96,8 +96,6 @@ def test_all_points_at_one_place_are_told():
 
 
 class Recorded:
-    """A recording of these scans."""
-
     def __init__(self, *scans):
         self._scans = scans
 
@@ -152,17 +150,10 @@ def strokes() -> Scan:
     return replace(scan, points=bent)
 
 
-@pytest.mark.parametrize(
-    ("recording", "told"),
-    [
-        (Recorded(spinning()), False),
-        (Recorded(spinning(mirror=-1.0)), True),
-        (Recorded(spinning(times_sign=-1.0)), True),
-        (MountedRecording(Recorded(spinning()), "upside-down"), False),
-        (Recorded(strokes()), False),
-    ],
-    ids=["clockwise", "mirrored", "reversed", "clockwise upside down", "strokes"],
-)
+@pytest.mark.parametrize(("recording", "told"), [
+    (Recorded(spinning()), False), (Recorded(spinning(mirror=-1.0)), True), (Recorded(spinning(times_sign=-1.0)), True),
+    (MountedRecording(Recorded(spinning()), "upside-down"), False), (Recorded(strokes()), False),
+], ids=["clockwise", "mirrored", "reversed", "clockwise upside down", "strokes"])  # fmt: skip
 def test_mirrored_axes_and_reversed_times_turn_the_other_way(recording, told):
     _, faults = taken(recording)
     assert ["turns counter-clockwise as seen from above" in said for said in faults.warnings()] == [True] * told

@@ -41,7 +41,6 @@ def write_sequence(
 
 @pytest.fixture
 def sequence(tmp_path, rng) -> Path:
-    """The folder of a sequence of six scans."""
     write_sequence(tmp_path, rng)
     return tmp_path / "sequences" / "04"
 

@@ -89,7 +89,6 @@ def write_drive(root: Path, rng: np.random.Generator, rows: int = 8, missing: tu
 
 @pytest.fixture
 def drive(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """A drive of eight scans."""
     return write_drive(tmp_path, rng)
 
 

@@ -12,15 +12,7 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.datasets.mounting import (
-    UPRIGHT,
-    MountedRecording,
-    correct_elevation,
-    guess_mounting,
-    mounting_with_up,
-    transform_of,
-    written,
-)
+from lidarslam.datasets import mounting as mountings
 from lidarslam.datasets.recording import RecordingInfo
 
 QUARTERS = {"left": (90, 0, 0), "right": (-90, 0, 0), "backward": (0, 90, 0), "forward": (0, -90, 0)}
@@ -80,9 +72,7 @@ class Recorded:
     name = "memory"
     warnings = ("old",)
     T_cam_lidar = make_transform(turn(10, 20, 30), np.array([0.1, 0.2, 0.3]))
-    ground_truth = Trajectory(
-        np.arange(3.0), np.stack([make_transform(turn(0, 0, a), np.ones(3)) for a in (0, 30, 60)])
-    )
+    ground_truth = Trajectory(np.arange(3.0), np.stack([make_transform(turn(0, 0, a), [1, 1, 1]) for a in (0, 30, 60)]))
     imu = ImuSamples(np.arange(3.0), np.ones((3, 3)), np.ones((3, 3)), T_cam_lidar)
 
     def __init__(self, clouds: list[FloatArray]) -> None:
@@ -100,40 +90,33 @@ class Recorded:
         return RecordingInfo("memory", len(self), self._scans[0], 1.0, None, None)
 
 
-@pytest.mark.parametrize(
-    ("mounting", "z", "x"),
-    [
-        ("upright", (0, 0, 1), (1, 0, 0)),
-        ("upside-down", (0, 0, -1), (1, 0, 0)),
-        ("left", (0, 1, 0), (1, 0, 0)),
-        ("right", (0, -1, 0), (1, 0, 0)),
-        ("forward", (1, 0, 0), (0, 0, -1)),
-        ("backward", (-1, 0, 0), (0, 0, 1)),
-        ("camera", (1, 0, 0), (0, -1, 0)),
-    ],
-)
+@pytest.mark.parametrize(("mounting", "z", "x"), [
+    ("upright", (0, 0, 1), (1, 0, 0)), ("upside-down", (0, 0, -1), (1, 0, 0)), ("left", (0, 1, 0), (1, 0, 0)),
+    ("right", (0, -1, 0), (1, 0, 0)), ("forward", (1, 0, 0), (0, 0, -1)), ("backward", (-1, 0, 0), (0, 0, 1)),
+    ("camera", (1, 0, 0), (0, -1, 0)),
+])  # fmt: skip
 def test_a_name_says_where_the_recorded_z_axis_points(mounting, z, x):
-    R = transform_of(mounting)[:3, :3]
+    R = mountings.transform_of(mounting)[:3, :3]
     np.testing.assert_array_equal(R @ [0, 0, 1], z)
     np.testing.assert_array_equal(R @ [1, 0, 0], x)
     np.testing.assert_allclose(np.linalg.det(R), 1.0)
 
 
 def test_angles_are_those_of_the_recorded_axes():
-    np.testing.assert_allclose(transform_of((10.0, 20.0, 30.0))[:3, :3], turn(10, 20, 30), atol=1e-15)
+    np.testing.assert_allclose(mountings.transform_of((10.0, 20.0, 30.0))[:3, :3], turn(10, 20, 30), atol=1e-15)
     odd = turn(70, 25, 110)
-    mounting = mounting_with_up(odd.T[:, 2])
-    assert guess_mounting(points @ odd.T for points in street()).warning is not None
+    mounting = mountings.mounting_with_up(odd.T[:, 2])
+    assert mountings.guess_mounting(points @ odd.T for points in street()).warning is not None
     assert not isinstance(mounting, str)
-    np.testing.assert_allclose((transform_of(mounting)[:3, :3] @ odd.T)[:, 2], [0, 0, 1], atol=0.02)
-    assert written(mounting).count(",") == 2
+    np.testing.assert_allclose((mountings.transform_of(mounting)[:3, :3] @ odd.T)[:, 2], [0, 0, 1], atol=0.02)
+    assert mountings.written(mounting).count(",") == 2
 
 
 def test_scans_truth_and_extrinsics_are_turned_together():
     clouds = [points[::50] @ turn(*QUARTERS["left"]).T for points in street()[:2]]
     recorded = Recorded(clouds)
-    mounted = MountedRecording(recorded, "left")
-    T = transform_of("left")
+    mounted = mountings.MountedRecording(recorded, "left")
+    T = mountings.transform_of("left")
     for scan, points in zip(mounted.scans(), clouds, strict=True):
         np.testing.assert_allclose(scan.points, points @ T[:3, :3].T)
     # What a point of the recorded axes is in the truth's world, and the camera and the LiDAR of the IMU, stay.
@@ -147,7 +130,7 @@ def test_scans_truth_and_extrinsics_are_turned_together():
 
 def test_an_upright_recording_is_left_alone():
     recorded = Recorded(street()[:2])
-    mounted = MountedRecording(recorded, "auto")
+    mounted = mountings.MountedRecording(recorded, "auto")
     assert all(scan.points is own.points for scan, own in zip(mounted.scans(), recorded.scans(), strict=True))
     np.testing.assert_array_equal(mounted.ground_truth.T_world_lidar, recorded.ground_truth.T_world_lidar)
     assert mounted.warnings == recorded.warnings
@@ -156,7 +139,7 @@ def test_an_upright_recording_is_left_alone():
 @pytest.mark.parametrize("name", [*QUARTERS, "upside-down"])
 def test_the_ground_shows_a_turned_sensor(name):
     R = turn(*QUARTERS.get(name, (180, 0, 0)))
-    guess = guess_mounting(points @ R.T for points in street())
+    guess = mountings.guess_mounting(points @ R.T for points in street())
     assert guess.mounting == name
     assert guess.warning is not None
     assert f"--set reader.mounting={name}" in guess.warning
@@ -197,12 +180,12 @@ LEFT_ALONE = {
 
 @pytest.mark.parametrize(("name", "angles"), [(name, angles) for name in LEFT_ALONE for angles in LEFT_ALONE[name]])
 def test_walls_and_ceilings_are_no_ground_and_a_tilt_is_left_alone(name, angles):
-    assert guess_mounting(points @ turn(*angles).T for points in scene(name)) == UPRIGHT
+    assert mountings.guess_mounting(points @ turn(*angles).T for points in scene(name)) == mountings.UPRIGHT
 
 
 def test_what_only_some_scans_show_is_a_warning_and_no_more():
     R, grass = turn(*QUARTERS["left"]), np.random.default_rng(0).normal(0.0, 5.0, (4000, 3))
-    guess = guess_mounting([street()[0] @ R.T, street()[1] @ R.T, grass, grass, grass])
+    guess = mountings.guess_mounting([street()[0] @ R.T, street()[1] @ R.T, grass, grass, grass])
     assert guess.mounting == "upright"
     assert guess.warning is not None
     assert "--set reader.mounting=left" in guess.warning
@@ -212,7 +195,7 @@ def test_what_only_some_scans_show_is_a_warning_and_no_more():
     "points", [np.empty((0, 3)), np.ones((3, 3)), np.ones((500, 3)), np.eye(3).repeat(400, axis=0)]
 )
 def test_scans_without_surfaces_show_nothing(points):
-    assert guess_mounting([points] * 5) == UPRIGHT
+    assert mountings.guess_mounting([points] * 5) == mountings.UPRIGHT
 
 
 @pytest.mark.parametrize("angles", [(90, 0, 0), (0, 90, 0), (45, 0, 0), (30, 40, 110)])
@@ -241,13 +224,13 @@ def test_equals_kiss_icp(rng):
     points = _cloud(rng)
     expected = np.asarray(pybind._correct_kitti_scan(pybind._Vector3dVector(points)))
     assert np.abs(expected - points).max() > 0.3  # the oracle does something
-    np.testing.assert_allclose(correct_elevation(points, 0.205), expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(mountings.correct_elevation(points, 0.205), expected, rtol=0.0, atol=1e-9)
 
 
 def test_raises_elevation_and_keeps_range_azimuth_and_its_input(rng):
     given = _cloud(rng).astype(np.float32)
     points = given.astype(np.float64)
-    raised = correct_elevation(given, 1.5)
+    raised = mountings.correct_elevation(given, 1.5)
     assert raised.dtype == np.float64
     np.testing.assert_array_equal(given, points)
     elevation = [np.rad2deg(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))) for p in (points, raised)]
@@ -258,6 +241,6 @@ def test_raises_elevation_and_keeps_range_azimuth_and_its_input(rng):
 
 
 def test_invalid_points_stay_recognisable():
-    raised = correct_elevation(np.array([[0.0, 0.0, 0.0], [np.nan, 1.0, 2.0], [np.inf, 1.0, np.inf]]), 0.205)
+    raised = mountings.correct_elevation(np.array([[0.0, 0.0, 0.0], [np.nan, 1.0, 2.0], [np.inf, 1.0, np.inf]]), 0.205)
     np.testing.assert_array_equal(raised[0], 0.0)
     assert not np.isfinite(raised[1:]).all(axis=1).any()

@@ -67,7 +67,6 @@ def packets(sensor, frames):
 
 @pytest.fixture(params=["osf", "pcap"])
 def recorded(request, tmp_path, sensor, frames, packets):
-    """The same recording in both kinds of file."""
     path = tmp_path / f"drive.{request.param}"
     if request.param == "osf":
         osf = pytest.importorskip("ouster.sdk.osf")

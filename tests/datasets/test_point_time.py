@@ -28,15 +28,6 @@ def inferred(*args, **kwargs):
     return infer_point_time(*args, **kwargs).model
 
 
-def timed_cloud(field, values):
-    return RawCloud(np.ones((len(values), 3)), field, values)
-
-
-def exact_offsets(values, unit, stamp):
-    """The offsets of clock readings in exact arithmetic."""
-    return np.array([float(Fraction(v.item()) / UNITS_PER_SECOND[unit] - Fraction(stamp)) for v in values])
-
-
 @pytest.mark.parametrize(
     ("values", "unit", "reference", "offsets", "tolerance"),
     [
@@ -86,19 +77,15 @@ def test_offsets_lose_nothing_of_a_clock_reading(stamp_ns, dtype):
     stamp = stamp_ns / 10**9  # rounded to float64, as Scan.stamp is
     values = (stamp_ns + SWEEP_NS[::100]).astype(dtype)
     offsets = PointTimeModel("t", "ns", "absolute").offsets(values, stamp)
-    np.testing.assert_allclose(offsets, exact_offsets(values, "ns", stamp), rtol=0.0, atol=1e-15)
+    exact = [float(Fraction(value.item()) / 10**9 - Fraction(stamp)) for value in values]
+    np.testing.assert_allclose(offsets, exact, rtol=0.0, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        pytest.param(np.full(100, STAMP_NS, dtype="u8"), id="all-equal-integers"),
-        pytest.param(np.array([0.05]), id="one-point"),
-        pytest.param(np.empty(0, dtype="f4"), id="no-points"),
-        pytest.param(np.r_[np.zeros(999), 0.1], id="all-equal-but-one"),
-        pytest.param(SWEEP * 1e-7, id="span-of-no-sweep"),
-    ],
-)
+@pytest.mark.parametrize("values", [
+    pytest.param(np.full(100, STAMP_NS, dtype="u8"), id="all-equal-integers"),
+    pytest.param(np.array([0.05]), id="one-point"), pytest.param(np.empty(0, dtype="f4"), id="no-points"),
+    pytest.param(np.r_[np.zeros(999), 0.1], id="all-equal-but-one"), pytest.param(SWEEP * 1e-7, id="span-of-no-sweep"),
+])  # fmt: skip
 def test_no_per_point_time(values):
     assert inferred("t", values, STAMP) is None
 
@@ -143,24 +130,20 @@ def test_a_scale_in_doubt_is_not_corrected(scale):
     assert "spans a sweep in no unit" in learned.warning
 
 
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        (np.zeros(100), "one value alone (0)"),
-        (np.full(100, STAMP), "one value alone (1.7e+09)"),
-        (np.full(100, np.nan), "no number"),
-        ((STAMP + SWEEP * 2000).astype("f4"), "too coarse"),
-    ],
-)
+@pytest.mark.parametrize(("values", "said"), [
+    (np.zeros(100), "one value alone (0)"), (np.full(100, STAMP), "one value alone (1.7e+09)"),
+    (np.full(100, np.nan), "no number"), ((STAMP + SWEEP * 2000).astype("f4"), "too coarse"),
+])  # fmt: skip
 def test_what_is_no_time_is_said(values, said):
-    model, warning = learn_point_time([(timed_cloud("stamps", values), STAMP + 0.1 * number) for number in range(5)])
+    cloud = RawCloud(np.ones((len(values), 3)), "stamps", values)
+    model, warning = learn_point_time([(cloud, STAMP + 0.1 * number) for number in range(5)])
     assert model is None
     assert warning.startswith("The time field 'stamps'")
     assert said in warning
 
 
 def test_a_first_cloud_without_times_is_no_fault_of_the_recording():
-    clouds = [(timed_cloud("t", values), STAMP) for values in (np.zeros(1001), SWEEP)]
+    clouds = [(RawCloud(np.ones((1001, 3)), "t", values), STAMP) for values in (np.zeros(1001), SWEEP)]
     assert learn_point_time(clouds) == LearnedTime(PointTimeModel("t", "s", "relative"))
 
 

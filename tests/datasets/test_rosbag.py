@@ -164,13 +164,9 @@ def test_topic_that_is_asked_for(ros2_kit, velodyne_clouds, make_sweep, topic):
     assert recording.describe().topic == "/rear"
 
 
-@pytest.mark.parametrize(
-    ("topic", "message"),
-    [
-        ("/nowhere", "no topic '/nowhere'"),
-        ("/imu", r"/imu \(sensor_msgs/msg/Imu, 0 messages\), which is no point cloud"),
-    ],
-)
+@pytest.mark.parametrize(("topic", "message"), [
+    ("/nowhere", "no topic '/nowhere'"), ("/imu", r"/imu \(sensor_msgs/msg/Imu, 0 messages\), which is no point cloud"),
+])  # fmt: skip
 def test_topic_that_is_not_there(drive, topic, message):
     with pytest.raises(InputError, match=message) as caught:
         open_recording(drive[0], ReaderConfig(topic=topic))
@@ -283,18 +279,13 @@ def test_two_sensors_that_send_to_one_topic_in_turn_are_told_apart(ros2_kit, vel
         stamps(Faults(), frame_id="left")
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"point_step": 4}, "beyond the 4 bytes"),
-        ({"point_step": 0}, "beyond the 0 bytes"),
-        ({"width": 10**6}, "needs 88000000 bytes"),
-        ({"width": 2**32 - 1, "height": 2**32 - 1}, "bytes, the message holds 4400"),
-        ({"height": 2, "row_step": 2**32 - 1}, "bytes, the message holds 4400"),
-        ({"data": np.zeros(9, np.uint8)}, "the message holds 9"),
-        ({"fields": []}, "need the fields x, y and z"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"point_step": 4}, "beyond the 4 bytes"), ({"point_step": 0}, "beyond the 0 bytes"),
+    ({"width": 10**6}, "needs 88000000 bytes"),
+    ({"width": 2**32 - 1, "height": 2**32 - 1}, "bytes, the message holds 4400"),
+    ({"height": 2, "row_step": 2**32 - 1}, "bytes, the message holds 4400"),
+    ({"data": np.zeros(9, np.uint8)}, "the message holds 9"), ({"fields": []}, "need the fields x, y and z"),
+])  # fmt: skip
 def test_a_damaged_message_costs_no_other(ros2_kit, velodyne_clouds, sweep, changes, reason):
     messages = velodyne_clouds(ros2_kit, 5)
     for place in (0, 3):

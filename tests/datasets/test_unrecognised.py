@@ -31,15 +31,11 @@ def scans(folder: Path) -> Path:
     return folder
 
 
-def of_run(folder: Path) -> Path:
-    write(folder / "map.ply", folder / "trajectory.tum")
-    write(folder / "config.yaml", content=b"run:\n  version: 0.1.0\n  source: /data/office.mcap\nreader:\n")
-    return folder
-
-
 @pytest.mark.parametrize("name", ["", "map.ply", "trajectory.tum"])
 def test_a_run_is_no_recording_and_its_recording_is_named(tmp_path: Path, name: str) -> None:
-    said = refused(of_run(tmp_path / "run") / name)
+    write(tmp_path / "run" / "map.ply", tmp_path / "run" / "trajectory.tum")
+    write(tmp_path / "run" / "config.yaml", content=b"run:\n  version: 0.1.0\n  source: /data/office.mcap\nreader:\n")
+    said = refused(tmp_path / "run" / name)
     assert "not a recording; its recording is /data/office.mcap." in said
     assert f"lidarslam view {tmp_path / 'run'} shows it" in said
 

@@ -2,7 +2,6 @@
 
 import struct
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
+
+from .conftest import write_pcap
 
 pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
 
@@ -57,19 +58,6 @@ def packet(first_s):
 def packets(duration_s):
     """Of a recording that begins at azimuth zero."""
     return [packet(first_s) for first_s in np.arange(0.0, duration_s, 24 * SEQUENCE_S)]
-
-
-def write_pcap(path: Path, payloads, stamps) -> Path:
-    """A capture of UDP packets over Ethernet."""
-    with path.open("wb") as file:
-        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
-        for payload, stamp in zip(payloads, stamps, strict=True):
-            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
-            ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, b"\xc0\xa8\1\xc9", b"\xff" * 4)
-            frame = b"\xff" * 6 + b"\1" * 6 + b"\x08\x00" + ip + udp
-            microseconds = round(1e6 * stamp)
-            file.write(struct.pack("<IIII", *divmod(microseconds, 10**6), len(frame), len(frame)) + frame)
-    return path
 
 
 @pytest.fixture
@@ -165,9 +153,8 @@ def test_clouds_come_before_packets(velodyne_kit, make_sweep):
     part = packets(0.1)
     stamp_ns = round(1e9 * STAMP_S)
     cloud = velodyne_kit.cloud(make_sweep("velodyne", stamp_ns).records, stamp_ns)
-    path = velodyne_kit.write(
-        {"/packets": [(stamp_ns, scan_message(velodyne_kit, part, stamp_ns))], "/points": [(stamp_ns, cloud)]}
-    )
+    message = scan_message(velodyne_kit, part, stamp_ns)
+    path = velodyne_kit.write({"/packets": [(stamp_ns, message)], "/points": [(stamp_ns, cloud)]})
     assert open_recording(path).describe().topic == "/points"
     assert open_recording(path, ReaderConfig(topic="/packets")).describe().topic == "/packets"
 
@@ -186,13 +173,9 @@ def test_an_empty_or_damaged_message_costs_no_other(velodyne_kit):
     assert "cannot be decoded" in faults.warnings()[0]
 
 
-@pytest.mark.parametrize(
-    ("payload", "said"),
-    [
-        (bytes(100), "no packets of a Velodyne; for an Ouster, .* as other.json"),
-        (b"\x11" * 1206, "cannot be decoded"),
-    ],
-)
+@pytest.mark.parametrize(("payload", "said"), [
+    (bytes(100), "no packets of a Velodyne; for an Ouster, .* as other.json"), (b"\x11" * 1206, "cannot be decoded"),
+])  # fmt: skip
 def test_packets_of_others_are_refused(tmp_path, payload, said):
     path = write_pcap(tmp_path / "other.pcap", [payload] * 10, STAMP_S + 0.001 * np.arange(10))
     with pytest.raises(InputError, match=said):

@@ -112,10 +112,7 @@ def comparison(random_drive, straight_drive, finished, rng) -> Comparison:
         finished("learned", corridor, 6, 0.01, status="stopped", message="interrupted"),
         finished("unmeasured", corridor, 7, metrics=None),
     ]
-    columns = [
-        TableColumn("09", "t_rel", "%", 2, True, ("09",)),
-        TableColumn("00-08", "t_rel", "%", 2, True, ("00", "01")),
-    ]
+    columns = [TableColumn(name, "t_rel", "%", 2, True, of) for name, of in (("09", ("09",)), ("00-08", ("00", "01")))]
     rows = [
         TableRow("learned", [TableCell(1.234, 1), TableCell(0.111, 1, "over 1 of 2", ranked=False)]),
         TableRow("kiss-icp", [TableCell(0.567, 1), TableCell(0.333, 2)]),

@@ -87,10 +87,8 @@ def test_bounds_are_included_and_null_fails():
 
 def test_a_comparison_is_judged_by_method():
     """The reference has no errors of its own, which is no failure; a method that failed is one."""
-    results = [
-        MethodResult("reference", "ok", lost=np.zeros(3, np.bool_), run="a"),
-        MethodResult("crashed", "failed", "it crashed"),
-    ]
+    failed = MethodResult("crashed", "failed", "it crashed")
+    results = [MethodResult("reference", "ok", lost=np.zeros(3, np.bool_), run="a"), failed]
     sequence = SequenceComparison("site", "site.bag", None, "reference", results)
     gates = [Gate("max", "ate", 1.0), Gate("max", "lost", 0.0), Gate("max", "memory_mb", 100.0, "reference")]
     judged = judge_comparison(gates, [sequence], {"a": {"peak_rss_mb": 80.0}})

@@ -42,14 +42,9 @@ def _error(T_a: FloatArray, T_b: FloatArray, points: FloatArray) -> float:
     return float(np.linalg.norm(transform_points(T_a, points) - transform_points(T_b, points), axis=1).max())
 
 
-@pytest.mark.parametrize(
-    ("xi", "origin", "guesses"),
-    [
-        ([0.0, 0.0, 1.8, 3.0, -20.0, 1.0], np.zeros(3), {}),
-        ([0.02, -0.03, -2.9, 0.0, 7.0, 0.0], UTM, {"none": np.eye(4)}),
-    ],
-    ids=["without a guess", "far away, with a wrong one"],
-)
+@pytest.mark.parametrize(("xi", "origin", "guesses"), [
+    ([0.0, 0.0, 1.8, 3.0, -20.0, 1.0], np.zeros(3), {}), ([0.02, -0.03, -2.9, 0.0, 7.0, 0.0], UTM, {"none": np.eye(4)}),
+], ids=["without a guess", "far away, with a wrong one"])  # fmt: skip
 def test_a_turned_map_is_found(building, rng, xi, origin, guesses):
     part = building[building[:, 0] < 16.0]
     T_reference_map = exp(xi)
@@ -125,11 +120,9 @@ def test_the_pose_is_the_same_for_any_number_of_threads():
     """Sums of several threads have no fixed order."""
     root = str(Path(__file__).parents[2])
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    poses = set()
+    poses, command = set(), [sys.executable, "-c", THREADS]
     for threads in ("1", "3"):
         environment = os.environ | {"PYTHONPATH": root} | dict.fromkeys(names, threads)
-        done = subprocess.run(
-            [sys.executable, "-c", THREADS], env=environment, capture_output=True, text=True, check=True
-        )
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         poses.add(done.stdout)
     assert len(poses) == 1

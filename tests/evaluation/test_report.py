@@ -11,16 +11,7 @@ import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
-from lidarslam.evaluation.comparison.comparison import (
-    Comparison,
-    MethodResult,
-    SequenceComparison,
-    Table,
-    TableCell,
-    TableColumn,
-    TableRow,
-    number_text,
-)
+from lidarslam.evaluation.comparison import comparison as compared
 from lidarslam.evaluation.map.metrics import CloudErrors
 from lidarslam.evaluation.report.accuracy import raster
 from lidarslam.evaluation.report.figure import Panel, line_trace, method_styles, plot_text, thin_curve
@@ -29,7 +20,7 @@ from lidarslam.evaluation.report.report import render_html, render_markdown
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \ufffd"
 
 
-def page_of(comparison: Comparison) -> ElementTree.Element:
+def page_of(comparison: compared.Comparison) -> ElementTree.Element:
     """The page as XML, which it is but for the style sheet and the two scripts."""
     html = re.sub(r"(<script>).*?(</script>)", r"\1\2", render_html(comparison), flags=re.DOTALL)
     return ElementTree.fromstring(html)
@@ -110,7 +101,7 @@ def test_the_best_of_each_column_is_bold_and_starred(comparison):
 def test_what_ended_early_wins_nothing(comparison):
     sequence = comparison.sequences[1]
     first, second, _ = sequence.methods
-    methods = [replace(first, status="stopped"), replace(second, status="ok"), MethodResult("x", "failed")]
+    methods = [replace(first, status="stopped"), replace(second, status="ok"), compared.MethodResult("x", "failed")]
     changed = replace(sequence, methods=methods)
     rows = table_rows(page_of(replace(comparison, sequences=[changed])), "corridor: all methods")
     assert not any("★" in text_of(cell) for cell in rows["kiss-icp"])
@@ -154,15 +145,17 @@ def test_a_method_keeps_its_colour_and_name_in_every_figure_and_recording(compar
 
 
 def test_an_empty_comparison_and_one_without_references_are_rendered(comparison, straight_drive):
-    empty = Comparison("Nothing", "", [])
+    empty = compared.Comparison("Nothing", "", [])
     assert "Nothing" in text_of(page_of(empty))
     assert render_markdown(empty).startswith("# Nothing")
     drive = straight_drive(3, (0.0,) * 6)
-    alone = SequenceComparison("a", "b", None, "", [MethodResult("still", "ok", scans=3, trajectory=drive)])
-    page = page_of(Comparison("One", "", [alone]))
+    alone = compared.SequenceComparison(
+        "a", "b", None, "", [compared.MethodResult("still", "ok", scans=3, trajectory=drive)]
+    )
+    page = page_of(compared.Comparison("One", "", [alone]))
     assert "Reference: none" in text_of(page)
     assert [text_of(f.find("figcaption"))[:22] for f in page.iter("figure")] == ["Figure 1. Trajectories"]
-    page_of(Comparison("None", "", [replace(alone, methods=[MethodResult("gone", "not run")])]))
+    page_of(compared.Comparison("None", "", [replace(alone, methods=[compared.MethodResult("gone", "not run")])]))
 
 
 def test_a_runaway_leaves_the_pictures_instead_of_flattening_them(comparison, finished):
@@ -230,11 +223,13 @@ def test_names_are_data_to_plotly_and_to_the_page():
      ("NA", "NA"), (12345678.0, "1.23e+07"), (7, "7.000")],
 )  # fmt: skip
 def test_numbers_as_text(value, text):
-    assert number_text(value, 3) == text
+    assert compared.number_text(value, 3) == text
 
 
 def test_equals_share_the_mark_and_a_column_of_equals_has_none():
-    columns = [TableColumn("", "q", "", 1, lower_is_better) for lower_is_better in (True, False, None, True)]
+    columns = [compared.TableColumn("", "q", "", 1, lower_is_better) for lower_is_better in (True, False, None, True)]
     values = [(1.04, 3.0, 1.0, 5.0), (1.01, 9.0, 2.0, 5.0), (2.0, math.nan, 3.0, 5.0), (None, "NA", 4.0, 5.0)]
-    table = Table("t", columns, [TableRow("m", [TableCell(value) for value in row]) for row in values])
+    table = compared.Table(
+        "t", columns, [compared.TableRow("m", [compared.TableCell(value) for value in row]) for row in values]
+    )
     assert table.best() == {(0, 0), (1, 0), (1, 1)}

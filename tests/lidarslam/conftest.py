@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
-from hypothesis import HealthCheck, settings
 
 from lidarslam.compare.comparison import Counter, Narrator
 from lidarslam.core.geometry import FloatArray
@@ -49,12 +48,6 @@ def ends_well(*arguments: object) -> Result:
         assert len(result.stderr.splitlines()) == 1, result.stderr
         assert len(result.stderr) < 3000
     return result
-
-
-def fuzzed(examples: int) -> settings:
-    """Examples that follow from the test's name alone, so that a failure is found again."""
-    unimportant = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-    return settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=unimportant)
 
 
 @contextmanager

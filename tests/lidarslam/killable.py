@@ -70,8 +70,6 @@ for line in sys.stdin:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
-
     status: int
     said: str
     events: int

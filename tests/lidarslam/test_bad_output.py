@@ -36,15 +36,10 @@ def left_in(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) if folder.exists() else []
 
 
-@pytest.mark.parametrize(
-    ("size", "more"),
-    [
-        *((size, ()) for size in (0, 1_200, 4_000, 100_000)),
-        (300, ("--pose-graph",)),
-        (100_000, ("--pcd",)),
-        (4_000, ("--set", "global_map.most_points=2000")),
-    ],
-)
+@pytest.mark.parametrize(("size", "more"), [
+    *((size, ()) for size in (0, 1_200, 4_000, 100_000)), (300, ("--pose-graph",)), (100_000, ("--pcd",)),
+    (4_000, ("--set", "global_map.most_points=2000")),
+])  # fmt: skip
 def test_a_run_on_a_full_disk(tmp_path, small_recording, size, more):
     """The map is 300 kB, the log of the scans 600 bytes, the configuration 3.6 kB."""
     out = tmp_path / "run"
@@ -273,17 +268,10 @@ def test_standard_streams_that_are_closed_or_full(tmp_path, small_recording, red
 
 
 @pytest.mark.slow  # a process of its own for each
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-        {"HOME": None},
-        {"HOME": "/proc/self/task"},
-        {"TMPDIR": "/no/such/folder"},
-        {"TERM": "dumb", "COLUMNS": "1"},
-    ],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("changed", [
+    {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, {"HOME": None},
+    {"HOME": "/proc/self/task"}, {"TMPDIR": "/no/such/folder"}, {"TERM": "dumb", "COLUMNS": "1"},
+], ids=" ".join)  # fmt: skip
 def test_environments(tmp_path, small_recording, changed):
     source = shutil.copytree(small_recording, tmp_path / "Größe")
     ended = in_shell(f"{COMMAND} run '{source}' --out läuft {' '.join(FAST)} --pose-graph", tmp_path, **changed)

@@ -111,15 +111,10 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path):
     assert (tmp_path / "out" / "recordings" / "office" / "ground_truth.tum").is_file()
 
 
-@pytest.mark.parametrize(
-    ("name", "method", "closes_loops"),
-    [
-        ("learned+map", "surfels", False),
-        ("prior+loam+graph", "loam", True),
-        ("kiss-icp@0.5+loam", "loam", False),
-        ("learned+graph", "off", True),
-    ],
-)
+@pytest.mark.parametrize(("name", "method", "closes_loops"), [
+    ("learned+map", "surfels", False), ("prior+loam+graph", "loam", True), ("kiss-icp@0.5+loam", "loam", False),
+    ("learned+graph", "off", True),
+])  # fmt: skip
 @pytest.mark.parametrize("before", ["surfels", "loam", "off"])
 def test_the_name_decides_the_mapping(name, method, closes_loops, before):
     config = load_config(None, [f"mapping.method={before}", *parse_method(name).settings])
@@ -129,17 +124,12 @@ def test_the_name_decides_the_mapping(name, method, closes_loops, before):
 SCENE = {"odometry.kiss_icp.voxel_size_m": None, "odometry.kiss_icp.max_range_m": 13.5}
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("kiss-icp@0.5", {"odometry.kiss_icp.voxel_size_m": 0.5}),
-        ("kiss-icp@0.25+map", {"odometry.kiss_icp.voxel_size_m": 0.25}),
-        ("kiss-icp-no-deskew", {"odometry.kiss_icp.deskew": False}),
-        ("prior+map", {"odometry.method": "external"}),
-        ("kiss-icp-no-deskew@scene", {"odometry.kiss_icp.deskew": False, **SCENE}),
-        ("kiss-icp@scene+map", SCENE),
-    ],
-)
+@pytest.mark.parametrize(("name", "values"), [
+    ("kiss-icp@0.5", {"odometry.kiss_icp.voxel_size_m": 0.5}),
+    ("kiss-icp@0.25+map", {"odometry.kiss_icp.voxel_size_m": 0.25}),
+    ("kiss-icp-no-deskew", {"odometry.kiss_icp.deskew": False}), ("prior+map", {"odometry.method": "external"}),
+    ("kiss-icp-no-deskew@scene", {"odometry.kiss_icp.deskew": False, **SCENE}), ("kiss-icp@scene+map", SCENE),
+])  # fmt: skip
 def test_the_name_decides_the_settings(name, values):
     method = parse_method(name)
     before = ("odometry.kiss_icp.voxel_size_m=0.7", "odometry.kiss_icp.max_range_m=70")

@@ -172,23 +172,18 @@ def names(path: Path) -> list[str]:
     return sorted(entry.name for entry in path.iterdir())
 
 
-@pytest.fixture
-def earlier(tmp_path: Path) -> Path:
-    """A directory with an earlier run and a file of the user's."""
-    with RunDirectory.create(tmp_path / "run") as directory:
-        directory.write_text(CONFIG, "run:\n  version: 0\n")
-        directory.write_json(METRICS, {"ate": 1.0})
-    (tmp_path / "run" / "notes.txt").write_text("mine")
-    return tmp_path / "run"
-
-
 def test_a_new_directory_is_gone_when_nothing_came_of_the_run(tmp_path):
     with pytest.raises(RuntimeError), RunDirectory.create(tmp_path / "run"):
         raise RuntimeError
     assert names(tmp_path) == []
 
 
-def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier):
+def test_overwriting_replaces_the_earlier_run_and_nothing_else(tmp_path):
+    earlier = tmp_path / "run"
+    with RunDirectory.create(earlier) as directory:
+        directory.write_text(CONFIG, "run:\n  version: 0\n")
+        directory.write_json(METRICS, {"ate": 1.0})
+    (earlier / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="--overwrite"), RunDirectory.create(earlier):
         pass
     with pytest.raises(RuntimeError), RunDirectory.create(earlier, overwrite=True):

@@ -55,7 +55,6 @@ def _request(recording: Path, out: Path, methods: str, **changes: Any) -> Compar
 
 @pytest.fixture(scope="module")
 def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """Two methods, compared for real."""
     out = tmp_path_factory.mktemp("compared")
     return out, compare(_request(recording, out, "kiss-icp@0.5,prior"), Told().narrator)
 
@@ -264,8 +263,6 @@ def lines() -> list[str]:
 
 @pytest.fixture
 def run(tmp_path: Path, lines: list[str]) -> Run:
-    """Supervise a few lines of Python."""
-
     def supervised(code: str, **limits: float) -> Ending:
         return supervise([sys.executable, "-c", code], tmp_path / "log", Limits(**limits), lines.append)
 

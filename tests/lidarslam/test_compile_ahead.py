@@ -81,8 +81,6 @@ def test_a_run_compiles_the_parts_that_it_uses(settings, parts):
 
 
 class Popen(subprocess.Popen[bytes]):
-    """A process that sleeps, or fails, in place of one that compiles."""
-
     code = "import time; time.sleep(60)"
 
     def __init__(self, command: list[str], **options: object) -> None:

@@ -65,12 +65,6 @@ def pose(message: Any) -> FloatArray:
     return make_transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
 
 
-def stamp_ns(message: Any) -> int:
-    """Of a header; one library keeps ROS 1's names."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
 def xyz(cloud: Any) -> FloatArray:
     raw = np.frombuffer(bytes(cloud.data), np.uint8).reshape(cloud.width, cloud.point_step)
     assert [field.name for field in cloud.fields[:3]] == ["x", "y", "z"]
@@ -109,7 +103,8 @@ def test_poses_and_points_come_back(run, landmarks, tmp_path, name, read):
     stamps_ns = [round(stamp * 1e9) for stamp in scans.trajectory.stamps]
     assert sorted(messages) == ["/map_points", "/odometry", "/path", "/points", "/tf"]
     for topic in ("/odometry", "/points"):
-        assert [stamp_ns(message) for _, message in messages[topic]] == stamps_ns
+        stamps = [message.header.stamp for _, message in messages[topic]]
+        assert [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps] == stamps_ns
         assert [recorded for recorded, _ in messages[topic]] == stamps_ns
     for number, (_, odometry) in enumerate(messages["/odometry"]):
         T = scans.trajectory.T_world_lidar[number]

@@ -52,14 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, truth: FloatArray) -> Path:
     return write_run(folder / "run", Trajectory(stamps, T), cloud, source=str(folder / "drive.bag"))
 
 
-def write_bag(
-    path: Path,
-    stamps: FloatArray,
-    T_utm_lidar: FloatArray,
-    clouds: list[FloatArray] | None = None,
-    T_utm_fix: FloatArray | None = None,
-    variance: float = 0.01,
-) -> None:
+def write_bag(path: Path, stamps: FloatArray, T_utm_lidar: FloatArray, clouds=None, T_utm_fix=None, variance=0.01):
     T = T_utm_lidar if T_utm_fix is None else T_utm_fix
     antenna = T[:, :3, :3] @ ANTENNA + T[:, :3, 3]
     longitude, latitude = pyproj.Transformer.from_crs(32756, 4326, always_xy=True).transform(*antenna[:, :2].T)

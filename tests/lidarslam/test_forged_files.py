@@ -9,7 +9,6 @@ import pytest
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import open_own
 from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.storage.finished_run import run_directories
 
 from ..conftest import succeeds
 from .conftest import refused
@@ -18,27 +17,11 @@ DEEP = "[" * 100_000
 LONG = "9" * 5_000
 
 
-SUMMARIES = [
-    DEEP,
-    '{"scans": 1e999}',
-]
-
-
-@pytest.mark.parametrize("text", SUMMARIES, ids=range(len(SUMMARIES)))
+@pytest.mark.parametrize("text", [DEEP, '{"scans": 1e999}'], ids=range(2))
 def test_a_forged_summary(finished_run, text):
     (finished_run / "summary.json").write_text(text)
     said = refused("view", finished_run, "--save", finished_run / "view.rrd")
     assert "summary.json: not a run's summary" in said
-
-
-COMPARISONS = ['{"methods": {"a": {"run": "../../x"}}}', '{"methods": {"a": {"run": "/etc"}}}', '{"sequences": [5]}']
-
-
-@pytest.mark.parametrize("text", COMPARISONS, ids=range(len(COMPARISONS)))
-def test_a_forged_comparison(tmp_path, text):
-    (tmp_path / "comparison.json").write_text(text)
-    with pytest.raises(InputError, match=r"comparison\.json: not a comparison"):
-        run_directories(tmp_path)
 
 
 @pytest.mark.parametrize("count", ["99999999999999999999", "9223372036854775807", "1000000000000", LONG])

@@ -25,8 +25,9 @@ from lidarslam.simulation.recorder import Rig, SimulatedScan
 from lidarslam.simulation.writers import FORMATS, write_kitti, write_ply_scans
 from lidarslam.storage.finished_run import load_map
 
+from .. import conftest
 from ..conftest import write_recording
-from . import conftest
+from ..datasets.conftest import write_pcap
 from .conftest import FAST, ends_well
 
 pytestmark = pytest.mark.slow
@@ -104,24 +105,18 @@ def simulated(room, drive) -> list[SimulatedScan]:
     return scans
 
 
-def write_pcap(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+def write_capture(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
     """A third of a second of a VLP-16 that sees 5 m everywhere."""
     folder.mkdir()
-    with (folder / "drive.pcap").open("wb") as file:
-        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
-        for number in range(260):
-            second = number * 24 * 55.296e-6
-            blocks = [
-                struct.pack("<HH", 0xEEFF, round(36000 * (10 * second + block * 0.0011)) % 36000)
-                + struct.pack("<HB", 2500 + 40 * block, 9) * 32
-                for block in range(12)
-            ]
-            payload = b"".join(blocks) + struct.pack("<IBB", round(1e6 * (123.25 + second)), 0x37, 0x22)
-            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
-            ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, b"\xc0\xa8\1\xc9", b"\xff" * 4)
-            frame = b"\xff" * 6 + b"\1" * 6 + b"\x08\x00" + ip + udp
-            stamp = divmod(round(1e6 * (1_700_000_123.25 + second)), 10**6)
-            file.write(struct.pack("<IIII", *stamp, len(frame), len(frame)) + frame)
+    seconds, payloads = 24 * 55.296e-6 * np.arange(260), []
+    for second in seconds:
+        blocks = [
+            struct.pack("<HH", 0xEEFF, round(36000 * (10 * second + block * 0.0011)) % 36000)
+            + struct.pack("<HB", 2500 + 40 * block, 9) * 32
+            for block in range(12)
+        ]
+        payloads.append(b"".join(blocks) + struct.pack("<IBB", round(1e6 * (123.25 + second)), 0x37, 0x22))
+    write_pcap(folder / "drive.pcap", payloads, 1_700_000_123.25 + seconds)
 
 
 def write_npy(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
@@ -138,7 +133,7 @@ RECORDINGS: dict[str, tuple[Callable[..., None], str, tuple[str, ...]]] = {
     "rosbag1": (FORMATS["rosbag1"].write, ".", ("*.bag",)),
     "rosbag2": (FORMATS["rosbag2"].write, ".", ("*.db3", "metadata.yaml")),
     "mcap": (FORMATS["mcap"].write, ".", ("*.mcap", "metadata.yaml")),
-    "pcap": (write_pcap, "drive.pcap", ("drive.pcap",)),
+    "pcap": (write_capture, "drive.pcap", ("drive.pcap",)),
 }
 
 
@@ -224,6 +219,8 @@ def reference_maps(tmp_path_factory: pytest.TempPathFactory, whole_run: Path) ->
 
 @pytest.mark.parametrize("name", ["map.las", "map.laz", "map.ply", "map.pcd"])
 def test_a_damaged_reference_map(tmp_path, whole_run, reference_maps, monkeypatch, name):
+    @fuzzed
+    @given(changes)
     def check(made: list[Change]) -> None:
         shutil.copytree(whole_run, tmp_path / "out", dirs_exist_ok=True)
         (tmp_path / name).write_bytes(changed((reference_maps / name).read_bytes(), made))

@@ -26,7 +26,6 @@ WRITING = "the results so far are being written"
 
 
 def press() -> None:
-    """Ctrl-C."""
     signal.raise_signal(signal.SIGINT)
 
 
@@ -58,7 +57,6 @@ def pressed_at(monkeypatch: pytest.MonkeyPatch, place: str, times: int) -> None:
 
 
 def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    """Press Ctrl-C after a scan."""
     add = ScanLog.add
 
     def pressing(self: ScanLog, *given: object) -> None:

@@ -1,26 +1,23 @@
 """`lidarslam localise`: a recording of a room found in the map of a run, and one of another room refused."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory import read_tum
 from lidarslam.storage.finished_run import load_run
 
-from ..conftest import succeeds, write_recording
+from ..conftest import Drive, succeeds, write_recording
 from .conftest import FAST, refused, summary_of
 
-Drive = Callable[[FloatArray], FloatArray]
 SCANS, FIRST = 34, 8
 WITHOUT_ODOMETRY = ["--odometry", "constant-velocity"]
 
 
 def record(folder: Path, room: Any, drive: Drive) -> Path:
-    """Scans as .npy files, with times and stamps."""
     scans = (room.sweep(drive, 0.1 * number) for number in range(1, SCANS + 1))
     return write_recording(folder, scans, is_timed=True)
 
@@ -33,13 +30,11 @@ def room(room: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive) -> Path:
-    """Of the room."""
     return record(tmp_path_factory.mktemp("recordings") / "room", room, drive)
 
 
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory, recording: Path) -> Path:
-    """A run of it."""
     out = tmp_path_factory.mktemp("runs") / "mapped"
     succeeds("run", recording, "-o", out, *FAST)
     return out

@@ -1,6 +1,5 @@
 """Maps that are joined, cleaned, levelled, cropped: clouds whose points are known."""
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 from lidarslam.storage.finished_run import load_map
 
 from ..conftest import lidarslam, succeeds, write_run
+from ..mapping.shapes import l_shaped_room
 
 TILT = exp([np.deg2rad(7.0), 0.0, 0.0, 0.0, 0.0, 0.0])
 POSES = TILT @ exp(np.linspace(0.0, 1.0, 41)[:, None] * [0.0, 0.0, 0.5, 4.0, 0.0, 0.0])
@@ -89,33 +89,22 @@ def test_floaters_are_removed_and_nothing_else(tmp_path, method):
     np.testing.assert_array_equal(cloud.attributes.intensity, np.arange(len(grid)))
 
 
-def l_shaped(rng: np.random.Generator) -> PointCloud:
-    """The floor and walls of an L-shaped room with boxes, which looks alike from no two sides."""
-    corners = [(0, 0), (9, 0), (9, 4), (4, 4), (4, 7), (0, 7), (0, 0)]
-    walls = [np.add(a, rng.random((1500, 1)) * np.subtract(b, a)) for a, b in pairwise(corners)]
-    parts = [np.column_stack([wall, rng.uniform(0.0, 2.5, len(wall))]) for wall in walls]
-    floor = rng.uniform([0.0, 0.0], [9.0, 7.0], (3000, 2))
-    floor = floor[(floor[:, 0] < 4.0) | (floor[:, 1] < 4.0)]
-    points = np.concatenate([*parts, np.column_stack([floor, np.zeros(len(floor))])])
-    return PointCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
-
-
 @pytest.mark.long
 def test_clouds_are_joined_where_they_lie(tmp_path):
-    room, T = l_shaped(np.random.default_rng(5)), exp([0.02, -0.03, 2.4, 2.0, -1.0, 0.3])
-    write_cloud(tmp_path / "first.ply", room)
-    write_cloud(tmp_path / "other.ply", moved(l_shaped(np.random.default_rng(6)), inverse(T)))
+    room, again = (l_shaped_room(np.random.default_rng(seed), 6_000) for seed in (5, 6))
+    T, other = exp([0.02, -0.03, 2.4, 2.0, -1.0, 0.3]), PointCloud(again, np.tile([0.0, 0.0, 1.0], (len(again), 1)))
+    write_cloud(tmp_path / "first.ply", PointCloud(room, np.tile([0.0, 0.0, 1.0], (len(room), 1))))
+    write_cloud(tmp_path / "other.ply", moved(other, inverse(T)))
     np.savetxt(tmp_path / "T.txt", T)
     sources = tmp_path / "first.ply", tmp_path / "other.ply"
-    expected = np.concatenate([room.points, l_shaped(np.random.default_rng(6)).points])
+    expected = np.concatenate([room, again])
     cloud, _ = edited(tmp_path / "given.ply", *sources, "--transform", tmp_path / "T.txt")
     np.testing.assert_allclose(cloud.points, expected, atol=1e-5)
     cloud, said = edited(tmp_path / "registered.ply", *sources, "--register")
     assert "other.ply: registered, from everywhere; 100 % of it within 0.20 m" in said
     np.testing.assert_allclose(cloud.points, expected, atol=0.03)
     cloud, _ = edited(tmp_path / "plain.ply", *sources)
-    apart = transform_points(inverse(T), expected[len(room) :])
-    np.testing.assert_allclose(cloud.points[len(room) :], apart, atol=1e-5)
+    np.testing.assert_allclose(cloud.points[len(room) :], transform_points(inverse(T), again), atol=1e-5)
 
 
 @pytest.mark.parametrize(

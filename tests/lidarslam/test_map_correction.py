@@ -139,14 +139,10 @@ def test_a_map_that_has_begun_since_stays(room_scans):
     assert mapper.process(mapper.sample(room_scans[6]), Prior()).registered  # to the last four scans, which are in it
 
 
-@pytest.mark.parametrize(
-    ("settings", "kept_scans"),
-    [
-        (["pose_graph.enabled=true"], SCANS_LATER),
-        (["pose_graph.enabled=true", "pose_graph.corrects_local_map=false"], 0),
-        ([], 0),
-    ],
-)
+@pytest.mark.parametrize(("settings", "kept_scans"), [
+    (["pose_graph.enabled=true"], SCANS_LATER), (["pose_graph.enabled=true", "pose_graph.corrects_local_map=false"], 0),
+    ([], 0),
+])  # fmt: skip
 def test_runs_with_a_graph_correct_their_map_unless_told_otherwise(settings, kept_scans):
     mapper = make_localiser(load_config(None, settings)).mapper
     assert mapper.kept_scans == kept_scans

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.storage.directory import MAPS, remove_run
 from lidarslam.storage.finished_run import load_map
 
-from ..conftest import lidarslam, succeeds
+from ..conftest import Drive, lidarslam, succeeds
 
 FAST = ("--no-report", "--odometry", "constant-velocity", "--set", "global_map.voxel_size_m=0.1")
 MOST = 2_000
@@ -26,7 +25,6 @@ BOUND = ("--set", f"global_map.most_points={MOST}")
 
 @pytest.fixture(scope="module")
 def whole(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with its map in one piece."""
     out = tmp_path_factory.mktemp("runs") / "whole"
     succeeds("run", small_recording, "--out", out, *FAST)
     assert not (out / "map").exists()
@@ -155,7 +153,7 @@ def colours(in_room: FloatArray) -> FloatArray:
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[[FloatArray], FloatArray]) -> Path:
+def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive) -> Path:
     """A drive whose intensities and colours follow from where a point lies; the ring is the number of the scan."""
     folder = tmp_path_factory.mktemp("recordings") / "room"
     folder.mkdir()
@@ -176,7 +174,6 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[
 
 
 def run(source: Path, out: Path, *arguments: str) -> str:
-    """Run a recording; what it printed."""
     return succeeds("run", source, "--out", out, *SETTINGS, *(one.format(source) for one in arguments))
 
 

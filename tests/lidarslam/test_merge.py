@@ -55,11 +55,8 @@ def record(folder: Path, office: int, since_s: float, scans: int, noise: int) ->
 def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Two walks that share some metres, and one in another office."""
     root = tmp_path_factory.mktemp("recordings")
-    return {
-        "first": record(root / "first", 0, 2.5, 90, 0),
-        "second": record(root / "second", 0, 5.0, 75, 1),
-        "foreign": record(root / "foreign", 5, 3.5, 12, 2),
-    }
+    walks = {"first": (0, 2.5, 90, 0), "second": (0, 5.0, 75, 1), "foreign": (5, 3.5, 12, 2)}
+    return {name: record(root / name, *walk) for name, walk in walks.items()}
 
 
 def request(out: Path, *sources: Path, settings: tuple[str, ...] = (), **more: Any) -> MergeRequest:
@@ -185,7 +182,6 @@ FAST = ("odometry.method=constant-velocity", "checkpoints.every_scans=1")
 
 @pytest.fixture
 def rooms(tmp_path: Path, room_scans: list[Scan]) -> list[Path]:
-    """Three short recordings."""
     return [write_recording(tmp_path / f"in room {number}", room_scans[:5]) for number in range(3)]
 
 

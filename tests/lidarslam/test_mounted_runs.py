@@ -34,7 +34,6 @@ CONSTANT = ["--odometry", "constant-velocity"]
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    """A walk along a street with a VLP-16."""
     return make_simulation(RecordRequest(Path(), "street", "vlp-16", "handheld", "upright", SCANS, 3, ""))
 
 
@@ -110,14 +109,10 @@ def test_a_resumed_run_guesses_the_same(recordings, upright, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("method", "turn"),
-    [
-        ("imu", "rolled"),
-        pytest.param("imu", "camera", marks=pytest.mark.slow),
-        pytest.param("learned+imu", "rolled", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("method", "turn"), [
+    ("imu", "rolled"), pytest.param("imu", "camera", marks=pytest.mark.slow),
+    pytest.param("learned+imu", "rolled", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_with_the_imu(recordings, tmp_path, method, turn):
     odometry = ["--odometry", method]
     mounting = ["--set", f"reader.mounting={'left' if turn == 'rolled' else 'camera'}"]

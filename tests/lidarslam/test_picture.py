@@ -59,11 +59,6 @@ def line(y: float, reach_m: float = 9.0) -> FloatArray:
 NOTHING = cloud(np.empty((0, 3)))
 
 
-def drawn(picture: Picture) -> NDArray[np.bool_]:
-    """(height, width) which pixels of the map are not paper."""
-    return (picture.pixels[: picture.view.height] < 250).any(axis=2)
-
-
 def near(picture: Picture, point: FloatArray, reach: int = 1) -> NDArray[np.int64]:
     """The colours (K, 3) about the pixel of a point."""
     column, row = np.round(picture.view.project(point[None])[0]).astype(int)
@@ -83,7 +78,7 @@ def test_every_point_is_drawn_at_its_pixel(rng, scale, elevation_deg):
     pixels = picture.view.project(points)
     assert (pixels > 5).all()
     assert (pixels < [picture.view.width - 5, picture.view.height - 5]).all()
-    covered = drawn(picture)
+    covered = (picture.pixels[: picture.view.height] < 250).any(axis=2)  # of the map; the rest is paper
     for column, row in np.round(pixels).astype(int):
         assert covered[row - 1 : row + 2, column - 1 : column + 2].any()
     # And nothing elsewhere: a point covers a few pixels, whatever the scale.

@@ -39,16 +39,12 @@ def register(slam: Slam, scans: list[Scan]) -> list[RegisteredScan]:
     return [slam.register_frame(scan.points, scan.time_offsets, scan.stamp) for scan in scans]
 
 
-def from_start(truth: Trajectory) -> Trajectory:
-    return truth.transformed(inverse(truth.T_world_lidar[0]))
-
-
 def map_errors(slam: Slam, room: Any, truth: Trajectory) -> Any:
     return room.distance_to_surface(transform_points(truth.T_world_lidar[0], slam.map().points))
 
 
 def test_each_pose_is_returned_at_once(slam, room_scans, room_truth):
-    results, truth = register(slam, room_scans), from_start(room_truth)
+    results, truth = register(slam, room_scans), room_truth.transformed(inverse(room_truth.T_world_lidar[0]))
     assert [result.stamp for result in results] == [scan.stamp for scan in room_scans]
     assert {result.status for result in results} == {Status.OK}
     positions = np.array([result.T_world_lidar[:3, 3] for result in results])
@@ -193,25 +189,18 @@ def test_without_stamps_scans_come_at_the_rate(room_scans):
 POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (60, 3))
 
 
-@pytest.mark.parametrize(
-    ("points", "times", "stamp", "told"),
-    [
-        (np.zeros((5, 2)), None, 0.2, r"must be \(N, 3\).* \(5, 2\)"),
-        (POINTS.T, None, 0.2, r"\(3, 60\); give points\.T"),
-        (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "points must be numbers"),
-        (np.array([["a", "b", "c"]]), None, 0.2, "must be numbers"),
-        (POINTS, np.zeros(7), 0.2, "7 for 60 points"),
-        (POINTS, np.full(60, 1.7e9), 2.0, "subtract the stamp"),
-        (POINTS, np.linspace(0, 1e8, 60), 2.0, "nanoseconds by 1e-9"),
-        (POINTS, np.linspace(0, 1, 60), 0.2, "multiply times from 0 to 1"),
-        (POINTS, None, 0.1, "is not after the scan before, 0.100000000 s"),
-        (POINTS, None, None, "with every scan or with none"),
-        (POINTS, None, float("nan"), "finite"),
-        (POINTS, None, 1_700_000_000_000_000_000, "nanoseconds by 1e-9"),
-        (POINTS, None, "now", "stamp must be numbers"),
-        (Scan(POINTS, 0.2), None, 0.2, "give it alone"),
-    ],
-)
+@pytest.mark.parametrize(("points", "times", "stamp", "told"), [
+    (np.zeros((5, 2)), None, 0.2, r"must be \(N, 3\).* \(5, 2\)"), (POINTS.T, None, 0.2, r"\(3, 60\); give points\.T"),
+    (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "points must be numbers"),
+    (np.array([["a", "b", "c"]]), None, 0.2, "must be numbers"), (POINTS, np.zeros(7), 0.2, "7 for 60 points"),
+    (POINTS, np.full(60, 1.7e9), 2.0, "subtract the stamp"),
+    (POINTS, np.linspace(0, 1e8, 60), 2.0, "nanoseconds by 1e-9"),
+    (POINTS, np.linspace(0, 1, 60), 0.2, "multiply times from 0 to 1"),
+    (POINTS, None, 0.1, "is not after the scan before, 0.100000000 s"),
+    (POINTS, None, None, "with every scan or with none"), (POINTS, None, float("nan"), "finite"),
+    (POINTS, None, 1_700_000_000_000_000_000, "nanoseconds by 1e-9"), (POINTS, None, "now", "stamp must be numbers"),
+    (Scan(POINTS, 0.2), None, 0.2, "give it alone"),
+])  # fmt: skip
 def test_what_cannot_be_used_is_refused_and_changes_nothing(slam, room_scans, points, times, stamp, told):
     register(slam, room_scans[:1])
     with pytest.raises(InputError, match=told):

@@ -24,16 +24,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.storage.finished_run import FinishedRun
-from lidarslam.viewer import rerun_environment, rerun_program
+from lidarslam.viewer import rerun_environment, rerun_program, rerun_recording
 from lidarslam.viewer.rerun_program import WebPage, is_taken, open_window, served_page
-from lidarslam.viewer.rerun_recording import (
-    IncompleteRecordingError,
-    require_complete,
-    rerun_viewer,
-    save,
-    show_file_in_window,
-    show_in_window,
-)
 from lidarslam.viewer.rerun_scenes import show_runs
 
 from .conftest import files_no_longer_than
@@ -55,12 +47,6 @@ INDEX = b"""<html><link rel="icon" href="favicon.ico" />
 /><script src="re_viewer.js"></script></html>"""
 
 
-@pytest.fixture
-def finished() -> FinishedRun:
-    trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
-    return FinishedRun("my run", trajectory, np.zeros(3, dtype=np.bool_), np.eye(3), np.array([[0, 2]]))
-
-
 @pytest.mark.parametrize("size", [0, 1_000, 100_000])
 def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(tmp_path, monkeypatch, size):
     """Rerun's own writer is never told, because it may wait without end then; the room it took is given back."""
@@ -68,8 +54,8 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(tmp_path, m
     begun = time.monotonic()
     with (
         files_no_longer_than(size),
-        pytest.raises(IncompleteRecordingError, match="is the disk full"),
-        rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
+        pytest.raises(rerun_recording.IncompleteRecordingError, match="is the disk full"),
+        rerun_recording.rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
     ):
         for seed in range(20):
             viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
@@ -78,21 +64,18 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(tmp_path, m
     assert not rerun_environment.abandoned
 
 
-@pytest.fixture
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(monkeypatch, small_recording, tmp_path):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setattr("lidarslam.viewer.rerun_program.is_taken", lambda _: False)
-
-
-@pytest.mark.usefixtures("no_display")
-def test_no_display_gets_one_line_and_ends_a_run_before_it_begins(finished, small_recording, tmp_path):
+    trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    finished = FinishedRun("my run", trajectory, np.zeros(3, dtype=np.bool_), np.eye(3), np.array([[0, 2]]))
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
-        show_in_window(show_runs([finished], None, ViewerConfig()))
-    save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
+        rerun_recording.show_in_window(show_runs([finished], None, ViewerConfig()))
+    rerun_recording.save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
     with pytest.raises(OutputError, match=r"no display .* --web"):
-        show_file_in_window(tmp_path / "runs.rrd")
+        rerun_recording.show_file_in_window(tmp_path / "runs.rrd")
     request = RunRequest(small_recording, tmp_path / "run", load_config(None), rerun="spawn")
     with pytest.raises(OutputError, match=r"no display .* --rerun web, .* --rerun save"):
         execute(request, lambda *_: None)
@@ -271,7 +254,7 @@ def test_a_run_is_served_while_it_goes_on_and_afterwards(serve, small_recording,
         assert line or process.poll() is None, "ended early"
         lines.append(line)
     assert "written to" in "".join(lines)
-    require_complete(out / "recording.rrd")
+    rerun_recording.require_complete(out / "recording.rrd")
     assert seen == (out / "recording.rrd").read_bytes()
     assert f"lidarslam view {out / 'recording.rrd'} --web" in line
     with urlopen(f"{address}/?url=there", timeout=120) as page:

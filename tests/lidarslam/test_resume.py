@@ -191,7 +191,6 @@ def test_a_run_may_be_killed_before_anything_it_does_on_disk(whole, tmp_path, me
 
 
 def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
-    """All that lies in a folder."""
     return tuple(
         (str(path.relative_to(folder)), hashlib.sha256(path.read_bytes()).digest() if path.is_file() else b"")
         for path in sorted(folder.rglob("*"))
@@ -211,7 +210,6 @@ def test_a_run_that_is_stopped_can_be_resumed_as_well(expected, tmp_path):
 
 @pytest.fixture(scope="module")
 def killed_once(expected: Whole, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The directory of a run that was killed half way."""
     out = tmp_path_factory.mktemp("killed") / "run"
     assert expected.again(out, kill_at=expected.ended.events // 3).status == KILLED
     assert (out / "unfinished" / "state.npz").exists()
@@ -220,7 +218,6 @@ def killed_once(expected: Whole, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture
 def killed(killed_once: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
     return Path(shutil.copytree(killed_once, tmp_path / "run"))
 
 
@@ -229,22 +226,17 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def assert_refused(ended: Ended, told: str) -> None:
-    """See that a command was refused in one line."""
     assert ended.status == 1
     assert told in ended.said
     assert ended.said.count("\n") == 1
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--stop", "13"], "stop 12 (now 13)"),
-        (["--start", "1"], "start 0 (now 1)"),
-        (["--pose-graph"], "pose_graph.enabled False (now True)"),
-        (["--odometry", "learned"], "odometry.method constant-velocity (now learned)"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "told"), [
+    (["--stop", "13"], "stop 12 (now 13)"), (["--start", "1"], "start 0 (now 1)"),
+    (["--pose-graph"], "pose_graph.enabled False (now True)"),
+    (["--odometry", "learned"], "odometry.method constant-velocity (now learned)"),
+])  # fmt: skip
 def test_another_run_is_not_resumed(expected, killed, arguments, told):
     before = contents(killed)
     assert_refused(expected.again(killed, *arguments, "--resume"), told)

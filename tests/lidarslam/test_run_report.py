@@ -29,7 +29,6 @@ def there(run: Path) -> list[str]:
 
 
 def figures(html: str) -> list[str]:
-    """Titles of the figures in order."""
     return re.findall(r"<figcaption><b>Figure \d+\. (.*?)\.</b>", html)
 
 
@@ -141,6 +140,9 @@ def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path, whole_run)
         ('{"sequences": [{"sequence": "north"}, {"sequence": "south"}]}', "several recordings.*name one of .*north"),
         ('{"methods": {"a": {"run": null}}}', "none of its methods came to a result"),
         ("no json", "not a comparison"),
+        ('{"methods": {"a": {"run": "../../x"}}}', r"comparison\.json: not a comparison"),
+        ('{"methods": {"a": {"run": "/etc"}}}', r"comparison\.json: not a comparison"),
+        ('{"sequences": [5]}', r"comparison\.json: not a comparison"),
     ],
 )
 def test_a_comparison_that_cannot_be_drawn_says_why(tmp_path, content, message):

@@ -1,7 +1,6 @@
 """Runs with loops given and forbidden, with LOAM, and what they say of times, elevations and maps that are wrong."""
 
 import csv
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
 from lidarslam.run.calibration import time_scale, time_scale_warning
 
-from ..conftest import lidarslam, succeeds, write_recording
+from ..conftest import Drive, lidarslam, succeeds, write_recording
 from ..mapping.runs import errors
 from .conftest import FAST, refused, summary_of
 
@@ -65,7 +64,7 @@ SCANS = 8
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[[FloatArray], FloatArray]) -> Path:
+def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive) -> Path:
     """Sweeps of a scanner with rings."""
     stamps = 0.1 * np.arange(1, SCANS + 1)
     scans, truth = (room.ring_sweep(drive, float(stamp)) for stamp in stamps), Trajectory(stamps, drive(stamps))

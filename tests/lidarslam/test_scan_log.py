@@ -164,13 +164,9 @@ def test_a_checkout_has_a_commit_and_says_that_files_differ(tmp_path, monkeypatc
     assert versions()["commit"] == f"{commit}-dirty"
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
 def test_before_the_first_scan_the_bar_says_what_goes_on(monkeypatch):
-    terminal = Terminal()
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
     monkeypatch.setattr("sys.stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     with show_progress("a[red]b[/nothing]") as progress:

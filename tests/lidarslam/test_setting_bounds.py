@@ -100,7 +100,6 @@ def needed(name: str, bound: float) -> list[str]:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) -> Path:
-    """Eight sweeps of 3 000 points, with their times."""
     scans = [scan.select(np.arange(0, 9000, 3)) for scan in room_scans[:8]]
     return write_recording(tmp_path_factory.mktemp("recordings") / "room", scans, is_timed=True)
 

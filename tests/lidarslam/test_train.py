@@ -381,17 +381,10 @@ def stretch(scans: int, simulated: bool) -> Stretch:
     return Stretch("some", identity, lambda: pytest.fail("opened"), 0, scans)
 
 
-@pytest.mark.parametrize(
-    ("recorded", "simulated", "weights"),
-    [
-        ([100, 300], [40, 40, 40], [0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3]),
-        ([1200], [40], [0.1, 0.1, 0.1, 0.7]),
-        ([10, 400], [], [1.0, 1.0]),
-        ([], [10, 400], [1.0, 1.0]),
-    ],
-)
-def test_recordings_have_their_share_of_the_pairs_by_their_lengths_and_long_ones_are_drawn_in_pieces(
-    recorded, simulated, weights
-):
+@pytest.mark.parametrize(("recorded", "simulated", "weights"), [
+    ([100, 300], [40, 40, 40], [0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3]), ([1200], [40], [0.1, 0.1, 0.1, 0.7]),
+    ([10, 400], [], [1.0, 1.0]), ([], [10, 400], [1.0, 1.0]),
+])  # fmt: skip
+def test_recordings_have_pairs_by_their_lengths_and_long_ones_are_drawn_in_pieces(recorded, simulated, weights):
     given = [*(stretch(scans, False) for scans in recorded), *(stretch(scans, True) for scans in simulated)]
     assert draw_weights(given) == pytest.approx(weights)

@@ -1,7 +1,5 @@
 """Trajectories aligned with GNSS tracks, and its positions in the graph of a drive whose edges drift."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -29,30 +27,25 @@ def drive(yaw_drift: float) -> FloatArray:
     return np.array(poses)
 
 
-@pytest.fixture
-def track(rng: np.random.Generator) -> ProjectedTrack:
-    """Fixes at 5 Hz, of which a stretch of a fifth is 20 to 40 m off."""
+def test_positions_take_the_drift_away_and_outliers_are_rejected(rng):
+    """Fixes are at 5 Hz; a stretch of a fifth of them is 20 to 40 m off."""
     poses = T_MAP_WORLD @ drive(0.0)[::2]
     antenna = poses[:, :3, :3] @ ANTENNA + poses[:, :3, 3] + rng.normal(0.0, SIGMA_M, (SCANS // 2, 3))
     antenna[100:160] += np.array([20.0, 20.0, 10.0]) + rng.normal(0.0, 5.0, (60, 3))
     stamps = PERIOD_S * np.arange(0, SCANS, 2)
     gnss = GnssTrack(stamps, np.zeros((len(stamps), 3)), np.full(len(stamps), SIGMA_M), ANTENNA)
-    return ProjectedTrack(gnss, antenna, 1.0)
-
-
-def test_positions_take_the_drift_away_and_outliers_are_rejected(track):
+    track = ProjectedTrack(gnss, antenna, 1.0)
     true, drifted = drive(0.0), drive(2e-4)
     scans = np.arange(0, SCANS, EVERY)
+    nodes = drifted[scans]
     registered = Trajectory(PERIOD_S * np.arange(SCANS), drifted)
-    edges = [
-        RelativePose(n, n + 1, inverse(drifted[a]) @ drifted[b], COVARIANCE) for n, (a, b) in enumerate(pairwise(scans))
-    ]
+    edges = [RelativePose(n, n + 1, T, COVARIANCE) for n, T in enumerate(inverse(nodes[:-1]) @ nodes[1:])]
     T_map_world = track.aligned(registered)
     positions = track.positions(registered, scans.tolist())
-    found = optimise(T_map_world @ drifted[scans], edges, [], [], positions)
+    found = optimise(T_map_world @ nodes, edges, [], [], positions)
     placed = T_MAP_WORLD @ true[scans]
     errors = np.linalg.norm(found.poses[:, :3, 3] + track.projected[0] - placed[:, :3, 3], axis=1)
-    drift = np.linalg.norm(drifted[scans][:, :3, 3] - true[scans][:, :3, 3], axis=1)
+    drift = np.linalg.norm(nodes[:, :3, 3] - true[scans][:, :3, 3], axis=1)
     assert drift.max() > 20.0
     assert errors.max() < 0.3
     rejected = np.flatnonzero(~found.position_inliers)

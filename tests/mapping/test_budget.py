@@ -126,9 +126,7 @@ def results(mapper: Mapper, faulty: Faulty, clock: FakeClock, first: int = 0) ->
 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", ["carried", pytest.param("covered", marks=pytest.mark.slow)])
-def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(
-    simulation, carried, clock, fault
-):
+def test_no_scan_takes_more_than_the_budget_and_a_registration_and_tracking_recovers(simulation, carried, clock, fault):
     faulty = carried if fault == "carried" else covered(simulation, AT, AT + 10, "empty")
     mapper = Mapper(MappingConfig(budget_ms=BUDGET_MS), clock=clock)
     mapped = list(results(mapper, faulty, clock))

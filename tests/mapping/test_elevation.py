@@ -55,11 +55,9 @@ def test_a_known_bias_is_found(street, low_deg):
 
 
 def test_a_common_offset_of_ranges_is_within_the_standard_deviation(street):
-    scans = [
-        replace(one, points=one.points * (1.0 + 0.02 / np.linalg.norm(one.points, axis=1))[:, None])
-        for one in stretch(street, 0.0)
-    ]
-    bias = estimate_bias(scans, EDGE_M)
+    scans = stretch(street, 0.0)
+    off = [replace(s, points=s.points * (1.0 + 0.02 / np.linalg.norm(s.points, axis=1))[:, None]) for s in scans]
+    bias = estimate_bias(off, EDGE_M)
     assert abs(bias.angle) < 2.0 * bias.sigma
 
 

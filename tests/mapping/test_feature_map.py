@@ -140,12 +140,10 @@ def test_the_plane_of_a_ring_s_beams_is_no_surface(rng, heights_m):
 
 def floor_ahead(rng: np.random.Generator, away_m: float, half_m: float, elevations: FloatArray) -> bool:
     """Whether points on a strip of floor ahead, with any of these elevations, make planes."""
-    count = 6000
-    floor = np.column_stack(
-        [rng.uniform(-half_m, half_m, count) + away_m, rng.uniform(-2.0, 2.0, count), np.full(count, -1.7)]
-    )
+    n = 6000
+    floor = np.column_stack([rng.uniform(-half_m, half_m, n) + away_m, rng.uniform(-2.0, 2.0, n), np.full(n, -1.7)])
     feature_map, sweep = FeatureMap(CELL_M, 100.0), Sweep(floor, None, kinds_of(NONE, floor))
-    feature_map.add(SampledScan(0.0, CELL_M, 1.0, sweep, np.resize(elevations, count), sweep), floor, ORIGIN)
+    feature_map.add(SampledScan(0.0, CELL_M, 1.0, sweep, np.resize(elevations, n), sweep), floor, ORIGIN)
     asked = np.column_stack([np.full(50, away_m), rng.uniform(-1.5, 1.5, 50), np.full(50, -1.7)])
     found = len(feature_map.match(asked, np.eye(4)))
     assert found in (0, 50)

@@ -181,10 +181,8 @@ def test_a_jerky_sweep_is_compensated_to_millimetres(stamp_at, rng):
     gyroscope = Preintegration(samples(jerky, 2.0), T_LIDAR_IMU[:3, :3])
     rate = gyroscope.mean_rate(sweep)
     velocity = np.concatenate([rate - T_LIDAR_IMU[:3, :3] @ BIAS, np.zeros(3)])
-    raw, evened = (
-        np.linalg.norm(move(scan.points, offsets, velocity) - points, axis=1).max()
-        for scan in (sweep, gyroscope.evened(sweep))
-    )
+    errors = [move(one.points, offsets, velocity) - points for one in (sweep, gyroscope.evened(sweep))]
+    raw, evened = (np.linalg.norm(error, axis=1).max() for error in errors)
     assert raw > 0.2
     assert evened < 0.007
 
@@ -378,10 +376,8 @@ def test_large_biases_are_reported(rng):
     assert "the IMU's gyroscope has a bias of 1.50 deg/s" in rates
 
 
-def compared(
-    motion: Path, rng: np.random.Generator, imu: ImuSamples, T_lidar_imu: FloatArray = T_LIDAR_IMU
-) -> Comparison:
-    comparison = Comparison(imu, T_lidar_imu)
+def compared(motion: Path, rng: np.random.Generator, imu: ImuSamples, T: FloatArray = T_LIDAR_IMU) -> Comparison:
+    comparison = Comparison(imu, T)
     for stamp in np.arange(0.5, imu.stamps[-1] - 0.1, PERIOD_S):
         error = exp(rng.normal(size=6) * ([np.deg2rad(0.05)] * 3 + [0.005] * 3))
         comparison.add(float(stamp), motion(stamp) @ error, True)
@@ -437,9 +433,8 @@ def test_what_no_turn_shows_stays_unknown(rng):
     ],
 )
 def test_signs_units_and_axes_that_cannot_be_right_are_seen(rates, forces, seen, rng):
-    imu, R = samples(walk, 12.0), T_LIDAR_IMU[:3, :3]
-    flawed = replace(
-        imu, angular_velocities=imu.angular_velocities @ R.T @ rates, accelerations=forces * imu.accelerations @ R.T
-    )
+    imu = samples(walk, 12.0)
+    turns, pulls = (values @ T_LIDAR_IMU[:3, :3].T for values in (imu.angular_velocities, imu.accelerations))
+    flawed = replace(imu, angular_velocities=turns @ rates, accelerations=forces * pulls)
     found = compared(walk, rng, flawed, make_transform(np.eye(3), T_LIDAR_IMU[:3, 3])).contradiction()
     assert found is None if seen is None else seen in str(found)

@@ -258,17 +258,12 @@ def test_edges_of_a_room_are_its_edges(room, drive, rng, sigma_m, false_edges):
     assert len(planes) > 0.5 * len(scan)
 
 
-def rows_of(features: FloatArray, scan: Scan) -> NDArray[np.intp]:
-    """Indices (M,) of the scan's points that features (M, 3) are."""
-    rows = {tuple(point): index for index, point in enumerate(scan.points)}
-    return np.array([rows[tuple(point)] for point in features], dtype=np.intp)
-
-
 def test_features_are_points_as_measured_with_their_times(ring_scans):
     scan = ring_scans[0]
     features = extract_features(scan, 0.5, 100.0, 0.1)
+    times = {tuple(point): time for point, time in zip(scan.points, scan.time_offsets, strict=True)}
     for sweep in features:
-        np.testing.assert_array_equal(sweep.times, scan.time_offsets[rows_of(sweep.points, scan)])
+        np.testing.assert_array_equal(sweep.times, [times[tuple(point)] for point in sweep.points])
     edges, planes = extract_features(replace(scan, time_offsets=None), 0.5, 100.0, 0.1)
     assert edges.times is None
     np.testing.assert_array_equal(planes.points, features[1].points)

@@ -150,9 +150,8 @@ def test_rooms_that_are_all_the_same_are_not_taken_for_one(min_way_m, min_simila
     """One room after the other, each exactly like the last: everything fits, and drift explains none of it."""
     monkeypatch.setattr(detection, "_MIN_SIMILARITY", min_similarity)
     rng = np.random.default_rng(0)
-    room = on_boxes(
-        [((0, 0, 1.5), (5, 4, 1.5)), ((3, 2, 0.6), (0.6, 1, 0.6)), ((-4, -1, 0.9), (0.7, 0.4, 0.9))], 0.035, rng, 0.005
-    )
+    boxes = [((0, 0, 1.5), (5, 4, 1.5)), ((3, 2, 0.6), (0.6, 1, 0.6)), ((-4, -1, 0.9), (0.7, 0.4, 0.9))]
+    room = on_boxes(boxes, 0.035, rng, 0.005)
     stands = make_transform(np.eye(3), np.array([[-2.0, -1.0, 1.3], [0.0, 0.5, 1.3], [2.0, -1.0, 1.3]]))
     truth, submaps = [], []
     for number in range(6):

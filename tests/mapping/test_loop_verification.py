@@ -19,18 +19,11 @@ from .shapes import on_boxes
 MIN_OVERLAP = LoopConfig().min_overlap
 # Centre and half sizes; the sensor stands inside.
 ROOM = [((0, 0, 1.5), (5, 4, 1.5)), ((3.2, 2.1, 0.6), (0.5, 1.1, 0.6)), ((-4.4, -1.5, 0.9), (0.6, 0.4, 0.9))]
-OTHER_ROOM = [
-    ROOM[0],
-    ((-1.2, 2.4, 0.9), (0.8, 0.5, 0.9)),
-    ((2.6, -1.5, 1.4), (0.6, 2.4, 1.4)),
-    ((-3.6, 0, 1), (0.9, 2, 1)),
-]
+OTHER = [ROOM[0], ((-1.2, 2.4, 0.9), (0.8, 0.5, 0.9)), ((2.6, -1.5, 1.4), (0.6, 2.4, 1.4)), ((-3.6, 0, 1), (0.9, 2, 1))]
 CORRIDOR = [((0, 0, 1.3), (60, 1.2, 1.3))]
 
 
-def submap_from(
-    boxes, T_world_lidar: FloatArray, seed: int, spacing_m: float = 0.08, reach_m: float = 25.0
-) -> SparseSubmap:
+def submap_from(boxes, T_world_lidar: FloatArray, seed: int, spacing_m=0.08, reach_m=25.0) -> SparseSubmap:
     points = on_boxes(boxes, spacing_m**2, np.random.default_rng(seed), 0.005)
     points = transform_points(inverse(T_world_lidar), points)
     points = points[np.linalg.norm(points, axis=1) < reach_m]
@@ -78,7 +71,7 @@ def test_covariance_has_floors_and_holds_the_error(room):
 
 
 def test_another_room_of_the_same_size_is_refused(room):
-    found = verify(room[0], place(OTHER_ROOM, SECOND, 3), TRUE)
+    found = verify(room[0], place(OTHER, SECOND, 3), TRUE)
     assert found.objection(MIN_OVERLAP)
     right = verify(*room, TRUE)
     assert found.overlap < right.overlap - 0.1
@@ -102,9 +95,7 @@ def test_a_pole_has_no_direction():
     stands = SubmapCloud.join(SparseSubmap.of(np.concatenate([floor, *poles]), 60.0))
     assert stands.is_line.sum() > 50
     turned = replace(stands, axes=np.where(stands.is_line[:, None], -stands.axes, stands.axes))
-    assert (
-        evaluate(stands, turned, np.eye(4)).inliers == evaluate(stands, stands, np.eye(4)).inliers == len(stands.points)
-    )
+    assert [evaluate(stands, one, np.eye(4)).inliers for one in (stands, turned)] == [len(stands.points)] * 2
 
 
 def test_a_corridor_says_nothing_along_itself():
@@ -120,17 +111,13 @@ def test_a_corridor_says_nothing_along_itself():
     assert "degenerate in" in found.objection(MIN_OVERLAP)
 
 
-def doors(first_x: float):
-    """A corridor with closets that reach into it, every four metres but one."""
-    closets = [((x, 0.9, 1.3), (0.4, 0.3, 1.3)) for x in first_x + np.array([-12, -8, -4, 0, 4, 12])]
-    return [*CORRIDOR, *closets]
-
-
 def test_along_a_corridor_what_would_tell_must_fit():
     first, second = pose(0.0, -0.3, 0.0), pose(0.3, -0.3, 0.0)
 
-    def stand(closets_from: float, T: FloatArray, seed: int) -> SubmapCloud:
-        return SubmapCloud.join(submap_from(doors(closets_from), T, seed, 0.06, 9.0))
+    def stand(first_x: float, T: FloatArray, seed: int) -> SubmapCloud:
+        """In a corridor with closets that reach into it, every four metres but one."""
+        closets = [((x, 0.9, 1.3), (0.4, 0.3, 1.3)) for x in first_x + np.array([-12, -8, -4, 0, 4, 12])]
+        return SubmapCloud.join(submap_from([*CORRIDOR, *closets], T, seed, 0.06, 9.0))
 
     target, source, elsewhere = stand(1.0, first, 1), stand(1.0, second, 2), stand(2.7, second, 2)
     right = verify(target, source, inverse(first) @ second)
@@ -147,10 +134,8 @@ def test_neighbours_that_drift_may_have_moved_count_less(room):
     wrong = exp([0, 0, 0, 0.15, 0.1, 0.0]) @ inverse(FIRST) @ stand
     around = [(wrong, submap_from(ROOM, stand, 5)), (wrong, submap_from(ROOM, stand, 6))]
     trusted = SubmapCloud.join(room[0].submap, around, [0, 0])
-    doubted, source = (
-        replace(place, drift_rates=(0.02, 0.05))
-        for place in (SubmapCloud.join(room[0].submap, around, [3, 3]), room[1])
-    )
+    joined = SubmapCloud.join(room[0].submap, around, [3, 3])
+    doubted, source = (replace(one, drift_rates=(0.02, 0.05)) for one in (joined, room[1]))
     found = [verify(*pair, TRUE).T_target_source for pair in ((trusted, room[1]), (doubted, source))]
     off, _ = errors(np.array(found), TRUE)
     assert off[0] > 0.03
@@ -159,11 +144,9 @@ def test_neighbours_that_drift_may_have_moved_count_less(room):
 
 def test_covariance_holds_what_drift_does_within_a_place(room):
     def covariance(target_middle: float, source_middle: float, ahead: float) -> FloatArray:
-        rates = (0.01, 0.02)
-        target = replace(room[0], middle_m=target_middle, drift_rates=rates)
-        source = replace(
-            room[1], middle_m=source_middle, drift_rates=rates, ahead_m=np.full(len(room[1].points), ahead)
-        )
+        first, second = (replace(one, drift_rates=(0.01, 0.02)) for one in room)
+        target = replace(first, middle_m=target_middle)
+        source = replace(second, middle_m=source_middle, ahead_m=np.full(len(second.points), ahead))
         return evaluate(target, source, TRUE).covariance
 
     more = covariance(1.0, 2.0, 0.0) - covariance(0.0, 0.0, 0.0)

@@ -300,18 +300,16 @@ def disturbed_scans(room_scans: list[Scan]) -> list[Scan]:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("method", "recording", "resumed_after"),
+    ("method", "recording", "resumed"),
     [("surfels", "disturbed_scans", (1, 6, 8)), ("loam", "ring_scans", (1, 7))],
 )
-def test_a_restored_mapper_goes_on_to_the_last_bit(
-    through_disk, request, monkeypatch, method, recording, resumed_after
-):
+def test_a_restored_mapper_goes_on_to_the_last_bit(through_disk, request, monkeypatch, method, recording, resumed):
     monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
     config, scans = MappingConfig(keypoints=600, method=method), request.getfixturevalue(recording)[:12]
     expected = process(Mapper(config), scans)
     assert Status.OK in {mapped.status for mapped in expected}
     assert any("a new map" in mapped.message for mapped in expected) == (method == "surfels")
-    for after in resumed_after:
+    for after in resumed:
         first, second = Mapper(config), Mapper(config)
         process(first, scans[:after])
         second.restore(through_disk(first.state()))

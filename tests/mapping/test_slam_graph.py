@@ -16,7 +16,6 @@ from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan, KeyframeGraph
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .runs import assert_near
 
@@ -226,23 +225,17 @@ def test_the_map_is_drawn_where_the_scans_have_gone(walk, closed):
     assert np.percentile(drawn, 90.0) < 0.5 * np.percentile(off, 90.0)
 
 
-@pytest.fixture(scope="module")
-def redrawn(walk: Walk) -> list[tuple[int, SurfelMap]]:
-    """The local maps that are drawn anew on the way, with the scans after which they are."""
-    graph, drawn = SlamGraph(CONFIG, local_radius_m=8.0), []
+@pytest.mark.long
+def test_the_local_map_is_drawn_anew_where_the_second_round_is(walk):
+    """Surfaces of the first round lie where the truth has them relative to the sensor, which has drifted away."""
+    graph, redrawn = SlamGraph(CONFIG, local_radius_m=8.0), []
     for i, scan in enumerate(walk.scans()):
         graph.add(scan)
         local_map = graph.redrawn_local_map(CELL_M)
         if local_map is not None:
-            drawn.append((i, local_map))
+            redrawn.append((i, local_map))
         graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
     graph.close()
-    return drawn
-
-
-@pytest.mark.long
-def test_the_local_map_is_drawn_anew_where_the_second_round_is(walk, redrawn):
-    """Surfaces of the first round lie where the truth has them relative to the sensor, which has drifted away."""
     assert 1 <= len(redrawn) <= 3
     first_round = np.concatenate([transform_points(walk.truth[i], walk.points[i]) for i in range(8)])
     for i, local_map in redrawn:
@@ -346,9 +339,7 @@ def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace
     first = result.keyframe_scans[result.keyframe_recordings == 1][0]
     np.testing.assert_allclose(result.T_world_lidar[first], second_walk.estimate[first - count], atol=1e-9)
     # In one piece: nothing within the recording moves.
-    steps, as_joined = (
-        inverse(poses[count:-1]) @ poses[count + 1 :] for poses in (result.T_world_lidar, joined.T_world_lidar)
-    )
+    steps, as_joined = (inverse(T[count:-1]) @ T[count + 1 :] for T in (result.T_world_lidar, joined.T_world_lidar))
     np.testing.assert_allclose(steps, as_joined, atol=1e-3)
     np.testing.assert_allclose(result.T_world_lidar[:count], joined.T_world_lidar[:count], atol=1e-3)
 

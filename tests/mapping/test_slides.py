@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.mapping.consistency import (
-    ConsistencyCheck,
-    Contradiction,
-    PairTest,
-    Surfels,
-    find_contradictions,
-    shift_profile,
-)
+from lidarslam.mapping import consistency
 
 # A street of 120 m with buildings, parked vans and posts, driven through at 8 m/s.
 SCANS, STEP_M = 40, 0.8
@@ -53,23 +46,23 @@ def scans(street: object) -> list[FloatArray]:
     return record(street)
 
 
-def check(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> ConsistencyCheck:
+def check(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> consistency.ConsistencyCheck:
     """All scans offered at these poses."""
-    slides = ConsistencyCheck()
+    slides = consistency.ConsistencyCheck()
     for number, (points, T) in enumerate(zip(scans, T_world_lidar, strict=True)):
         slides.add(points, number, T)
     slides.finish()
     return slides
 
 
-def found(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> tuple[Contradiction, ...]:
+def found(scans: Sequence[FloatArray], T_world_lidar: FloatArray) -> tuple[consistency.Contradiction, ...]:
     """What contradicts these poses."""
-    return find_contradictions(check(scans, T_world_lidar).tests, T_world_lidar)
+    return consistency.find_contradictions(check(scans, T_world_lidar).tests, T_world_lidar)
 
 
 def test_normals_are_those_of_the_walls(room):
     points = room.sweep(lambda times: np.tile(np.eye(4), (len(times), 1, 1)), 0.1).points
-    surfels = Surfels.of(points)
+    surfels = consistency.Surfels.of(points)
     on_wall = np.abs(np.abs(surfels.points[:, 0]) - 7.0) < 0.01
     assert np.count_nonzero(on_wall) > 50
     assert np.quantile(-surfels.normals[on_wall, 0] * np.sign(surfels.points[on_wall, 0]), 0.1) > 0.99
@@ -77,10 +70,10 @@ def test_normals_are_those_of_the_walls(room):
 
 @pytest.mark.parametrize("shift_m", [0.0, -1.3, 20.0])
 def test_the_profile_peaks_at_the_shift(scans, shift_m):
-    first, second = Surfels.of(scans[0]), Surfels.of(scans[10])
+    first, second = consistency.Surfels.of(scans[0]), consistency.Surfels.of(scans[10])
     T = np.eye(4)
     T[0, 3] = 10 * STEP_M - shift_m
-    profile = shift_profile(first, second, T, np.array([1.0, 0.0, 0.0]))
+    profile = consistency.shift_profile(first, second, T, np.array([1.0, 0.0, 0.0]))
     assert 0.1 * (profile.argmax() - len(profile) // 2) == pytest.approx(shift_m, abs=0.11)
 
 
@@ -124,7 +117,7 @@ def test_a_bare_tunnel_says_nothing(street):
 def pair(first, second, shift_m, votes, votes_at_pose):
     near = np.zeros(41)
     near[20], near[20 + round(10 * shift_m)] = votes_at_pose, votes
-    return PairTest(first, second, np.array([1.0, 0.0, 0.0]), np.zeros(3), shift_m, votes, near)
+    return consistency.PairTest(first, second, np.array([1.0, 0.0, 0.0]), np.zeros(3), shift_m, votes, near)
 
 
 @pytest.mark.parametrize(("confirmed", "votes", "stretches"), [(True, 14.0, 1), (False, 14.0, 0), (True, 9.0, 0)])
@@ -133,7 +126,7 @@ def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, vote
     contradicting, weaker = pair(0, 20, shift_m, votes, 4.0), pair(0, 10, shift_m, 16.0, 12.0)
     other = weaker if confirmed else pair(0, 10, 0.0, 12.0, 12.0)
     agreeing = [pair(10, 20, 0.0, 20.0, 20.0), pair(20, 30, 0.0, 20.0, 20.0)]
-    found = find_contradictions([contradicting, other, *agreeing], standing)
+    found = consistency.find_contradictions([contradicting, other, *agreeing], standing)
     assert [one.shift_m for one in found] == [shift_m] * stretches
 
 
@@ -142,26 +135,26 @@ def test_one_contradicting_pair_counts_where_another_confirms_it(confirmed, vote
 )
 def test_the_only_pair_of_a_short_run_counts_where_it_is_clear(votes, votes_at_pose, stretches):
     standing = np.tile(np.eye(4), (11, 1, 1))
-    assert len(find_contradictions([pair(0, 10, 0.4, votes, votes_at_pose)], standing)) == stretches
+    assert len(consistency.find_contradictions([pair(0, 10, 0.4, votes, votes_at_pose)], standing)) == stretches
 
 
 @pytest.mark.parametrize(("votes_at_pose", "stretches"), [(0.5, 1), (2.2, 0)])
 def test_two_low_peaks_contradict_poses_only_where_next_to_nothing_fits_there(votes_at_pose, stretches):
     """A quarter of the votes at the pose, and nine at a peak, is chance among sparse strokes."""
     pairs = [pair(0, 20, -0.9, 8.3, votes_at_pose), pair(10, 20, -0.8, 9.0, votes_at_pose)]
-    assert len(find_contradictions(pairs, np.tile(np.eye(4), (31, 1, 1)))) == stretches
+    assert len(consistency.find_contradictions(pairs, np.tile(np.eye(4), (31, 1, 1)))) == stretches
 
 
 def test_poses_that_were_corrected_are_judged_as_corrected(scans):
     slid = poses([0.9 * STEP_M] * (SCANS - 1))
-    assert find_contradictions(check(scans, slid).tests, TRUE) == ()
-    (stretch,) = find_contradictions(check(scans, TRUE).tests, slid)
+    assert consistency.find_contradictions(check(scans, slid).tests, TRUE) == ()
+    (stretch,) = consistency.find_contradictions(check(scans, TRUE).tests, slid)
     assert stretch.shift_m > 0.0
 
 
 def test_it_goes_on_from_its_state(scans, through_disk):
     slid = poses([0.9 * STEP_M] * (SCANS - 1))
-    begun, resumed = ConsistencyCheck(), ConsistencyCheck()
+    begun, resumed = consistency.ConsistencyCheck(), consistency.ConsistencyCheck()
     for number in range(25):
         begun.add(scans[number], number, slid[number])
     resumed.restore(through_disk(begun.state()))
@@ -176,12 +169,12 @@ def test_it_goes_on_from_its_state(scans, through_disk):
 def test_long_runs_are_sampled(monkeypatch):
     looked_at: list[FloatArray] = []
 
-    def empty(points: FloatArray) -> Surfels:
+    def empty(points: FloatArray) -> consistency.Surfels:
         looked_at.append(points)
-        return Surfels(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return consistency.Surfels(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
-    monkeypatch.setattr(Surfels, "of", empty)
-    slides = ConsistencyCheck()
+    monkeypatch.setattr(consistency.Surfels, "of", empty)
+    slides = consistency.ConsistencyCheck()
     for number in range(20_000):
         slides.add(np.empty((0, 3)), number, np.eye(4))
     assert 500 < len(looked_at) < 1200

@@ -74,29 +74,24 @@ def test_a_drawn_map_holds_all_that_its_submaps_reach(rng):
     assert len(drawn.match(wall, np.eye(4)).index) > 40
 
 
-@pytest.fixture
-def revisited(rng: np.random.Generator) -> tuple[SubmapPlacement, FloatArray]:
+def test_where_a_submap_lay_when_a_scan_was_registered(rng):
     """Out and back: keyframe 9 is beside keyframe 0, and has drifted off; keyframes 4 and 5 are beyond the radius."""
     ways = [SPACING_M * min(key, 9 - key) for key in range(10)]
     poses = np.array([at(way + (0.5 if key > 4 else 0.0)) for key, way in enumerate(ways)])
     targets = np.array([at(way + 0.5) for way in ways])
     submaps = {key: means_of_wall(rng, WALL_M, 2.5) for key in range(10)}
-    return laid(submaps, poses, targets)[0], poses
-
-
-def test_where_a_submap_lay_when_a_scan_was_registered(revisited):
-    laid, poses = revisited
+    placement = laid(submaps, poses, targets)[0]
     exchanged = 40 + SCANS_LATER
-    before = laid.place(0, 0, poses[0], exchanged - 1)
-    after = laid.place(0, 0, poses[0], exchanged)
+    before = placement.place(0, 0, poses[0], exchanged - 1)
+    after = placement.place(0, 0, poses[0], exchanged)
     assert (before[1], after[1]) == (0, exchanged)
     np.testing.assert_array_equal(before[0], poses[0])
     np.testing.assert_allclose(after[0], at(0.5), atol=1e-12)
-    assert laid.place(4, 16, poses[4], exchanged) is None, "beyond the radius"
-    later = laid.place(10, 45, at(-1.0), exchanged + 3)
+    assert placement.place(4, 16, poses[4], exchanged) is None, "beyond the radius"
+    later = placement.place(10, 45, at(-1.0), exchanged + 3)
     assert later[1] == 45, "of a keyframe since then, its own pose"
-    assert laid.is_exchanged(exchanged - 1, exchanged)
-    assert not laid.is_exchanged(exchanged, exchanged + 5)
+    assert placement.is_exchanged(exchanged - 1, exchanged)
+    assert not placement.is_exchanged(exchanged, exchanged + 5)
 
 
 REGISTERED = np.diag([1e-3] * 3 + [5e-3] * 3) ** 2
@@ -147,16 +142,10 @@ def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip):
     np.testing.assert_allclose(found.T_first_second, inverse(T_odom_first) @ round_trip[-1], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("radius_m", "first", "off"),
-    [
-        (50.0, REGISTERED, NEAR),
-        (0.0, REGISTERED, NEAR),
-        (100.0, None, NEAR),
-        (100.0, REGISTERED, np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0])),
-    ],
-    ids=["the way left the map", "without a map", "not registered", "drifted off its own map"],
-)
+@pytest.mark.parametrize(("radius_m", "first", "off"), [
+    (50.0, REGISTERED, NEAR), (0.0, REGISTERED, NEAR), (100.0, None, NEAR),
+    (100.0, REGISTERED, np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0])),
+], ids=["the way left the map", "without a map", "not registered", "drifted off its own map"])  # fmt: skip
 def test_elsewhere_the_closure_counts(round_trip, radius_m, first, off):
     measured = closure(round_trip, off)
     assert as_registered(measured, round_trip, radius_m, first) is measured

@@ -7,16 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.grid import (
-    COUNT,
-    DIRECTION,
-    ELEVATION_SPREAD,
-    IS_PLANE,
-    MEAN,
-    NORMAL,
-    SPREADS,
-    SurfelGrid,
-)
+from lidarslam.mapping.surfels import grid as grids
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 from lidarslam.mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps
 
@@ -38,13 +29,13 @@ def on_plane(
     return through + coordinates @ np.stack([along, np.cross(normal, along)])
 
 
-def grid_of(points: FloatArray, elevations: FloatArray | None = None) -> SurfelGrid:
-    grid = SurfelGrid(CELL)
+def grid_of(points: FloatArray, elevations: FloatArray | None = None) -> grids.SurfelGrid:
+    grid = grids.SurfelGrid(CELL)
     grid.insert(points, np.zeros(len(points)) if elevations is None else elevations, from_above(len(points)))
     return grid
 
 
-def surfels_at(grid: SurfelGrid, points: FloatArray) -> FloatArray:
+def surfels_at(grid: grids.SurfelGrid, points: FloatArray) -> FloatArray:
     return grid.surfels(grid.find(points))
 
 
@@ -64,11 +55,11 @@ def test_surfels_of_a_plane_lie_on_it_wherever_it_is(seed, away_m):
     normal, through = unit(rng.normal(size=3)), away_m * unit(rng.normal(size=3))
     points = on_plane(rng, normal, through)
     surfels = surfels_at(grid_of(points), points)
-    assert surfels[:, IS_PLANE].all()
-    np.testing.assert_allclose(np.abs(surfels[:, NORMAL] @ normal), 1.0, rtol=0.0, atol=1e-10)
-    np.testing.assert_allclose(np.cross(surfels[:, NORMAL], normal), 0.0, atol=2e-5)
-    np.testing.assert_allclose((surfels[:, MEAN] - through) @ normal, 0.0, atol=2e-6)
-    assert surfels[:, SPREADS][:, 0].max() < 1e-3
+    assert surfels[:, grids.IS_PLANE].all()
+    np.testing.assert_allclose(np.abs(surfels[:, grids.NORMAL] @ normal), 1.0, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(np.cross(surfels[:, grids.NORMAL], normal), 0.0, atol=2e-5)
+    np.testing.assert_allclose((surfels[:, grids.MEAN] - through) @ normal, 0.0, atol=2e-6)
+    assert surfels[:, grids.SPREADS][:, 0].max() < 1e-3
 
 
 def test_a_surfel_is_as_thick_as_the_noise(rng):
@@ -76,21 +67,21 @@ def test_a_surfel_is_as_thick_as_the_noise(rng):
     points = on_plane(rng, normal, np.zeros(3), count=20_000)
     grid = grid_of(points + rng.normal(0.0, 0.02, (len(points), 1)) * normal)
     inner = np.abs(points).max(axis=1) < 0.5
-    thickness = surfels_at(grid, points[inner])[:, SPREADS][:, 0]
+    thickness = surfels_at(grid, points[inner])[:, grids.SPREADS][:, 0]
     np.testing.assert_allclose(thickness, 0.02, rtol=0.1)
 
 
 @pytest.mark.parametrize("weight", [1.0, 3.0], ids=["in batches", "weighed"])
 def test_batches_make_what_one_makes_and_a_point_counts_as_many_as_it_weighs(rng, weight):
     points, elevations, times = cloud(rng, 20_000), rng.normal(size=20_000), round(weight)
-    grid, whole = SurfelGrid(CELL), grid_of(np.repeat(points, times, axis=0), np.repeat(elevations, times))
+    grid, whole = grids.SurfelGrid(CELL), grid_of(np.repeat(points, times, axis=0), np.repeat(elevations, times))
     for part in np.array_split(np.arange(len(points)), 7):
         grid.insert(points[part], elevations[part], from_above(len(part)), weight)
     assert len(grid) == len(whole)
     one, other = surfels_at(grid, points), surfels_at(whole, points)
-    for columns in (MEAN, SPREADS, ELEVATION_SPREAD):
+    for columns in (grids.MEAN, grids.SPREADS, grids.ELEVATION_SPREAD):
         np.testing.assert_allclose(one[:, columns], other[:, columns], atol=1e-4)
-    np.testing.assert_allclose(one[:, COUNT], other[:, COUNT], rtol=1e-5)
+    np.testing.assert_allclose(one[:, grids.COUNT], other[:, grids.COUNT], rtol=1e-5)
 
 
 @pytest.mark.parametrize("offset", [-0.004, 0.004])
@@ -99,27 +90,27 @@ def test_a_wall_along_the_border_of_cells_is_one_plane(rng, offset):
     points = np.column_stack([rng.normal(offset, 0.005, 6_000), rng.uniform(-2, 2, (6_000, 2))])
     inner = np.abs(points[:, 1:]).max(axis=1) < 1.0
     surfels = surfels_at(grid_of(points), points[inner])
-    assert surfels[:, IS_PLANE].all()
-    np.testing.assert_allclose(surfels[:, MEAN][:, 0], offset, atol=0.002)
-    assert np.rad2deg(np.arccos(np.abs(surfels[:, NORMAL][:, 0]).min())) < 0.5
+    assert surfels[:, grids.IS_PLANE].all()
+    np.testing.assert_allclose(surfels[:, grids.MEAN][:, 0], offset, atol=0.002)
+    assert np.rad2deg(np.arccos(np.abs(surfels[:, grids.NORMAL][:, 0]).min())) < 0.5
 
 
 def test_samples_of_cells_are_seen_from_where_their_points_were(rng):
     wall = across_x(rng, 0.25, 1.0, 5_000)
-    grid, other = SurfelGrid(CELL), SurfelGrid(0.5 * CELL)
+    grid, other = grids.SurfelGrid(CELL), grids.SurfelGrid(0.5 * CELL)
     grid.insert(wall, np.zeros(5_000), np.tile([-0.6, 0.8, 0.0], (5_000, 1)))
     samples, elevations, views = grid.samples()
     np.testing.assert_allclose(views, np.tile([-0.6, 0.8, 0.0], (len(samples), 1)), atol=1e-5)
     other.insert(samples, elevations, views)
-    assert surfels_at(other, samples)[:, NORMAL][:, 0].max() < -0.99
+    assert surfels_at(other, samples)[:, grids.NORMAL][:, 0].max() < -0.99
 
 
 def test_neighbours_count_less_than_the_cell_itself():
     """Two points beside one another in neighbouring cells: the surfel lies nearer to the cell's own."""
     points = np.array([[0.25, 0.25, 0.25], [0.75, 0.25, 0.25]])
     surfel = surfels_at(grid_of(points), points[:1])
-    np.testing.assert_allclose(surfel[:, MEAN], [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
-    np.testing.assert_allclose(surfel[:, COUNT], 1.8, rtol=1e-6)
+    np.testing.assert_allclose(surfel[:, grids.MEAN], [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
+    np.testing.assert_allclose(surfel[:, grids.COUNT], 1.8, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -128,15 +119,15 @@ def test_a_line_has_its_direction(seed):
     direction, through = unit(rng.normal(size=3)), 100.0 * rng.normal(size=3)
     points = through + rng.uniform(-3.0, 3.0, (600, 1)) * direction
     surfels = surfels_at(grid_of(points), points)
-    assert not surfels[:, IS_PLANE].any()
-    np.testing.assert_allclose(np.cross(surfels[:, DIRECTION], direction), 0.0, atol=2e-5)
-    np.testing.assert_allclose(np.cross(surfels[:, MEAN] - through, direction), 0.0, atol=1e-5)
+    assert not surfels[:, grids.IS_PLANE].any()
+    np.testing.assert_allclose(np.cross(surfels[:, grids.DIRECTION], direction), 0.0, atol=2e-5)
+    np.testing.assert_allclose(np.cross(surfels[:, grids.MEAN] - through, direction), 0.0, atol=1e-5)
 
 
 def test_a_ball_of_points_is_no_plane_nor_are_five_points(rng):
     few = np.array([[0.1, 0.1, 0.1], [0.4, 0.1, 0.1], [0.1, 0.4, 0.1], [0.4, 0.4, 0.1], [0.2, 0.3, 0.1]])
     for points, asked in ((cloud(rng, 20_000, half_size=1.5), [0.1, 0.2, 0.3]), (few, [0.2, 0.2, 0.1])):
-        assert not surfels_at(grid_of(points), np.array([asked]))[:, IS_PLANE].any()
+        assert not surfels_at(grid_of(points), np.array([asked]))[:, grids.IS_PLANE].any()
 
 
 def test_an_empty_cell_shows_the_nearest_around_it():
@@ -190,9 +181,9 @@ def test_a_cell_that_has_seen_enough_moves_no_more(rng):
 def test_one_ring_has_no_spread_of_elevation_and_two_have_half_their_distance(rng):
     points = np.column_stack([np.full(400, 10.1), rng.uniform(-0.2, 0.2, 400), np.full(400, 0.1)])
     one = grid_of(points, np.full(400, 0.25))
-    assert surfels_at(one, points)[:, ELEVATION_SPREAD].max() < 3e-4
+    assert surfels_at(one, points)[:, grids.ELEVATION_SPREAD].max() < 3e-4
     two = grid_of(points, np.repeat([0.25, 0.29], 200))
-    np.testing.assert_allclose(surfels_at(two, points)[:, ELEVATION_SPREAD], 0.02, rtol=0.1)
+    np.testing.assert_allclose(surfels_at(two, points)[:, grids.ELEVATION_SPREAD], 0.02, rtol=0.1)
 
 
 def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng):
@@ -200,14 +191,14 @@ def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng):
     stray = np.array([[0.25, 0.25, 0.6]]) + rng.normal(0.0, 0.02, (10, 3))
     wall = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.array([0.25, 0.25, 0.45]), half_size=2.0)
     grid = grid_of(stray)
-    assert not surfels_at(grid, stray)[:, IS_PLANE].any()
+    assert not surfels_at(grid, stray)[:, grids.IS_PLANE].any()
     grid.insert(wall, np.zeros(len(wall)), from_above(len(wall)))
-    assert not surfels_at(grid, stray)[:, IS_PLANE].any()
+    assert not surfels_at(grid, stray)[:, grids.IS_PLANE].any()
     grid._tidied = len(grid)  # so that no cell is forgotten
     grid.tidy()
     surfels = surfels_at(grid, stray)
-    assert surfels[:, IS_PLANE].all()
-    np.testing.assert_allclose(np.abs(surfels[:, NORMAL][:, 2]), 1.0, atol=1e-3)
+    assert surfels[:, grids.IS_PLANE].all()
+    np.testing.assert_allclose(np.abs(surfels[:, grids.NORMAL][:, 2]), 1.0, atol=1e-3)
 
 
 def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng):
@@ -216,11 +207,11 @@ def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng):
     once = on_plane(rng, np.array([1.0, 0.0, 0.0]), np.array([30.25, 0.0, 0.0]), count=60)  # as few as a stray, alone
     grid = grid_of(np.concatenate([wall, strays, once]))
     inner = wall[np.abs(wall).max(axis=1) < 1.9]  # at its border cells have few points, too
-    seen = surfels_at(grid, inner)[:, MEAN]
+    seen = surfels_at(grid, inner)[:, grids.MEAN]
     grid.tidy()
     assert (grid.find(strays[strays[:, 2] > 1.8]) == ABSENT).all()
     assert (grid.find(once) != ABSENT).all()
-    np.testing.assert_allclose(surfels_at(grid, inner)[:, MEAN], seen, atol=1e-3)
+    np.testing.assert_allclose(surfels_at(grid, inner)[:, grids.MEAN], seen, atol=1e-3)
 
 
 def eigenvalues(M: FloatArray) -> FloatArray:
@@ -327,9 +318,7 @@ def test_cells_come_back_from_their_keys(cells):
 def test_a_step_leads_to_the_neighbours_key(cells, offsets):
     inside = np.clip(np.array(cells), -(1 << 19) + 3, (1 << 19) - 4)
     steps = np.array(offsets)
-    np.testing.assert_array_equal(
-        cell_keys(inside)[:, None] + key_steps(steps), cell_keys(inside[:, None] + steps[None])
-    )
+    np.testing.assert_array_equal(cell_keys(inside)[:, None] + key_steps(steps), cell_keys(inside[:, None] + steps))
 
 
 def test_rows_of_before_stay_while_the_table_grows(rng):

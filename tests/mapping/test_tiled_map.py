@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
@@ -81,14 +80,6 @@ def test_every_voxel_lies_in_one_tile(rng):
         assert len(tiling.around(*tiling.bounds(tile, 0.05))) == 9
 
 
-def rows_of(points: FloatArray, among: FloatArray) -> NDArray[np.intp]:
-    """Which of as many points each of some is, all of them once."""
-    off_m, rows = cKDTree(among).query(points)
-    assert off_m.max() < 1e-6
-    assert len(points) == len(among) == len(np.unique(rows))
-    return np.asarray(rows)
-
-
 def in_tiles(built: GlobalMap, views: PlacedViews, config: GlobalMapConfig = CONFIG) -> dict[Tile, PointCloud]:
     tiles: dict[Tile, PointCloud] = {}
     drawn = drawn_map(built, views, config, lambda tile, cloud, _: tiles.__setitem__(tile, cloud))
@@ -113,7 +104,9 @@ def test_tiles_together_are_the_map_in_one_piece(views):
         assert (cloud.points[:, :2] > low - 1e-6).all()
         assert (cloud.points[:, :2] < low + drawn.tiled.tiling.edge_m + 1e-6).all()
     points, normals = (np.vstack([getattr(cloud, name) for cloud in tiles.values()]) for name in ("points", "normals"))
-    rows = rows_of(expected.cloud.points, points)
+    off_m, rows = cKDTree(points).query(expected.cloud.points)
+    assert off_m.max() < 1e-6
+    assert len(points) == len(rows) == len(np.unique(rows))
     turned = np.einsum("ij,ij->i", normals[rows], expected.cloud.normals)
     assert np.mean(turned > 1.0 - 1e-6) > 0.999  # the rest has two sets of nearest points, equally far
     for name, values in expected.cloud.attributes.present():

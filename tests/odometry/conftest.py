@@ -80,7 +80,6 @@ class Scene:
         return self.as_scans(self.sweeps(count, twist, start))
 
     def as_scans(self, sweeps: list[SweepImages]) -> list[Scan]:
-        """Sweeps of this scene as scans."""
         scans = []
         for number, images in enumerate(sweeps):
             points = images.points.T.reshape(-1, 3)
@@ -95,12 +94,8 @@ class Scene:
     def recording(self, count: int, twist: Sequence[float], rolling: bool = True) -> PreparedRecording:
         """The sweeps with their true motions, all valid."""
         T = torch.from_numpy(exp(self.period_s * np.asarray(twist))).float().expand(count - 1, 4, 4)
-        return PreparedRecording(
-            *stacked(self.sweeps(count, twist, rolling=rolling)),
-            torch.full((count - 1,), self.period_s),
-            T.clone(),
-            torch.ones(count - 1, dtype=torch.bool),
-        )
+        periods, valid = torch.full((count - 1,), self.period_s), torch.ones(count - 1, dtype=torch.bool)
+        return PreparedRecording(*stacked(self.sweeps(count, twist, rolling=rolling)), periods, T.clone(), valid)
 
 
 @pytest.fixture(scope="module", autouse=True)

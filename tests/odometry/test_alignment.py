@@ -9,37 +9,26 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.odometry.alignment import alignment
 from lidarslam.odometry.alignment import alignment as module
-from lidarslam.odometry.alignment.alignment import (
-    DOUBTFUL,
-    Alignment,
-    Effort,
-    InitialEstimate,
-    align,
-    align_best,
-    find_degeneracy,
-    joined_information,
-    replaced_along,
-)
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from lidarslam.odometry.images.sweep_images import SweepImages
 
 from .motions import WRONG, assert_close, errors, moved
 
-FINE, NO_STEP = Effort(column_step=2), Effort(iterations=0, column_step=2)
+FINE, NO_STEP = alignment.Effort(column_step=2), alignment.Effort(iterations=0, column_step=2)
 INTERVAL_S = 0.1
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)  # rad/s, m/s
 TURNING = (0.1, 0.1, math.radians(80.0), 1.0, 0.3, 0.1)
 
 
 def second_on_first(sweeps: list[SweepImages], last: SweepMotion | None = None) -> SweepPair:
-    """The last two of the sweeps."""
     return SweepPair(sweeps[-1], sweeps[-2], INTERVAL_S, last)
 
 
-def one_on_the_other(sweeps: list[SweepImages], T: FloatArray, effort: Effort = FINE) -> Alignment:
+def one_on_the_other(sweeps: list[SweepImages], T: FloatArray, effort: alignment.Effort = FINE) -> alignment.Alignment:
     """The second of two sweeps on the first."""
-    return align(InitialEstimate(T), second_on_first(sweeps), effort)
+    return alignment.align(alignment.InitialEstimate(T), second_on_first(sweeps), effort)
 
 
 @pytest.mark.parametrize(("twist", "wrong", "rolling", "rotation_deg", "translation_m"), [
@@ -61,8 +50,8 @@ def test_turning_sweeps_are_compensated(box_room):
 @pytest.mark.parametrize("certain", [True, False])
 def test_a_guess_is_held_as_firmly_as_its_information_says(box_room, certain):
     close = moved(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
-    start = InitialEstimate(close, (1e9 if certain else 1e-3) * np.eye(6))
-    found = align(start, second_on_first(box_room.sweeps(2, TWIST)), FINE).T_prev_curr
+    start = alignment.InitialEstimate(close, (1e9 if certain else 1e-3) * np.eye(6))
+    found = alignment.align(start, second_on_first(box_room.sweeps(2, TWIST)), FINE).T_prev_curr
     assert_close(found, close if certain else moved(TWIST), 0.01, 5e-4)
 
 
@@ -73,7 +62,7 @@ def test_the_information_of_a_guess_is_of_changes_from_the_left(box_room):
     T = moved(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
     holds_x = np.zeros((6, 6))
     holds_x[3, 3] = 1e9
-    found = align(InitialEstimate(T, holds_x), second_on_first(sweeps), FINE)
+    found = alignment.align(alignment.InitialEstimate(T, holds_x), second_on_first(sweeps), FINE)
     away = found.T_prev_curr[:3, 3] - moved(twist)[:3, 3]
     # What is held wrongly pulls a little at the rest.
     assert away[0] - T[0, 3] + moved(twist)[0, 3] == pytest.approx(0.0, abs=1e-4)
@@ -85,7 +74,7 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
     twist, wrong = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0), (0.01, 0.01, 0.02, 0.10, 0.06, 0.05)
     sweeps = corridor.sweeps(2, twist)
     T = moved(twist, wrong)
-    kept = align(InitialEstimate(T, np.eye(6)), second_on_first(sweeps), FINE)
+    kept = alignment.align(alignment.InitialEstimate(T, np.eye(6)), second_on_first(sweeps), FINE)
     error = log(kept.T_prev_curr @ inverse(moved(twist)))
     # Turning it back about the origin moves it along x by less than a millimetre.
     assert kept.T_prev_curr[0, 3] == pytest.approx(T[0, 3], abs=1e-3)
@@ -141,18 +130,18 @@ def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room, monkeyp
     before, motion = inverse(T[0]) @ T[1], inverse(T[1]) @ T[2]
     velocity = log(before) / INTERVAL_S
     half_a_change = 0.05 * np.array(ACCELERATION)
-    off = InitialEstimate(exp([0.02, 0.0, -0.02, 0.05, 0.03, 0.0]) @ motion)
+    off = alignment.InitialEstimate(exp([0.02, 0.0, -0.02, 0.05, 0.03, 0.0]) @ motion)
     for last in (None, SweepMotion(velocity, np.zeros(6), INTERVAL_S)):
-        found = align(off, second_on_first(sweeps, last), FINE)
+        found = alignment.align(off, second_on_first(sweeps, last), FINE)
         assert_close(found.T_prev_curr, motion, 0.06, 0.004)
         np.testing.assert_allclose(found.velocity_change, half_a_change, atol=0.06)
     # Held at none, the motion is off by more.
     even(monkeypatch)
-    stiff = align(off, second_on_first(sweeps), FINE)
+    stiff = alignment.align(off, second_on_first(sweeps), FINE)
     assert np.abs(stiff.velocity_change).max() <= 1e-2
     assert errors(stiff.T_prev_curr, motion)[0] > 3.0 * errors(found.T_prev_curr, motion)[0]
     # Held at what the motion before tells, it is nearly as good.
-    told = align(off, second_on_first(sweeps, SweepMotion(velocity, np.zeros(6), INTERVAL_S)), FINE)
+    told = alignment.align(off, second_on_first(sweeps, SweepMotion(velocity, np.zeros(6), INTERVAL_S)), FINE)
     assert_close(told.T_prev_curr, motion, 0.06, 0.004)
 
 
@@ -181,11 +170,13 @@ def street(box_room) -> list[SweepImages]:
     return scene.sweeps(2, (0.0, 0.0, 0.0, 14.0, 0.0, 0.0))
 
 
-def best_of(sweeps: list[SweepImages], *guesses: FloatArray, information: FloatArray | None = None) -> Alignment:
+def best_of(
+    sweeps: list[SweepImages], *guesses: FloatArray, information: FloatArray | None = None
+) -> alignment.Alignment:
     """The second of two sweeps on the first; the information is about the first guess."""
     first, *others = guesses
-    starts = [InitialEstimate(first, information), *(InitialEstimate(guess) for guess in others)]
-    return align_best(starts, second_on_first(sweeps), FINE)
+    starts = [alignment.InitialEstimate(first, information), *(alignment.InitialEstimate(guess) for guess in others)]
+    return alignment.align_best(starts, second_on_first(sweeps), FINE)
 
 
 def ahead(along_m: float) -> FloatArray:
@@ -193,7 +184,7 @@ def ahead(along_m: float) -> FloatArray:
     return exp([0.0, 0.0, 0.0, along_m, 0.0, 0.0])
 
 
-def wrong_by_m(aligned: Alignment) -> float:
+def wrong_by_m(aligned: alignment.Alignment) -> float:
     return float(errors(aligned.T_prev_curr, ahead(1.4))[1])
 
 
@@ -210,15 +201,15 @@ def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m,
     """The motion is 1.4 m from the guess: two standard deviations, or fifty."""
     information = np.eye(6) / sigma_m**2
     searched = best_of(street, REST, information=information)
-    assert (wrong_by_m(searched) < 0.02) == (searched.explained > DOUBTFUL) == found
+    assert (wrong_by_m(searched) < 0.02) == (searched.explained > alignment.DOUBTFUL) == found
 
 
 def test_the_less_likely_a_guess_the_more_it_must_explain(street, monkeypatch):
     """From rest hardly anything fits; what lies beside it is right, and taken unless it is held next to impossible."""
     monkeypatch.setattr(module, "STEPS_M", ())
     for odds, wrong in ((0.0, False), (1.0, False), (30.0, True)):
-        starts = [InitialEstimate(REST), InitialEstimate(ahead(1.3), sigmas=odds)]
-        found = align_best(starts, second_on_first(street), FINE)
+        starts = [alignment.InitialEstimate(REST), alignment.InitialEstimate(ahead(1.3), sigmas=odds)]
+        found = alignment.align_best(starts, second_on_first(street), FINE)
         assert (wrong_by_m(found) > 0.5) == wrong
 
 
@@ -246,7 +237,7 @@ def corridor_walls() -> FloatArray:
 
 
 def test_a_corridor_is_open_along_it(corridor_walls):
-    found = find_degeneracy(corridor_walls, 4000, images())
+    found = alignment.find_degeneracy(corridor_walls, 4000, images())
     assert found.names == ("x",)
     np.testing.assert_allclose(np.abs(found.directions), [[0, 0, 0, 1, 0, 0]], atol=1e-6)
 
@@ -257,20 +248,20 @@ def test_a_corridor_is_open_along_it(corridor_walls):
 def test_a_wall_at_the_end_closes_it_when_enough_points_lie_on_it(corridor_walls, share, range_m, count):
     """More than the noise of near normals feigns."""
     end = share * 4000 * information(np.array([[1.0, 0.0, 0.0]]), np.array([[8.0, 0.0, 0.0]]))
-    assert len(find_degeneracy(corridor_walls + end, 4000, images(range_m))) == count
+    assert len(alignment.find_degeneracy(corridor_walls + end, 4000, images(range_m))) == count
 
 
 @pytest.mark.parametrize(("bare_share", "count"), [(1.0, 1), (0.75, 1), (0.65, 0), (0.0, 0)])
 def test_where_much_has_no_normal_nothing_is_left_open_for_all_one_knows(corridor_walls, box_room, bare_share, count):
     sweep = box_room.sweeps(1, [0.0] * 6)[0]
     sweep.normals[..., round(bare_share * sweep.normals.shape[-1]) :] = 0.0
-    assert len(find_degeneracy(corridor_walls, 4000, sweep)) == count
+    assert len(alignment.find_degeneracy(corridor_walls, 4000, sweep)) == count
 
 
 def test_a_motion_goes_on_along_open_directions_and_only_there(corridor_walls):
-    degeneracy = find_degeneracy(corridor_walls, 4000, images())
+    degeneracy = alignment.find_degeneracy(corridor_walls, 4000, images())
     aligned, expected = exp([0.01, 0.0, 0.2, 0.02, -0.1, 0.05]), exp([0.0, 0.1, 0.19, 0.4, 0.3, 0.0])
-    motion = replaced_along(aligned, expected, degeneracy)
+    motion = alignment.replaced_along(aligned, expected, degeneracy)
     change = log(motion @ inverse(aligned))
     np.testing.assert_allclose(change[[0, 1, 2, 4, 5]], 0.0, atol=1e-9)
     assert log(expected @ inverse(motion))[3] == pytest.approx(0.0, abs=0.01)
@@ -278,11 +269,8 @@ def test_a_motion_goes_on_along_open_directions_and_only_there(corridor_walls):
 
 def test_the_covariance_is_the_expected_one_along_and_the_seen_one_across(corridor_walls):
     expected = np.diag([0.02, 0.02, 0.02, 0.3, 0.3, 0.3]) ** 2
-    joined = np.linalg.inv(
-        joined_information(corridor_walls, expected, find_degeneracy(corridor_walls, 4000, images()))
-    )
+    degeneracy = alignment.find_degeneracy(corridor_walls, 4000, images())
+    joined = np.linalg.inv(alignment.joined_information(corridor_walls, expected, degeneracy))
     assert np.sqrt(joined[3, 3]) == pytest.approx(0.3)
-    free = [0, 1, 2, 4, 5]
-    np.testing.assert_allclose(
-        joined[np.ix_(free, free)], np.linalg.inv(corridor_walls[np.ix_(free, free)]), rtol=1e-3, atol=1e-9
-    )
+    free = np.ix_([0, 1, 2, 4, 5], [0, 1, 2, 4, 5])
+    np.testing.assert_allclose(joined[free], np.linalg.inv(corridor_walls[free]), rtol=1e-3, atol=1e-9)

@@ -33,10 +33,9 @@ def test_a_point_lies_in_its_cell(x, y):
 def test_the_heading_turns_points_and_normals(heading):
     c, s = math.cos(heading), math.sin(heading)
     x, y, u, v = 6.2, -3.3, 0.6, 0.8
+    level = image([(x, y, 0.7)], [(u, v, 0.0)])
     turned = image([(c * x - s * y, s * x + c * y, 0.7)], [(c * u - s * v, s * u + c * v, 0.0)])
-    np.testing.assert_allclose(
-        bird_eye(*image([(x, y, 0.7)], [(u, v, 0.0)]), heading), bird_eye(*turned, 0.0), atol=1e-5
-    )
+    np.testing.assert_allclose(bird_eye(*level, heading), bird_eye(*turned, 0.0), atol=1e-5)
 
 
 def test_walls_differ_from_ground_and_are_the_same_from_both_sides():

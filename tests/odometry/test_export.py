@@ -7,15 +7,8 @@ from torch.nn import functional
 
 from lidarslam.core.errors import InputError
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network import checkpoint as checkpoints
 from lidarslam.odometry.network.candidates import CorrelationSearch
-from lidarslam.odometry.network.checkpoint import (
-    Checkpoint,
-    checkpoint_of,
-    export_onnx,
-    load_checkpoint,
-    network_of,
-    torch_search,
-)
 from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, load_exported
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.registry import default_weights, shipped_folder
@@ -25,14 +18,14 @@ SHAPE = (16, 96)
 TOLERANCE = 1e-4
 
 
-def untrained(name: str) -> Checkpoint:
+def untrained(name: str) -> checkpoints.Checkpoint:
     config = NetworkConfig.model_validate({"name": name})
     torch.manual_seed(5)
     network = make_network(config)
     with torch.no_grad():
         for parameter in network.parameters():  # far from the first weights, with which the answer hardly varies
             parameter.add_(0.02 * torch.randn_like(parameter))
-    return checkpoint_of(network, config, ImageConfig(rows=SHAPE[0], columns=SHAPE[1]))
+    return checkpoints.checkpoint_of(network, config, ImageConfig(rows=SHAPE[0], columns=SHAPE[1]))
 
 
 def a_scan(seed: int, shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.ndarray]:
@@ -43,9 +36,9 @@ def a_scan(seed: int, shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.nd
 
 def test_the_shipped_graphs_are_the_shipped_weights():
     """Else they were exported from others: `lidarslam export --out odometry/weights/correlation` makes them again."""
-    checkpoint, (exported, images) = load_checkpoint(default_weights()), load_exported(shipped_folder(), 1)
+    checkpoint, (exported, images) = checkpoints.load_checkpoint(default_weights()), load_exported(shipped_folder(), 1)
     assert images == checkpoint.images
-    searches = exported, torch_search(network_of(checkpoint))
+    searches = exported, checkpoints.torch_search(checkpoints.network_of(checkpoint))
     assert all(isinstance(search, CorrelationSearch) for search in searches)
     given, expected = (search._parts for search in searches)  # type: ignore[attr-defined]
     points, normals = a_scan(0, (checkpoint.images.rows, checkpoint.images.columns))
@@ -65,9 +58,9 @@ def test_the_shipped_graphs_are_the_shipped_weights():
 @pytest.mark.parametrize("name", ["correlation", "delora"])
 def test_onnx_gives_what_torch_gives(name, tmp_path):
     checkpoint = untrained(name)
-    written = export_onnx(checkpoint, tmp_path)
+    written = checkpoints.export_onnx(checkpoint, tmp_path)
     assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
-    (given, _), expected = load_exported(tmp_path, 1), torch_search(network_of(checkpoint))
+    (given, _), expected = load_exported(tmp_path, 1), checkpoints.torch_search(checkpoints.network_of(checkpoint))
     found, _ = given.compare(given.describe(*a_scan(1)), *a_scan(2))
     wanted, _ = expected.compare(expected.describe(*a_scan(1)), *a_scan(2))
     assert len(found) == len(wanted)

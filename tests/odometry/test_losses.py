@@ -154,7 +154,6 @@ def pair(small_room) -> PairBatch:
 
 
 def batch_of(targets: Tensor, valid: list[bool] | None = None) -> PairBatch:
-    """Pairs without surfaces."""
     images = torch.zeros(len(targets), 2, 6, 4, 8)
     return PairBatch(images, T_prev_curr=targets, valid=torch.tensor(valid or [True] * len(targets)))
 

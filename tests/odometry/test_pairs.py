@@ -156,9 +156,7 @@ def test_worn_scans_gain_nothing_and_surfaces_are_spared(recording, name):
 
 def test_noise_is_along_the_rays_and_of_the_size_asked_for(recording):
     several = stack([pair_of(recording, 0, 1, surfaces=False)] * 40)
-    quiet, noisy = (
-        augmented(several, only(range_noise_m=sigma), torch.Generator().manual_seed(5)) for sigma in (0.0, 0.05)
-    )
+    quiet, noisy = (augmented(several, only(range_noise_m=m), torch.Generator().manual_seed(5)) for m in (0.0, 0.05))
     before, after = (b.scans[:, 0, :3].double() for b in (quiet, noisy))
     ranges = before.norm(dim=1)
     torch.testing.assert_close(torch.nn.functional.cosine_similarity(before, after), torch.ones_like(ranges))

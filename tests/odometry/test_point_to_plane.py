@@ -115,11 +115,8 @@ def test_fits_are_those_of_the_slow_sums(box_room, rolling):
     assert found.inliers > 50
     assert found.inliers == pytest.approx(len(good), abs=5, rel=3e-3)
     assert found.share_in_view == pytest.approx(len(seen) / len(slow), abs=2e-3)
-    for matrix, vectors in (
-        (found.H, [J for J, _ in good]),
-        (found.in_view, seen),
-        (found.inlier, [turned for _, turned in good]),
-    ):
+    jacobians, inliers = zip(*good, strict=True)
+    for matrix, vectors in ((found.H, jacobians), (found.in_view, seen), (found.inlier, inliers)):
         expected = np.array(vectors).T @ np.array(vectors)
         np.testing.assert_allclose(matrix, expected, atol=4e-3 * np.abs(expected).max())
 

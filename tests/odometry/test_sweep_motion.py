@@ -9,13 +9,9 @@ from lidarslam.odometry.alignment.sweep_motion import StampInterpolator
 AXIS = np.array([0.2, -0.1, 0.9, 3.0, 0.5, -0.2])  # a screw: along it poses of different times commute
 
 
-def growing(times: FloatArray) -> FloatArray:
-    return 0.4 * times + 1.5 * times**2
-
-
 def on_the_way(*times: float) -> FloatArray:
     """(N, 4, 4)."""
-    return exp(np.multiply.outer(growing(np.array(times)), AXIS))
+    return exp(np.multiply.outer(0.4 * np.array(times) + 1.5 * np.square(times), AXIS))
 
 
 def between(start: float, end: float) -> FloatArray:

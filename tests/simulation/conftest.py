@@ -23,7 +23,6 @@ cached_world = cache(build_world)
 
 @cache
 def caster_of(name: str, seed: int) -> Caster:
-    """Casts rays in one of the program's worlds."""
     return Caster(cached_world(name, seed))
 
 
@@ -34,7 +33,6 @@ def cast(caster: Caster, origins: FloatArray, direction: FloatArray) -> FloatArr
 
 
 def simulation_in(world: World, carrier: str, height_m: float, scans: int) -> Simulation:
-    """A recording of an upright VLP-16."""
     motion = motion_along_route(carrier, world, seed=2)
     return Simulation(world, find_sensor("vlp-16"), motion, mount_pose("upright", height_m), scans, seed=5)
 

@@ -74,9 +74,8 @@ def test_a_start_and_an_end_at_speed_are_no_blows(carrier, yard):
 def test_errors_are_white_noise_and_biases(yard):
     exact, noisy = (simulation(yard, imu_model=model).imu for model in (EXACT_IMU, MEMS_IMU))
     biases = bias_paths(MEMS_IMU, len(noisy), 4)
-    for k, (name, errors) in enumerate(
-        [("angular_velocities", MEMS_IMU.gyroscope), ("accelerations", MEMS_IMU.accelerometer)]
-    ):
+    parts = {"angular_velocities": MEMS_IMU.gyroscope, "accelerations": MEMS_IMU.accelerometer}
+    for k, (name, errors) in enumerate(parts.items()):
         bias = biases[:, 3 * k : 3 * k + 3]
         white = getattr(noisy, name) - getattr(exact, name) - bias
         # One-sided density times the square root of the band, 100 Hz, as data sheets mean it.

@@ -17,9 +17,7 @@ def test_resampled_points_are_evenly_spaced():
 
 
 def test_the_right_of_a_counter_clockwise_line_is_outside():
-    np.testing.assert_allclose(
-        paths.offset_loop(RECTANGLE, 2.0), [[-2.0, -2.0], [22.0, -2.0], [22.0, 12.0], [-2.0, 12.0]]
-    )
+    np.testing.assert_allclose(paths.offset_loop(RECTANGLE, 2.0), [[-2, -2], [22, -2], [22, 12], [-2, 12]])
     np.testing.assert_allclose(paths.offset_loop(RECTANGLE[::-1], 2.0)[0], [2.0, 8.0])
 
 

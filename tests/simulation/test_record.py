@@ -1,7 +1,6 @@
 """Whole recordings: made, read back, replaced or refused, and by the command line."""
 
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,7 +78,11 @@ def test_a_recording_of_every_format_is_true(name, tmp_path):
     true_map = cKDTree(coordinates(read_ply(out / "map.ply")))
     assert true_map.n == summary.map_points
     truth = read_tum(out / "ground_truth.tum")
-    assert_readme_tells(out, summary.source, name)
+    readme = (out / "README.md").read_text()
+    assert f"lidarslam simulate --out {shlex.quote(str(out))} --world hall --sensor vlp-16 --motion tracked" in readme
+    assert f"--mount tilted --scans {SCANS} --seed 4 --format {name}\n" in readme
+    assert f"lidarslam run {shlex.quote(str(summary.source))}" in readme
+    assert all(file in readme for file in ("ground_truth.tum", "map.ply"))
     for recording in map(open_recording, {out, summary.source}):
         assert len(recording) == summary.scans == SCANS
         assert recording.describe().ground_truth is not None
@@ -93,15 +96,6 @@ def test_a_recording_of_every_format_is_true(name, tmp_path):
             distances, _ = true_map.query(points)
             assert np.median(distances) < 0.035  # half the distance between samples of the map
             assert np.quantile(distances, 0.99) < 0.12
-
-
-def assert_readme_tells(out: Path, source: Path, name: str) -> None:
-    """How the recording was made, what to type, and what its files are."""
-    text = (out / "README.md").read_text()
-    assert f"lidarslam simulate --out {shlex.quote(str(out))} --world hall --sensor vlp-16 --motion tracked" in text
-    assert f"--mount tilted --scans {SCANS} --seed 4 --format {name}\n" in text
-    assert f"lidarslam run {shlex.quote(str(source))}" in text
-    assert all(file in text for file in ("ground_truth.tum", "map.ply"))
 
 
 def test_same_request_same_bytes(tmp_path):

@@ -13,9 +13,7 @@ from lidarslam.simulation.world import Boxes
 from .conftest import in_world, simulation_in
 
 # A square of 10 m split into two triangles, facing up.
-SQUARE = Mesh(
-    np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
-)
+SQUARE = Mesh(np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]), np.int32([[0, 1, 2], [0, 2, 3]]))
 
 
 def grid(x, y, z):

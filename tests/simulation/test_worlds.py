@@ -303,7 +303,6 @@ def test_streets_meet_at_corners_that_a_car_can_take(seed):
 
 @pytest.fixture(scope="module")
 def small_town() -> World:
-    """A town of four blocks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(town, "_ROWS", 3)
         patch.setattr(town, "_LEFT_OUT", 2)

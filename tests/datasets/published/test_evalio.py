@@ -1,5 +1,6 @@
 """evalio's own readers over bags, binary scans and truth written in the layouts of some of its data sets."""
 
+import json
 import os
 import subprocess
 import sys
@@ -13,18 +14,19 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+import lidarslam
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import choose_reader, is_recording, open_recording
 
+from ...conftest import succeeds
+
 START_NS = 1_640_000_000 * 10**9
 PERIOD_NS, IMU_PERIOD_NS = 10**8, 2_500_000
 # The published calibration of Hilti 2022.
-HILTI_T_IMU_LIDAR = make_transform(
-    Rotation.from_quat([0.7071068, -0.7071068, 0.0, 0.0]).as_matrix(), [-0.001, -0.00855, 0.055]
-)
+HILTI_T_IMU_LIDAR = make_transform(Rotation.from_quat([1.0, -1.0, 0.0, 0.0]).as_matrix(), [-0.001, -0.00855, 0.055])
 TRUTH = exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0])
 SPIRES_BAG = "1710406700_2024-03-14-08-58-21_0_blurred_filtered_compressed"
 
@@ -41,7 +43,6 @@ def _imu_messages(kit: Any, samples: int) -> tuple[list[tuple[int, Any]], np.nda
 
 
 def _one_scan(kit: Any, sweep: Any, lidar: str, imu: str) -> dict[str, list[tuple[int, Any]]]:
-    """A cloud and three samples of an IMU."""
     return {lidar: [(START_NS, kit.cloud(sweep.records, START_NS))], imu: _imu_messages(kit, 3)[0]}
 
 
@@ -51,7 +52,6 @@ def _quaternion(T: np.ndarray) -> str:
 
 @pytest.fixture
 def evalio_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """evalio's data folder, empty."""
     pytest.importorskip("evalio")
     monkeypatch.setenv("EVALIO_DATA", str(tmp_path / "published"))
     return tmp_path / "published"
@@ -114,6 +114,20 @@ def test_truth_and_imu_come_with_their_calibration(hilti: SimpleNamespace) -> No
     assert imu.stamps == pytest.approx(START_NS * 1e-9 + 0.0025 * np.arange(100), abs=1e-6)
     np.testing.assert_allclose(np.hstack([imu.angular_velocities, imu.accelerations]), hilti.imu)
     np.testing.assert_allclose(imu.T_lidar_imu @ HILTI_T_IMU_LIDAR, np.eye(4), atol=1e-6)
+
+
+def test_info_and_python_know_the_name_of_a_sequence_in_the_default_place(hilti, tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("EVALIO_DATA")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "published").rename("evalio_data")
+    known = json.loads(succeeds("info", "evalio:hilti_2022/basement_2", "--json"))
+    source = tmp_path / "evalio_data" / "hilti_2022" / "basement_2"
+    assert (known["reader"], known["scans"], known["source"]) == ("evalio", 3, str(source))
+    assert known["first_scan"]["has_rings"]
+    assert known["point_time"]["last_s"] == pytest.approx(0.1, abs=1e-3)
+    recording = lidarslam.open("evalio:hilti_2022/basement_2", stop=2)
+    assert len(list(recording)) == len(recording) == 2
+    assert recording.ground_truth is not None
 
 
 def test_newer_college_2021(make_sequence: Any, make_sweep: Callable[..., Any]) -> None:
@@ -323,7 +337,6 @@ from evalio.types import SE3, SO3, Duration, ImuMeasurement, ImuParams, LidarMea
 
 class MyRig(Dataset):
     loop = auto()
-
     def data_iter(self):
         numbers = np.load(self.folder / "points.npy")
         scans = (
@@ -336,19 +349,14 @@ class MyRig(Dataset):
         )
         samples = (ImuMeasurement(Stamp(sec=100, nsec=k), np.ones(3), np.zeros(3)) for k in range(3))
         return RawDataIter(scans, samples, 2)
-
     def imu_T_lidar(self):
         return SE3.identity()
-
     def imu_T_gt(self):
         return SE3.identity()
-
     def imu_params(self):
         return ImuParams(gravity=np.zeros(3))
-
     def lidar_params(self):
         return LidarParams(num_rows=16, num_columns=100, min_range=0.1, max_range=50.0, rate=1.0)
-
     def files(self):
         return ["points.npy"]
 """
@@ -372,7 +380,6 @@ def test_a_data_set_of_the_user(evalio_data: Path, tmp_path: Path) -> None:
     )
     environment = {**os.environ, "EVALIO_CUSTOM": "my_rig_data", "EVALIO_DATA": str(evalio_data)}
     environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, cwd=tmp_path
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.stdout.splitlines() == ["2 101.0 10 None {3}", "None None 1.0"], done.stderr

@@ -29,7 +29,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three scans."""
     folder = tmp_path_factory.mktemp("served") / "walk"
     folder.mkdir()
     rng = np.random.default_rng(4)

@@ -53,14 +53,12 @@ def root(tmp_path):
         (data.parent / "timestamps.txt").write_text("\n".join(lines) + "\n")
         poses = root / "data_poses" / name
         poses.mkdir(parents=True)
-        (poses / "poses.txt").write_text(
-            "".join(f"{k} {row(T_world_lidar(PERIOD_S * k) @ inverse(T_POSE_LIDAR))}\n" for k in range(FIRST, 8))
-        )
-    (root / "calibration").mkdir()
-    (root / "calibration" / "calib_cam_to_velo.txt").write_text(row(T_LIDAR_CAM) + "\n")
-    (root / "calibration" / "calib_cam_to_pose.txt").write_text(
-        f"image_00: {row(T_POSE_CAM)}\nimage_01: {row(np.eye(4))}\n"
-    )
+        rows = [f"{k} {row(T_world_lidar(PERIOD_S * k) @ inverse(T_POSE_LIDAR))}\n" for k in range(FIRST, 8)]
+        (poses / "poses.txt").write_text("".join(rows))
+    calibration = root / "calibration"
+    calibration.mkdir()
+    (calibration / "calib_cam_to_velo.txt").write_text(row(T_LIDAR_CAM) + "\n")
+    (calibration / "calib_cam_to_pose.txt").write_text(f"image_00: {row(T_POSE_CAM)}\nimage_01: {row(np.eye(4))}\n")
     return root
 
 

@@ -29,10 +29,8 @@ def sweep(index):
     """Column after column of 64 lasers: range, azimuth and elevation name the column and the laser."""
     column, laser = np.divmod(np.arange(64 * 1024), 64)
     azimuth, elevation = 2.0 * np.pi * column / 1024, np.deg2rad(16.611 - 33.222 * laser / 63)
-    reach = 5.0 + index + 0.01 * laser
-    points = reach[:, None] * np.column_stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    reach, level = 5.0 + index + 0.01 * laser, np.cos(elevation)
+    points = reach[:, None] * np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     points[(column + laser) % 7 == 0] = 0.0  # no return
     return np.column_stack([points, laser + 100.0]).astype("<f4")
 
@@ -66,9 +64,7 @@ def test_scans_with_columns_for_times_and_lasers_for_rings(sequence):
         np.testing.assert_array_equal(scan.intensities, rows[returned, 3])
         np.testing.assert_array_equal(scan.rings, scan.intensities - 100)
         azimuth = np.mod(np.arctan2(scan.points[:, 1], scan.points[:, 0]), 2.0 * np.pi)
-        np.testing.assert_allclose(
-            scan.time_offsets, 0.1 * np.mod(azimuth + 1e-4, 2.0 * np.pi) / (2.0 * np.pi), atol=1e-5
-        )
+        np.testing.assert_allclose(scan.time_offsets, 0.1 * np.mod((azimuth + 1e-4) / (2.0 * np.pi), 1.0), atol=1e-5)
     info = recording.describe()
     assert info.point_time.field == "column"
     assert any("start of its sweep" in note for note in info.notes)

@@ -1,7 +1,5 @@
 """The NCLT reader on a little session written in the published layout."""
 
-import struct
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,15 +26,6 @@ def pose(time):
     return T, [*position, roll, pitch, heading]
 
 
-def packed(points, laser):
-    """Points as 16-bit steps of 5 mm from -100 m, one after the other."""
-    steps = np.round((points + 100.0) / 0.005).astype(int)
-    return b"".join(
-        struct.pack("<HHHBB", *xyz.tolist(), 50 + number % 100, int(ring))
-        for number, (xyz, ring) in enumerate(zip(steps, laser, strict=True))
-    )
-
-
 @pytest.fixture
 def session(tmp_path):
     folder = tmp_path / "2012-01-08"
@@ -44,8 +33,10 @@ def session(tmp_path):
     for k in range(5):
         T_down_body, _ = pose(0.2 * k)
         in_body = transform_points(inverse(T_down_body), WALL)
-        file = folder / "velodyne_sync" / f"{FIRST_US + k * PERIOD_US}.bin"
-        file.write_bytes(packed(in_body, np.arange(len(WALL)) % 32))
+        points = np.zeros(len(WALL), [("steps", "<u2", 3), ("intensity", "u1"), ("ring", "u1")])
+        points["steps"] = np.round((in_body + 100.0) / 0.005)  # of 5 mm from -100 m
+        points["intensity"], points["ring"] = 50 + np.arange(len(WALL)) % 100, np.arange(len(WALL)) % 32
+        points.tofile(folder / "velodyne_sync" / f"{FIRST_US + k * PERIOD_US}.bin")
     rows = [f"{FIRST_US + 10_000 * k}, {', '.join(repr(float(v)) for v in pose(0.01 * k)[1])}\n" for k in range(100)]
     unknown = f"{FIRST_US - 20_000}, nan, nan, nan, nan, nan, nan\n"
     (tmp_path / "groundtruth_2012-01-08.csv").write_text("".join([unknown, *rows]))

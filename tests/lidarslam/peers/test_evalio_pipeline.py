@@ -15,60 +15,45 @@ pytest.importorskip("evalio", reason="needs the extra peers")
 REPOSITORY = Path(__file__).parents[3]
 DATASET = """
 from pathlib import Path
-
 import numpy as np
 from evalio.datasets import Dataset, DatasetIterator, register_dataset
 from evalio.types import SE3, Duration, ImuParams, LidarMeasurement, LidarParams, Point, Stamp
 
 FILES = sorted(Path(__file__).parent.glob("*.npz"))
 
-
 class Files(DatasetIterator):
     def imu_iter(self):
         return iter(())
-
     def lidar_iter(self):
         for file in FILES:
             with np.load(file) as data:
                 rows = zip(data["points"].tolist(), data["times"].tolist())
                 points = [Point(x=x, y=y, z=z, t=Duration.from_sec(t)) for (x, y, z), t in rows]
                 yield LidarMeasurement(Stamp.from_sec(float(data["start"])), points)
-
     def __iter__(self):
         return self.lidar_iter()
-
     def __len__(self):
         return len(FILES)
 
-
 class Room(Dataset):
     box = "box"
-
     def data_iter(self):
         return Files()
-
     def imu_T_lidar(self):
         return SE3.from_mat(np.load(Path(__file__).parent / "imu_T_lidar.npy"))
-
     def imu_T_gt(self):
         return SE3.identity()
-
     def imu_params(self):
         return ImuParams()
-
     def lidar_params(self):
         return LidarParams(num_rows=16, num_columns=512, min_range=0.1, max_range=100.0)
-
     def files(self):
         return []
-
     def is_downloaded(self):
         return True
-
     @staticmethod
     def url():
         return "none"
-
     def quick_len(self):
         return len(FILES)
 """
