@@ -369,7 +369,7 @@ def velocity_error(last: MotionState, state: MotionState, share: float) -> Float
     return np.asarray(motion - (share * last.velocity + (1.0 - share) * state.velocity), dtype=np.float64)
 
 
-def corrected_by_motion(state: MotionState, last: MotionState, seen_from_s: float) -> MotionState:
+def corrected_by_motion(state: MotionState, last: MotionState, seen_from_s: float, observed: FloatArray) -> MotionState:
     """The state with its velocity corrected by the motion since the last one, and the likeliest pose given that.
 
     Sweeps that are bent equally fit one another and the map that they make, so that their registration hardly observes
@@ -377,12 +377,14 @@ def corrected_by_motion(state: MotionState, last: MotionState, seen_from_s: floa
     receives the corrected sweeps, and the next velocity is estimated from that, so that a bias fades away.
 
     The sweep begins `seen_from_s` before its stamp; the last one's velocity is the corrected one. After a gap between
-    the two, the state stays as it is.
+    the two, the state stays as it is, and so it does along directions that its registration did not observe (of which
+    `observed`, (6, 6), is the projector onto the others): motion and velocity are predictions there, which would be
+    corrected by one another from scan to scan.
     """
     interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
     if not covered_s > _COVERED * interval_s > 0.0:
         return state
-    error = velocity_error(last, state, last.seen_until_s / covered_s)
-    correction, P = _CORRECTED_SHARE * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE), state.covariance
-    T_world_lidar = state.T_world_lidar @ exp(P[:6, 6:] @ np.linalg.solve(P[6:, 6:], correction))
+    error, P = velocity_error(last, state, last.seen_until_s / covered_s), state.covariance
+    correction = observed @ (_CORRECTED_SHARE * np.clip(error, -_MOST_CHANGE, _MOST_CHANGE))
+    T_world_lidar = state.T_world_lidar @ exp(observed @ P[:6, 6:] @ np.linalg.solve(P[6:, 6:], correction))
     return replace(state, T_world_lidar=T_world_lidar, velocity=state.velocity + correction)

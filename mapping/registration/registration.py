@@ -86,6 +86,11 @@ class Registration:
         return self.solution.system.degeneracy
 
     @property
+    def observed(self) -> FloatArray:
+        """(6, 6) projector onto the directions of motion that are not degenerate."""
+        return self.solution.observed[:6, :6]
+
+    @property
     def measured(self) -> MeasuredPose:
         """The pose by the correspondences alone."""
         measured = self.solution.measured(self.T_world_lidar, self.velocity_error)
@@ -275,7 +280,7 @@ class _Solution:
 
     def covariance(self, share: float = 1.0) -> FloatArray:
         """(12, 12) with a share of the correspondences' information, none of it along degenerate directions."""
-        observed = self._observed
+        observed = self.observed
         return np.asarray(
             np.linalg.inv(share * observed.T @ self.system.hessian @ observed + self.prior), dtype=np.float64
         )
@@ -285,7 +290,7 @@ class _Solution:
 
         The velocity during the sweep is marginalised, with the uncertainty of its prediction.
         """
-        observed, hessian = self._observed, self.system.hessian
+        observed, hessian = self.observed, self.system.hessian
         H, g = observed.T @ hessian @ observed, observed.T @ (self.system.gradient + hessian @ self.step)
         known = np.linalg.inv(np.linalg.inv(self.prior)[6:, 6:])
         H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ velocity_error
@@ -294,7 +299,7 @@ class _Solution:
         return replace(pose, information=_INFORMATION_SHARE * pose.information)
 
     @cached_property
-    def _observed(self) -> FloatArray:
+    def observed(self) -> FloatArray:
         """(12, 12) projector onto the directions that are not degenerate."""
         scale, D = lever_scale(self.system.degeneracy.lever_m), self.system.degeneracy.directions
         observed = np.zeros((12, 12))  # several times as fast as `np.kron`

@@ -136,7 +136,8 @@ class NearSearch:
                 attempts.append(matcher.attempt(prediction, replace(prediction, velocity=velocity), patient=True))
         turning = max(attempts, key=lambda attempt: attempt.quality)
         is_near = near.status is not Status.LOST and _apart_m(turning, near) < matcher.scan.cell_m  # the same optimum
-        is_better = (turning.is_reliable or is_near) and turning.quality > _BETTER * near.quality
+        factor = _MUCH_BETTER if turning.unconstrained else _BETTER
+        is_better = (turning.is_reliable or is_near) and turning.quality > factor * near.quality
         return replace(turning, prediction=self.prediction) if is_better else near
 
     def without_odometry(self, near: Attempt) -> Attempt:
@@ -161,7 +162,9 @@ class NearSearch:
             return near
         best, (others,) = near, displaced
         for other in others:
-            if (other.is_reliable or not self.state.velocity_known) and other.quality > _CLEARLY_BETTER * best.quality:
+            # With a known velocity, a place that leaves a direction unconstrained is no better than the prediction.
+            counts = (other.is_reliable and not other.unconstrained) or not self.state.velocity_known
+            if counts and other.quality > _CLEARLY_BETTER * best.quality:
                 best = other
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
 

@@ -245,7 +245,7 @@ class Tracker(Stateful):
         tracking = self.tracking.registered(attempt.status, relocalised, attempt.quality, scan.stamp)
         velocity_known = not (jumped or relocalised)
         if is_timed and velocity_known and tracking.velocity_known and prior.inertial is None:
-            state = corrected_by_motion(state, last, scan.seen_from_s)
+            state = corrected_by_motion(state, last, scan.seen_from_s, registration.observed)
         motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         if not relocalised:
             tracking = tracking.moved(last, state, motion, prior, self._config)

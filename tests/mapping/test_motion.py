@@ -265,9 +265,8 @@ def test_equals_the_exponential_of_every_points_time(rng, scale):
 def test_points_before_and_after_the_stamp_move_with_their_own_velocity(rng, low, high):
     points, offsets = rng.normal(0.0, 10.0, (200, 3)), rng.uniform(low, high, 200)
     before, after = rng.normal(size=(2, 6))
-    expected = np.where(
-        offsets[:, None] < 0.0, exponentials(points, offsets, before), exponentials(points, offsets, after)
-    )
+    ends = [exponentials(points, offsets, velocity) for velocity in (before, after)]
+    expected = np.where(offsets[:, None] < 0.0, *ends)
     np.testing.assert_allclose(deskew(points, offsets, before, after), expected, atol=1e-9)
 
 
@@ -294,6 +293,7 @@ INTERVAL_S = 0.1
 STEADY = np.array([0.02, -0.01, 0.1, 5.0, 0.2, -0.1])  # rad/s, m/s
 MOTION = exp(INTERVAL_S * STEADY)
 BIAS = np.array([0.01, 0.0, -0.04, 0.1, -0.15, 0.05])
+ALL = np.eye(6)  # every direction is observed
 COVARIANCE = np.diag(np.array([0.001] * 3 + [0.01] * 3 + [0.02] * 3 + [0.2] * 3) ** 2)
 
 
@@ -309,7 +309,7 @@ def test_a_bias_that_sweeps_and_map_have_in_common_fades_away(seen_from_s, share
     """With stamps at the beginning of the sweeps, in their middle, and at their end; sweeps are a share of the map."""
     bias, last = BIAS, swept(0, STEADY + BIAS, seen_from_s)
     for number in range(1, 200):
-        last = corrected_by_motion(swept(number, STEADY + bias, seen_from_s), last, seen_from_s)
+        last = corrected_by_motion(swept(number, STEADY + bias, seen_from_s), last, seen_from_s, ALL)
         bias = bias + share * (last.velocity - STEADY - bias)
     np.testing.assert_allclose(last.velocity, STEADY, atol=0.01 * np.abs(BIAS).max())
 
@@ -317,14 +317,14 @@ def test_a_bias_that_sweeps_and_map_have_in_common_fades_away(seen_from_s, share
 def test_a_sudden_acceleration_is_no_bias():
     """Of 360 deg/s and 30 m/s, 0.9 degrees and 6 cm per second are corrected."""
     sudden = np.array([0.0, 0.0, np.deg2rad(360.0), 30.0, 0.0, 0.0])
-    state = corrected_by_motion(swept(1, STEADY, 0.0), swept(0, STEADY - sudden, 0.0), 0.0)
+    state = corrected_by_motion(swept(1, STEADY, 0.0), swept(0, STEADY - sudden, 0.0), 0.0, ALL)
     np.testing.assert_allclose((state.velocity - STEADY)[[2, 3]], [np.deg2rad(0.9), 0.06], rtol=1e-6)
 
 
 def test_nothing_is_corrected_after_a_gap_between_sweeps():
     for last, now in ((0, 2), (1, 1)):
         state = swept(now, STEADY, 0.0)
-        assert corrected_by_motion(state, swept(last, STEADY + BIAS, 0.0), 0.0) is state
+        assert corrected_by_motion(state, swept(last, STEADY + BIAS, 0.0), 0.0, ALL) is state
 
 
 def test_the_pose_follows_as_it_is_correlated():
@@ -332,7 +332,19 @@ def test_the_pose_follows_as_it_is_correlated():
     covariance = COVARIANCE.copy()
     covariance[:6, 6:] = covariance[6:, :6] = -0.5 * INTERVAL_S * COVARIANCE[6:, 6:]
     state = MotionState(INTERVAL_S, MOTION, STEADY, covariance, INTERVAL_S)
-    corrected = corrected_by_motion(state, swept(0, STEADY + BIAS, 0.0), 0.0)
+    corrected = corrected_by_motion(state, swept(0, STEADY + BIAS, 0.0), 0.0, ALL)
     correction = corrected.velocity - STEADY
     np.testing.assert_allclose(log(inverse(MOTION) @ corrected.T_world_lidar), -0.05 * correction, atol=1e-12)
     assert np.abs(correction + 0.3 * BIAS).max() < 1e-12
+
+
+def test_nothing_is_corrected_along_a_direction_that_was_not_observed():
+    """As in a tunnel: the errors of position and velocity along it have grown together, and exceed all others."""
+    covariance, along, across = COVARIANCE.copy(), np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), [0, 1, 2, 4, 5]
+    covariance[[3, 9], [3, 9]], covariance[3, [9, 10]], covariance[9, 10] = 1.0, [0.9, 0.1], 0.1
+    covariance = np.triu(covariance) + np.triu(covariance, 1).T
+    state = MotionState(INTERVAL_S, MOTION, STEADY, covariance, INTERVAL_S)
+    corrected = corrected_by_motion(state, swept(0, STEADY + BIAS, 0.0), 0.0, ALL - along)
+    assert abs((corrected.velocity - STEADY)[3]) < 1e-12
+    assert abs(log(inverse(MOTION) @ corrected.T_world_lidar)[3]) < 1e-12
+    np.testing.assert_allclose((corrected.velocity - STEADY)[across], -0.3 * BIAS[across], atol=1e-12)
