@@ -387,7 +387,7 @@ _WALKING_MPS = 1.5
 # Of a sensor that is not at rest.
 _SHORTEST_MOTION_M = 0.02
 # Of a vehicle, m/s^2.
-_MOST_ACCELERATION = 5.0
+_MOST_ACCELERATION = 4.0
 
 
 def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
