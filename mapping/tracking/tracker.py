@@ -259,7 +259,7 @@ class Tracker(Stateful):
         cautious = replace(prior, caution=WEAK_CAUTION)
         fits = attempt.status is Status.OK or attempt.local_map.is_young
         fits = fits or tracking.odometry_noise.agrees(cautious, motion, self._config) is True
-        unexpected = not relocalised and replace(attempt, prediction=prediction).has_jumped
+        unexpected = not relocalised and replace(attempt, prediction=prediction).is_unexpected
         unconfirmed, adrift = tracking.is_unconfirmed, len(self._archive) > 0
         conflict = None if relocalised else tracking.lasting_conflict
         status, message = judge(attempt, unconfirmed, unexpected, adrift, conflict, self._config.tracking)
