@@ -219,3 +219,13 @@ def test_a_place_is_reachable_within_the_uncertainty_of_the_motion_since(since_s
     found = replace(prediction, T_world_lidar=make_transform(np.eye(3), np.array([0.0, 0.0, away_m])))
     attempt = Attempt(prediction, cast(Any, None), cast(Any, found), NO_FIT, Status.OK, relocalised=True)
     assert attempt.is_reachable(10.0, motion_is_measured=measured) == reachable
+
+
+@pytest.mark.parametrize(("sigma_m", "away_m", "unexpected", "jumped"), [
+    (0.01, 0.09, False, False), (0.01, 0.2, True, False), (0.05, 0.2, False, False), (0.01, 0.6, True, True),
+])  # fmt: skip
+def test_a_correction_beyond_the_uncertainty_of_the_prediction_is_unexpected(sigma_m, away_m, unexpected, jumped):
+    prediction = Prediction(0.1, np.eye(4), np.zeros(6), sigma_m**2 * np.eye(12))
+    found = replace(prediction, T_world_lidar=make_transform(np.eye(3), np.array([0.0, away_m, 0.0])))
+    attempt = Attempt(prediction, cast(Any, None), cast(Any, found), NO_FIT, Status.OK)
+    assert (attempt.is_unexpected, attempt.has_jumped) == (unexpected, jumped)
