@@ -39,6 +39,7 @@ from simulated_faults import (
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
+from lidarslam.core.text import count
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
@@ -98,8 +99,8 @@ def _carried(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
 
 
 def _dropped(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
-    for count in (1, 3, 10):
-        yield f"{count} scans dropped", dropped(simulation, range(at, at + count))
+    for number in (1, 3, 10):
+        yield f"{count(number, 'scan')} dropped", dropped(simulation, range(at, at + number))
 
 
 def _gap(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
