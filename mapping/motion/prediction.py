@@ -377,9 +377,9 @@ def corrected_by_motion(state: MotionState, last: MotionState, seen_from_s: floa
     receives the corrected sweeps, and the next velocity is estimated from that, so that a bias fades away.
 
     The sweep begins `seen_from_s` before its stamp; the last one's velocity is the corrected one. After a gap between
-    the two, the state stays as it is, and so it does along directions that its registration did not observe (of which
-    `observed`, (6, 6), is the projector onto the others): motion and velocity are predictions there, which would be
-    corrected by one another from scan to scan.
+    the two, the state stays as it is, and so does its part along directions that the registration did not observe
+    (`observed`, (6, 6), projects onto the others): motion and velocity are predictions there, and would amplify one
+    another.
     """
     interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
     if not covered_s > _COVERED * interval_s > 0.0:

@@ -38,7 +38,7 @@ _LEAST_EVIDENCE = 7.0
 _MOST_SIGMAS = 5.0
 _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
 # A smaller one is unexpected: amid trucks that pass on both sides, a standing car appears to move by 0.2 m. At 10 Hz,
-# the corrections beyond four standard deviations are below 0.08 m on all recordings of cars, legged robots and hands.
+# corrections beyond four standard deviations are below 0.08 m on ten recordings of cars, robots and handhelds.
 _LEAST_UNEXPECTED = np.array([np.deg2rad(10.0)] * 3 + [0.1] * 3)
 # Speeds beyond the predicted ones, m/s and rad/s, that a sensor may have for this time after it was tracked; then
 # it may have been carried anywhere. The same where a consistent odometry measured the motion since.

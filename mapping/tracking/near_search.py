@@ -28,7 +28,7 @@ from lidarslam.mapping.tracking.scan_matcher import (
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 # Factors by which the quality of a result with any acceleration, of one from elsewhere, and of one that contradicts the
-# odometry must be better.
+# odometry, or with any acceleration leaves a direction unconstrained, must be better.
 _BETTER, _CLEARLY_BETTER, _MUCH_BETTER = 1.05, 1.1, 1.3
 # A scan constrains its weakest direction poorly below this support or evidence: a fifth of the scans on stairs, in
 # offices, streets and crowds none. There an odometry counts with this many times its own standard deviations, after
