@@ -238,6 +238,7 @@ class Tracker(Stateful):
         registration, jumped, relocalised = attempt.registration, attempt.has_jumped, attempt.relocalised
         assert registration is not None
         is_timed = scan.sweep.times is not None and self._config.continuous_time
+        unexpected = not relocalised and self._is_unexpected(attempt, scan, prior, prediction, last)
         if attempt.status is Status.OK or relocalised:
             self._end_search()
         T_world_lidar, velocity, covariance = registration.T_world_lidar, registration.velocity, registration.covariance
@@ -259,7 +260,6 @@ class Tracker(Stateful):
         cautious = replace(prior, caution=WEAK_CAUTION)
         fits = attempt.status is Status.OK or attempt.local_map.is_young
         fits = fits or tracking.odometry_noise.agrees(cautious, motion, self._config) is True
-        unexpected = not relocalised and replace(attempt, prediction=prediction).is_unexpected
         unconfirmed, adrift = tracking.is_unconfirmed, len(self._archive) > 0
         conflict = None if relocalised else tracking.lasting_conflict
         status, message = judge(attempt, unconfirmed, unexpected, adrift, conflict, self._config.tracking)
@@ -277,6 +277,15 @@ class Tracker(Stateful):
             is_connected=not relocalised,
             turn_rate=registration.velocity[:3] if is_timed and prior.inertial is None else None,
         )
+
+    def _is_unexpected(
+        self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
+    ) -> bool:
+        """Whether a pose is improbable by its prediction, and by that of the last motion without an odometry."""
+        if not replace(attempt, prediction=prediction).is_unexpected:
+            return False
+        alone = self.tracking.predict(scan, Prior(inertial=prior.inertial), last, self._config)
+        return replace(attempt, prediction=alone).is_unexpected
 
     def lose(self, prediction: Prediction, reason: str, fit: Fit | None = None) -> MappedScan:
         """A scan that was not registered stays at its prediction; without a fit, it has too few points.
