@@ -13,12 +13,12 @@ demo: $(VENV)/.base
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
 
 test: install
-	@echo "running the tests: about 7 minutes on two cores"
+	@echo "running the tests: about 5 minutes on two cores"
 	$(PYTEST)
 
 # Those that take more than a few seconds.
 test-long: install
-	@echo "running the long tests: some 12 minutes on two cores"
+	@echo "running the long tests: about 8 minutes on two cores"
 	$(PYTEST) -m "long and not slow"
 
 # All of them, the slow ones on recordings where they are at hand.
