@@ -253,7 +253,7 @@ class Attempt:
 
     @property
     def is_unexpected(self) -> bool:
-        """Whether the correction is improbable by the prediction, and larger than the errors of any at 10 Hz."""
+        """Whether the correction is improbable by the prediction, and larger than those of tracked motions at 10 Hz."""
         return self._exceeds(_LEAST_UNEXPECTED)
 
     def _exceeds(self, least: FloatArray) -> bool:

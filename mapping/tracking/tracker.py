@@ -278,15 +278,6 @@ class Tracker(Stateful):
             turn_rate=registration.velocity[:3] if is_timed and prior.inertial is None else None,
         )
 
-    def _is_unexpected(
-        self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
-    ) -> bool:
-        """Whether a pose is improbable by its prediction, and by that of the last motion without an odometry."""
-        if not replace(attempt, prediction=prediction).is_unexpected:
-            return False
-        alone = self.tracking.predict(scan, Prior(inertial=prior.inertial), last, self._config)
-        return replace(attempt, prediction=alone).is_unexpected
-
     def lose(self, prediction: Prediction, reason: str, fit: Fit | None = None) -> MappedScan:
         """A scan that was not registered stays at its prediction; without a fit, it has too few points.
 
@@ -312,6 +303,15 @@ class Tracker(Stateful):
         """Take the last registration back, but for the observed error of the predictions."""
         self.tracking = replace(earlier, prediction_error_m=self.tracking.prediction_error_m)
         self._end_search()
+
+    def _is_unexpected(
+        self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
+    ) -> bool:
+        """Whether a pose is improbable by its prediction, and by that of the last motion without an odometry."""
+        if not replace(attempt, prediction=prediction).is_unexpected:
+            return False
+        alone = self.tracking.predict(scan, Prior(inertial=prior.inertial), last, self._config)
+        return replace(attempt, prediction=alone).is_unexpected
 
     def _relocalise(self, matcher: ScanMatcher, near: Attempt) -> Attempt | None:
         """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none.
