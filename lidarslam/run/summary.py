@@ -299,6 +299,8 @@ class RunSummary:
     contradictions: tuple[Contradiction, ...] = ()
     slowest: SlowestScan | None = None
     elevation: Elevation | None = None
+    # ratio of the turn rates within sweeps to those from scan to scan, as of `calibration.time_scale`
+    time_scale: float | None = None
 
     @property
     def elapsed_ms_per_scan(self) -> float:
@@ -327,6 +329,7 @@ class RunSummary:
             "lost": [vars(stretch) for stretch in self.lost],
             "map_contradictions": [vars(found) for found in self.contradictions],
             **elevation,
+            "time_scale": self.time_scale,
             **graph_and_map_json(self.graph, self.map, self.warnings),
         }
 
@@ -359,6 +362,8 @@ def summarise(
     trajectory, total_ms, stage_ms = log.trajectory, log.table["total_ms"], log.table["stage_ms"]
     stages = {"total": total_ms} | dict(zip(STAGES, stage_ms.T, strict=True))
     elapsed_s, unconstrained_m = float(total_ms.sum()) / 1e3, _unconstrained_m(log)
+    is_tracked = np.array([status is Status.OK for status in log.statuses])
+    scale = time_scale(trajectory, log.table["turn_rate"], is_tracked)
     return RunSummary(
         scans=len(log),
         length_m=trajectory.length_m,
@@ -374,10 +379,11 @@ def summarise(
         odometry_asked=int(log.table["odometry_asked"].sum()),
         graph=graph,
         map=written,
-        warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m)),
+        warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m, scale)),
         contradictions=contradictions,
         slowest=SlowestScan.of(stage_ms),
         elevation=elevation,
+        time_scale=None if scale is None else scale[0],
     )
 
 
@@ -440,8 +446,9 @@ def _unconfirmed_start_m(log: ScanLog) -> float:
 
 
 def _warnings(
-    log: ScanLog, skipped: int, contradictions: Sequence[Contradiction], unconstrained_m: float
-) -> Iterator[str]:
+    log: ScanLog, skipped: int, contradictions: Sequence[Contradiction], unconstrained_m: float,
+    scale: tuple[float, int] | None,
+) -> Iterator[str]:  # fmt: skip
     if skipped:
         yield f"{count(skipped, 'scan')} of those asked for missing"
     steps = np.diff(log.stamps)
@@ -464,8 +471,7 @@ def _warnings(
             f"the length of {length_m:.1f} m is uncertain by {unconstrained_m:.1f} m: hardly any surface constrains the"
             " motion there, as in a featureless corridor or the first sweeps of a sparse sensor, or people walk along"
         )
-    is_tracked = np.array([status is Status.OK for status in log.statuses])
-    if (wrong := time_scale_warning(time_scale(log.trajectory, log.table["turn_rate"], is_tracked))) is not None:
+    if (wrong := time_scale_warning(scale)) is not None:
         yield wrong
     if contradictions:
         clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,16 +141,16 @@ class Voxels:
             layout,
         )
 
-    def reduced(self, kind: Literal["quicksort", "stable"] = "quicksort") -> "Voxels":
-        """Rows of equal keys added up, in the order of keys, which are sorted by an algorithm of NumPy."""
+    def reduced(self) -> "Voxels":
+        """Rows of equal keys added up, in the order of keys."""
         unique, totals = np.empty_like(self.keys), np.empty_like(self.sums)
-        order = np.argsort(self.keys, kind=kind)
+        order = np.argsort(self.keys, kind="stable")  # merges sorted parts in linear time
         count = add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
         return Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
 
     def united(self, other: "Voxels") -> "Voxels":
-        """Both of them, reduced; both are reduced already, and a stable sort merges sorted parts in linear time."""
-        return Voxels.join([self, other]).reduced("stable")
+        """Both of them, reduced; both are reduced already."""
+        return Voxels.join([self, other]).reduced()
 
     def chosen(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Voxels":
         """Some of them."""

@@ -306,8 +306,9 @@ class LoopDetector(Stateful):
     def _look(self, index: int, barred: NDArray[np.bool_] | None) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""
         decided: list[LoopClosure] = []
-        source = self.database.cloud(index)
+        source: SubmapCloud | None = None  # most keyframes have no candidate
         for candidate in self.database.candidates(index, barred):
+            source = source or self.database.cloud(index)
             found = verify(self.database.cloud(candidate.index), source, candidate.T_first_second)
             if found is None:
                 continue

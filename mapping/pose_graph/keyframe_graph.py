@@ -196,7 +196,7 @@ class KeyframeSelector(Stateful):
         self._cell_m = max(1e-3, _CELL_RANGES * range_m)
         # The cells of points and those that share a face with them, so that noise does not count.
         steps = key_steps(np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]).astype(np.int64))
-        self._cells = np.unique(np.add.outer(point_keys(points, self._cell_m), steps))
+        self._cells = np.unique(np.add.outer(np.unique(point_keys(points, self._cell_m)), steps))
 
     def _overlap(self, T_keyframe_lidar: FloatArray, points: FloatArray) -> float:
         """The share of a scan's points that lie where the keyframe saw something; 1 for a scan without points."""

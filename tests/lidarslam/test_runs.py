@@ -1,6 +1,8 @@
 """Runs with loops given and forbidden, with LOAM, and what they say of times, elevations and maps that are wrong."""
 
 import csv
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -133,6 +135,7 @@ def test_a_run_says_that_the_times_are_wrong(walk, tmp_path, scale, fault):
     options = ["--odometry", "constant-velocity", "--no-report", "--set", f"reader.time_scale={scale}"]
     out = tmp_path / "run"
     lidarslam("run", walk, "--out", out, *options)
+    assert summary_of(out)["time_scale"] == pytest.approx(1.0 / scale, rel=0.25)
     warnings = [text for text in summary_of(out)["warnings"] if "points' times" in text]
     assert len(warnings) == (fault is not None)
     assert all(f"times are {fault}" in text for text in warnings)
@@ -144,6 +147,22 @@ def test_the_scale_holds_for_any_mounting(walk, mounting):
     configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))
     (recorded,), (scaled,) = (list(open_recording(walk, config).scans(stop=1)) for config in configs)
     np.testing.assert_array_equal(scaled.time_offsets, -0.5 * recorded.time_offsets)
+
+
+def documented(heading: str, column: int = 1) -> list[str]:
+    """The names in a column of the table below a heading of docs/results.md."""
+    text = (Path(__file__).parents[2] / "docs/results.md").read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    rows = [line.split("|") for line in text.splitlines() if line.startswith("| `")]
+    return [name for row in rows for name in re.findall("`([a-z_]+)`", row[column])]
+
+
+def test_the_files_of_a_run_have_the_documented_keys(whole_run):
+    with (whole_run / "scans.csv").open() as file:
+        assert next(csv.reader(file)) == documented("scans.csv")
+    assert set(summary_of(whole_run)) == set(documented("summary.json"))
+    metrics = json.loads((whole_run / "metrics.json").read_text())
+    assert list(metrics) == documented("metrics.json")
+    assert {*metrics["association"], *metrics["trajectory"]} <= set(documented("metrics.json", 2))
 
 
 LOW_DEG, STREET_SCANS = 0.4, 36
