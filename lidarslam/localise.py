@@ -159,14 +159,14 @@ def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
     log.correct(poses)
     log.mark([number for number in localiser.placed_afterwards if number in scans], Status.DEGRADED, _AFTERWARDS)
     for found in localiser.found:
-        waited = range(found.scan, found.confirmed)
+        waited = range(found.scan, min(found.confirmed, len(log)))  # an interrupted run lacks the last scans
         log.mark([number for number in waited if log.messages[number].endswith(NOT_CONFIRMED)], Status.OK, "")
     log.mark([number for number in localiser.unconfirmed() if number in scans], Status.LOST, _REVOKED)
 
 
 def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
     refused = tuple(localiser.refusals)
-    if not localiser.found:
+    if not localiser.found or not len(log):
         return Localisation(refused)
     first = localiser.found[0]
     lost, afterwards = log.statuses.count(Status.LOST), len(localiser.placed_afterwards)
@@ -174,7 +174,7 @@ def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
         refused,
         found_scan=first.scan,
         confirmed_scan=first.confirmed,
-        confirmed_after_s=float(log.stamps[first.confirmed] - log.stamps[0]),
+        confirmed_after_s=float(log.stamps[min(first.confirmed, len(log) - 1)] - log.stamps[0]),
         found_inlier_ratio=float(np.mean([fit.inlier_ratio or 0.0 for fit in first.fits])),
         times_found=len(localiser.found),
         tracked_scans=len(log) - lost - afterwards,

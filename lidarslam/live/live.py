@@ -120,15 +120,18 @@ class Follower:
             self._statistics.arrived((stamp_ns or message.published_ns) / 10**9, message.arrived_s)
 
     def _register_all(self, incoming: IncomingQueue) -> None:
-        started, begin, registered = time.time(), None, 0
+        started, begin, registered = time.monotonic(), None, 0
         while True:
             message = incoming.take(_POLL_S)
             if message is None:
-                if incoming.is_ended or _is_over(self._request.duration_s, time.time() - (begin or started)):
+                if incoming.is_ended or _is_over(self._request.duration_s, time.monotonic() - (begin or started)):
                     return
                 continue
             begin = begin or message.arrived_s
             registered += self._register(message)
+            if self._decoder.is_set_back:
+                logger.warning("the clock of the stamps was set back: the run ends here, with its results")
+                return
             if registered == self._request.scans or _is_over(self._request.duration_s, message.arrived_s - begin):
                 return
 

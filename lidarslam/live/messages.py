@@ -28,8 +28,12 @@ _MOST_LOOKED_AT = 10
 # A stamp that is ahead of the time since the scan before by this much is an outlier, unless this many in a row are.
 _AHEAD_NS, _CLOCK_WAS_SET = 10**9, 6
 
+# Stamps this far behind are of a clock that was set back if this many increase in a row.
+_BEHIND_NS, _SET_BACK = 10**9, 6
+
 _NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
 _AHEAD = "scans were left out: their stamps are ahead of the time that has passed since the scans before"
+_CLOCK_BEHIND = "scans are behind the last one: the clock of the stamps was set back, and the run ended; start another"
 _OTHER_SENSOR = "scans were left out: they come from another sensor; name one with --set reader.frame_id=NAME"
 
 _TIME_FIELD = "time field of the points has a fault"
@@ -59,11 +63,17 @@ class CloudDecoder:
         self._last_ns: int | None = None
         self._doubtful: tuple[int, int] | None = None  # stamp and publication of a first message from the future
         self._last_published_ns = self._ahead = 0  # and the number of stamps in a row ahead of it
+        self._behind_ns, self._behind = 0, 0  # the last stamp behind it, and the number of increasing ones in a row
         self._has_header_stamps = True
         self._clouds: list[tuple[RawCloud, float]] = []
         self._timing = PointTiming()
         self._is_settled = config.time_reference == "none"
         self.T_upright_recorded = transform_of(config.mounting)
+
+    @property
+    def is_set_back(self) -> bool:
+        """Whether the clock of the stamps was set back, so that no later scan follows the earlier ones."""
+        return self._behind >= _SET_BACK
 
     def scan(self, raw: bytes, published_ns: int) -> LiveScan | None:
         """The scan of a serialised message; None where it cannot be used, which is counted."""
@@ -82,7 +92,7 @@ class CloudDecoder:
         stamp = stamp_ns / 10**9
         self._learn(cloud, stamp)
         self._last_ns, self._last_published_ns, self._frame_id = stamp_ns, published_ns, frame_id
-        self._ahead = 0
+        self._ahead = self._behind = 0
         scan = self._timing.scan(cloud, stamp, self._faults, f"{stamp:.9f}")
         scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
         return LiveScan(scan, stamp_ns, frame_id)
@@ -95,7 +105,12 @@ class CloudDecoder:
             return self._begins(stamp_ns, published_ns)
         step_ns = stamp_ns - self._last_ns
         if step_ns <= 0:
-            self._faults.leave_out(_NOT_AFTER, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+            self._behind = self._behind + 1 if self._behind_ns < stamp_ns < self._last_ns - _BEHIND_NS else 0
+            self._behind_ns = stamp_ns
+            example = f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}"
+            if self.is_set_back:
+                self._faults.note(_CLOCK_BEHIND, example, self._behind)
+            self._faults.leave_out(_NOT_AFTER, example)
             return False
         is_ahead = step_ns > max(0, published_ns - self._last_published_ns) + _AHEAD_NS
         self._ahead = self._ahead + 1 if is_ahead else 0

@@ -92,7 +92,7 @@ class Received:
 class Arrived(Received):
     """A message with its time of arrival."""
 
-    arrived_s: float  # when it arrived, by this machine's clock
+    arrived_s: float  # when it arrived, by `time.monotonic`
 
 
 class IncomingQueue:
@@ -152,7 +152,7 @@ class IncomingQueue:
         try:
             while not self.is_ended:
                 for message in self._receive(_RECEIVE_S):
-                    self._add(Arrived(message.raw, message.published_ns, time.time()))
+                    self._add(Arrived(message.raw, message.published_ns, time.monotonic()))
         except Exception as error:
             self._error = error
             self.end()
@@ -294,20 +294,20 @@ class LiveStatistics:
 
     def registered(self, stamp_s: float, arrived_s: float) -> None:
         """Count a scan whose pose is published."""
-        now = time.time()
+        since_arrival_s, since_stamp_s = time.monotonic() - arrived_s, time.time() - stamp_s
         with self._lock:
-            self._from_arrival.append(now - arrived_s)
-            if abs(now - stamp_s) < _SAME_CLOCK_S:
-                self._from_stamp.append(now - stamp_s)
+            self._from_arrival.append(since_arrival_s)
+            if abs(since_stamp_s) < _SAME_CLOCK_S:
+                self._from_stamp.append(since_stamp_s)
 
     def counts(self, dropped: int) -> LiveCounts:
         """The counts up to now; the queue dropped `dropped` messages."""
         with self._lock:
             stamps, arrivals = np.array(self._arrived).reshape(-1, 2).T
-            registered, recent = len(self._from_arrival), arrivals[arrivals > time.time() - _RATE_OVER_S]
+            registered, recent = len(self._from_arrival), arrivals[arrivals > time.monotonic() - _RATE_OVER_S]
             return LiveCounts(
                 received=len(arrivals),
-                missing=count_missing(stamps),
+                missing=count_missing(stamps, arrivals),
                 dropped=dropped,
                 registered=registered,
                 rate_hz=float((len(recent) - 1) / np.ptp(recent)) if len(recent) > 1 and np.ptp(recent) > 0.0 else 0.0,
@@ -320,12 +320,15 @@ def _latency(seconds: list[float]) -> Latency | None:
     return Latency(*(1e3 * np.quantile(seconds, [0.5, 0.99])).tolist()) if seconds else None
 
 
-def count_missing(stamps: FloatArray) -> int:
+def count_missing(stamps: FloatArray, arrivals: FloatArray) -> int:
     """The number of scans missing in the gaps between stamps (N,), seconds, by their median interval.
 
-    No more than fit into the whole time: a stamp that is late by an interval is followed by a shorter one.
+    No more than fit into the whole time: a stamp that is late by an interval is followed by a shorter one. A gap that
+    is longer by seconds than that between the arrivals (N,) is of an outlier, or of a clock that was set.
     """
-    steps = np.diff(np.unique(stamps))
+    stamps, first = np.unique(stamps, return_index=True)
+    steps, waited_s = np.diff(stamps), np.abs(np.diff(arrivals[first]))
+    steps = steps[steps < waited_s + _FAR_S]
     if not len(steps):
         return 0
     intervals = steps / np.median(steps)

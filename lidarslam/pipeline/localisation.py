@@ -166,6 +166,7 @@ class ScanToMap(Stateful):
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
             cell_m=mapped.cell_m,
+            has_surfels=mapped.has_surfels,
             turn_rate=mapped.turn_rate,
         )
 

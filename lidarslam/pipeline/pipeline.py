@@ -201,7 +201,7 @@ class Pipeline(Stateful):
         self.map.add(thinned, estimate)
         if self._graph is not None:
             arrived = graph_scan(odometry, estimate)
-            cell_m = None if self._correction is None else estimate.cell_m
+            cell_m = estimate.cell_m if self._correction is not None and estimate.has_surfels else None
             drawing = self._graph_worker.submit(_give, self._graph, self.map, arrived, cell_m)
             if self._correction is not None:
                 self._correction.add(drawing)

@@ -149,7 +149,8 @@ class ProjectedTrack:
         """The positions within the time of a trajectory (M poses), assigned to the keyframes among its scans."""
         track, scans = self.track, np.asarray(keyframe_scans)
         rows = np.flatnonzero(track.is_within(trajectory, self.projected))
-        keys = np.abs(trajectory.stamps[scans][None, :] - track.stamps[rows, None]).argmin(axis=1)
+        between = trajectory.stamps[scans[:-1]] + 0.5 * np.diff(trajectory.stamps[scans])
+        keys = np.searchsorted(between, track.stamps[rows])
         antennas = trajectory.at(track.stamps[rows]) @ np.append(track.lidar_antenna, 1.0)
         T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])
         antennas = np.einsum("nij,nj->ni", T_keyframe_world, antennas)[:, :3]

@@ -50,6 +50,8 @@ _FEW_POINTS, _LIKELY = 500, 0.5
 _PROMISING = 16
 # A region of the map serves several places: it is larger than the scans' reach by this factor. Number of them kept.
 _SPARE, _REGIONS = 1.5, 8
+# Factor by which the scans' reach grows before regions are drawn again.
+_GROWN = 1.25
 # Other scans that must fit, and their largest deviation from the recording's own motion: angle and distance.
 _OTHERS = 5
 _MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
@@ -135,9 +137,9 @@ class Regions:
         self._drawn: list[tuple[FloatArray, SurfelMap]] = []
 
     def resize(self, wanted_m: float, reach_m: float) -> None:
-        """Adapt to the wanted edge of cells; where that changes theirs, begin again with regions of this reach."""
+        """Adapt to the wanted edge of cells and a reach; where either outgrows the regions, begin again."""
         cell_m = self._map.cell_m(wanted_m)
-        if cell_m != self.cell_m:
+        if cell_m != self.cell_m or reach_m > _GROWN * self._reach_m:
             self.cell_m, self._reach_m, self._spare_m, self._drawn = cell_m, reach_m, self._spare * reach_m, []
 
     def around(self, position: FloatArray) -> SurfelMap:

@@ -295,13 +295,13 @@ class LoopDetector(Stateful):
 
     def _is_soon(self, way_m: float, segment: int) -> bool:
         """Whether the last closure is so recent that another would repeat it."""
-        if self._pending or not self._accepted:
-            return False
         track, range_m = self.database.track, self.database.submaps[-1].range_m
-        since_m = [way_m - track.way_m[one.second] for one in self._accepted[-_MANY:]]
-        are_many = len(since_m) == _MANY and since_m[0] < _MANY * range_m
-        spacing_m = max(_SPACING_M, range_m) if are_many else _SPACING_M
-        return bool(track.segment[self._accepted[-1].second] == segment and since_m[-1] < spacing_m)
+        latest = [one.second for one in self._accepted[-_MANY:] if track.segment[one.second] == segment]
+        if self._pending or not latest:
+            return False
+        since_m = way_m - track.way_m[latest]
+        are_many = len(latest) == _MANY and since_m[0] < _MANY * range_m
+        return bool(since_m[-1] < (max(_SPACING_M, range_m) if are_many else _SPACING_M))
 
     def _look(self, index: int, barred: NDArray[np.bool_] | None) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""

@@ -115,7 +115,7 @@ class SlamGraph(KeyframeGraph):
         return drawn
 
     def finish(self, placed: tuple[FloatArray, ProjectedTrack] | None = None) -> Corrected | None:
-        """Optimise everything, with the stamps (M,) of all scans and a GNSS track; None when there is no keyframe.
+        """Optimise everything, with the stamps (M,) of the first scans and a GNSS track; None without a keyframe.
 
         A TooFewPositionsError is raised where too few positions are within the time of the scans.
         """
@@ -169,12 +169,13 @@ class SlamGraph(KeyframeGraph):
         track: ProjectedTrack,
     ) -> Optimised:  # fmt: skip
         """Optimise the keyframes' poses (K, 4, 4) in the projection, with GNSS positions; the result is of the run."""
-        scans = [keyframe.scan for keyframe in self.keyframes]
-        registered = Trajectory(stamps, np.array(self.scan_poses))
-        T_world_lidar = corrected_recordings(registered.T_world_lidar, np.array([0]), np.array(scans), poses)
+        # An interrupted run knows the stamps of fewer scans than the graph was given.
+        scans = np.array([one.scan for one in self.keyframes if one.scan < len(stamps)], dtype=np.intp)
+        registered = Trajectory(stamps, np.array(self.scan_poses[: len(stamps)]))
+        T_world_lidar = corrected_recordings(registered.T_world_lidar, np.array([0]), scans, poses[: len(scans)])
         T_map_world = track.aligned(Trajectory(stamps, T_world_lidar))
         attitudes = [replace(attitude, world=np.array([0.0, 0.0, 1.0])) for attitude in self.attitudes]
-        positions = track.positions(registered, scans)
+        positions = track.positions(registered, scans.tolist())
         optimised = optimise(T_map_world @ poses, edges, loops, attitudes, positions)
         T_world_map = poses[0] @ inverse(optimised.poses[0])
         logger.info("GNSS: %d of %d positions are inliers", optimised.position_inliers.sum(), len(positions))

@@ -338,6 +338,7 @@ class MappedScan:
     # (6,) body velocity of the first scan as the second shows it, in the result of the second; None in all others
     first_velocity: FloatArray | None = None
     cell_m: float | None = None  # edge of the finest cells of a local map
+    has_surfels: bool = False  # whether that map is one of surfels
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU
 
     @property

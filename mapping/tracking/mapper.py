@@ -49,6 +49,7 @@ _EVEN_MOTION = np.diag(np.concatenate([LEAST_SIGMA, [np.deg2rad(20.0)] * 3, [0.5
 _GROWING = "inserted at its prediction: the map has too few sweeps for a registration"
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 _SEARCHING = "the search for its place goes on with the next scan"
+_IN_VAIN = "the search for its place found none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,8 @@ class Mapper(Stateful):
         else:
             mapped = self._track(scan, prior, last, self._map)
         self._last = mapped.state
-        return replace(mapped, cell_m=None if self._map is None else self._map.cell_m)
+        cell_m = None if self._map is None else self._map.cell_m
+        return replace(mapped, cell_m=cell_m, has_surfels=isinstance(self._map, SurfelMap))
 
     def _track(self, scan: SampledScan, prior: Prior, last: MotionState, local_map: LocalMap) -> MappedScan:
         """Predict, register, judge, insert."""
@@ -137,7 +139,7 @@ class Mapper(Stateful):
             return self._grow(scan, prediction, local_map, attempt.fit)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
-            reason = _SEARCHING if self._tracker.is_searching else reason
+            reason = _SEARCHING if self._tracker.is_searching else _IN_VAIN if self._tracker.in_vain else reason
             return self._lose(scan, attempt.prediction, local_map, attempt.fit, reason)
         # Judge the pose by its fit, and adapt the noise of process and odometry.
         mapped = self._tracker.accept(attempt, scan, prior, prediction, last)

@@ -182,7 +182,7 @@ class Tracker(Stateful):
         self._budget = budget or Budget()
         self._search: SpreadSearch | None = None  # that continues with the next scan
         self._map_is_due = False  # whether the next search is one of the whole map
-        self._in_vain = False  # whether the last scan ended a search that found nothing
+        self.in_vain = False  # whether the last scan ended a search of several scans that found nothing
         self.tracking = TrackingState()
         self._archive = ArchivedMaps()
 
@@ -206,7 +206,7 @@ class Tracker(Stateful):
         nearby = NearSearch(matcher, state, prior, prediction)
         if state.is_lost and self.is_searching:  # which has all the time of a lost scan
             found = self._found(matcher, prediction)
-            self._in_vain = found is None and not self.is_searching
+            self.in_vain = found is None and not self.is_searching
             return found or matcher.none(nearby.continued(prediction))
         uncertain, unconfirmed = state.is_uncertain(scan.stamp - last.stamp), state.is_unconfirmed
         best: Attempt | None
@@ -319,8 +319,8 @@ class Tracker(Stateful):
         The nearby attempt does not count before a search is done.
         """
         sufficient = near.is_reliable if self.tracking.is_unconfirmed else near.fit.inlier_share > _PLAUSIBLE_SHARE
-        counts, in_vain = near.status is not Status.LOST and sufficient, self._in_vain
-        self._in_vain = False
+        counts, in_vain = near.status is not Status.LOST and sufficient, self.in_vain
+        self.in_vain = False
         if counts and in_vain:
             return near
         found = self._found(matcher, near.prediction)
@@ -343,4 +343,4 @@ class Tracker(Stateful):
 
     def _end_search(self) -> None:
         self._search = None
-        self._map_is_due = self._in_vain = False
+        self._map_is_due = self.in_vain = False

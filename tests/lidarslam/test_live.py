@@ -227,6 +227,18 @@ def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few():
     assert "ahead of the time that has passed" in faults.warnings()[0]
 
 
+@pytest.mark.parametrize(("back_s", "is_set_back"), [(0.5, False), (60.0, True)])
+def test_a_clock_that_was_set_back_ends_the_run_with_a_warning(back_s, is_set_back):
+    faults = Faults()
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)
+    steps = 0.1 * np.arange(10)
+    for number, stamp in enumerate([*(100.0 + steps), *(100.9 - back_s + 0.01 * steps)]):
+        decoder.scan(message_at(stamp), NOW + number * 10**8)
+        assert not decoder.is_set_back or number >= 15
+    assert decoder.is_set_back == is_set_back
+    assert any("clock of the stamps was set back" in warning for warning in faults.warnings()) == is_set_back
+
+
 @pytest.mark.parametrize("ahead_s", [0.0, 37.0])
 def test_a_stray_stamp_at_the_very_beginning_costs_one_scan(decoder, ahead_s):
     """Also where the sensor's clock is ahead, as that of TAI; there the first scan decides nothing by itself."""
@@ -263,22 +275,24 @@ def test_an_error_of_receiving_is_raised_where_messages_are_taken():
 
 def test_missing_scans_are_counted_by_the_gaps_between_stamps():
     stamps = 1e9 + 0.1 * np.arange(50) + 0.005 * np.random.default_rng(0).standard_normal(50)
-    assert count_missing(stamps) == 0
-    assert count_missing(np.delete(stamps, [7, 20, 21, 22])) == 4
-    assert count_missing(stamps[:1]) == 0
-    late = stamps + np.where(np.arange(50) == 30, 0.08, 0.0)  # which is not missing
-    assert count_missing(late) == 0
+    arrivals, some = 0.1 * np.arange(50), np.delete(np.arange(50), [7, 20, 21, 22])
+    assert count_missing(stamps, arrivals) == 0
+    assert count_missing(stamps[some], arrivals[some]) == 4
+    assert count_missing(stamps[:1], arrivals[:1]) == 0
+    for late_s, missing in ((0.08, 0), (1e9, 1)):  # a late scan is not missing, and an outlier alone is
+        assert count_missing(stamps + np.where(np.arange(50) == 30, late_s, 0.0), arrivals) == missing
+    assert count_missing(stamps + np.where(np.arange(50) < 30, 0.0, 3600.0), arrivals) == 0
 
 
 def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock():
-    now, statistics = time.time(), LiveStatistics()
-    statistics.arrived(now - 0.2, now - 0.1)
-    statistics.registered(now - 0.2, now - 0.1)
+    now, arrived_s, statistics = time.time(), time.monotonic() - 0.1, LiveStatistics()
+    statistics.arrived(now - 0.2, arrived_s)
+    statistics.registered(now - 0.2, arrived_s)
     counts = statistics.counts(dropped=0)
     assert 100.0 <= counts.from_arrival.median_ms < counts.from_stamp.median_ms
     assert not counts.warnings()
     other = LiveStatistics()
-    other.registered(5.0, now)
+    other.registered(5.0, arrived_s)
     assert other.counts(dropped=3).from_stamp is None
     assert "3 scans dropped" in other.counts(dropped=3).warnings()[0]
 

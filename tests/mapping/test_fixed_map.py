@@ -12,7 +12,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.localization.map_localiser import MapLocaliser
-from lidarslam.mapping.localization.place_search import FixedMap
+from lidarslam.mapping.localization.place_search import FixedMap, Regions
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 from . import runs
@@ -134,3 +134,14 @@ def test_a_map_far_from_its_origin_is_refused(rng):
     for use in (lambda: fixed.region(points[0], 10.0, 0.1), lambda: fixed.views(0.1)):
         with pytest.raises(InputError, match=r"up to 5,000 km from its origin, and cells of 0\.1 m reach 105 km"):
             use()
+
+
+def test_regions_grow_with_the_reach_of_the_scans_and_stay_when_it_shrinks(room_map):
+    regions, centre = Regions(room_map, spare=0.5), T_MAP_ROOM[:3, 3]
+    regions.resize(0.1, 1.0)
+    narrow = regions.around(centre)
+    regions.resize(0.1, 20.0)
+    wide = regions.around(centre)
+    assert len(wide.means()) > 3 * len(narrow.means())
+    regions.resize(0.1, 1.0)
+    assert regions.around(centre) is wide

@@ -95,8 +95,9 @@ def settled(followed: Mapper) -> Mapper:
 @pytest.mark.parametrize(("sensor", "kind"), [("vlp-16", SurfelMap), ("mid-360", FeatureMap)])
 def test_without_rings_planes_pass_through_neighbouring_voxels(scan_room, sensor, kind):
     mapper = Mapper(SURFELS)
-    process(mapper, [scan_room(sensor)])
+    (mapped,) = process(mapper, [scan_room(sensor)])
     assert isinstance(mapper.local_map, kind)
+    assert mapped.has_surfels == (kind is SurfelMap)  # the pose graph rebuilds no others
 
 
 def test_poses_and_velocities_are_true_without_any_prior(mapper, rest_scans, rest_truth):

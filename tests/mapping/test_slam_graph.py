@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.mapping.config import PoseGraphConfig
+from lidarslam.mapping.global_map.georeference import GnssTrack, ProjectedTrack
 from lidarslam.mapping.loops.closure import NEAR_SCANS, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph import slam_graph
 from lidarslam.mapping.pose_graph.correction import Corrected
@@ -166,6 +167,16 @@ def test_a_closed_round_takes_the_drift_away(walk, closed):
     assert before.max() > 0.6
     assert np.sqrt(np.mean(after**2)) < 0.2 * np.sqrt(np.mean(before**2))
     assert sum(result.inliers) >= 2
+
+
+def test_an_interrupted_run_is_placed_by_gnss(walk):
+    """The graph was given more scans than the run delivered."""
+    graph, stamps = follow(walk), 0.1 * np.arange(len(walk.truth))
+    track = GnssTrack(stamps, np.zeros((len(stamps), 3)), np.full(len(stamps), 0.02), np.zeros(3))
+    corrected = graph.finish((stamps[:-5], ProjectedTrack(track, walk.truth[:, :3, 3], 1.0)))
+    assert corrected is not None
+    assert len(corrected.T_world_lidar) == len(stamps)
+    assert walk.errors_m(corrected.T_world_lidar).max() < 0.05
 
 
 def test_a_forbidden_loop_is_not_found(walk, closed):
