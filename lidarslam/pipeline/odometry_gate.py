@@ -39,18 +39,17 @@ class OdometryGate(Stateful):
 
     _odometry: SkippingOdometry
     _ok: int  # ok scans in a row
-    _error_m: float  # of the last predictions: the largest, fading
+    _error_cells: float  # of the last predictions, in cells of the local map: the largest, fading
     _stamp: float | None  # of the last scan that was given to `estimate`
     _interval_s: float | None  # between the last two
     _T_world_last: Annotated[FloatArray, TRANSFORM] | None  # pose of the last ok scan, unless another one followed
     _last_stamp: float  # its stamp
     _velocity: Annotated[FloatArray, Shape(6)] | None  # (6,) up to it
-    _cell_m: float
 
     def __init__(self, odometry: SkippingOdometry) -> None:
         self._odometry = odometry
         self._waiting: deque[Callable[[], ScanEstimate]] = deque()
-        self._ok, self._error_m, self._cell_m = 0, 0.0, 0.0
+        self._ok, self._error_cells = 0, 0.0
         self._stamp = self._interval_s = self._T_world_last = self._velocity = None
         self._last_stamp = 0.0
 
@@ -89,13 +88,12 @@ class OdometryGate(Stateful):
 
     def _may_be_skipped(self) -> bool:
         """Whether the next scan can do without, if all pending results are as good as possible."""
-        error_m = self._error_m * _FADING ** len(self._waiting)
-        return self._ok + len(self._waiting) >= _LEAST_OK and error_m < _LARGEST_ERROR * self._cell_m
+        waiting = len(self._waiting)
+        return self._ok + waiting >= _LEAST_OK and self._error_cells * _FADING**waiting < _LARGEST_ERROR
 
     def _take(self) -> None:
         estimate = self._waiting.popleft()()
-        self._cell_m = estimate.cell_m or 0.0
-        if estimate.status is not Status.OK or not estimate.is_connected:
+        if estimate.status is not Status.OK or not estimate.is_connected or not estimate.cell_m:
             self._ok, self._T_world_last, self._velocity = 0, None, None
             return
         before, self._T_world_last = self._T_world_last, estimate.T_world_lidar
@@ -106,7 +104,8 @@ class OdometryGate(Stateful):
         motion = log(inverse(before) @ estimate.T_world_lidar)
         if self._velocity is not None:
             error = log(inverse(exp(self._velocity * interval_s)) @ exp(motion))
-            self._error_m = max(_FADING * self._error_m, displacement_m(error, _RANGE_M))
+            error_cells = displacement_m(error, _RANGE_M) / estimate.cell_m
+            self._error_cells = max(_FADING * self._error_cells, error_cells)
             self._ok += 1
         self._velocity = motion / interval_s
 

@@ -17,6 +17,7 @@ import torch
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan, ScanSequence
+from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.tasks import Where, open_tasks
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.config import ReaderConfig
@@ -34,15 +35,19 @@ from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredien
 
 
 class MapTeacher:
-    """Registers a recording at constant velocity, scan after scan."""
+    """Registers a recording at constant velocity, scan after scan, in the axes of its images."""
 
     def __init__(self) -> None:
         self._mapper = Mapper(MappingConfig())
+        self._R_image_lidar: FloatArray | None = None
         self._T_world_middle: list[FloatArray] = []
         self._is_ok: list[bool] = []
 
     def follow(self, scan: Scan) -> None:
         """Register the next scan."""
+        if self._R_image_lidar is None:
+            self._R_image_lidar = image_axes(scan.points)
+        scan = replace(scan, points=scan.points @ self._R_image_lidar.T)
         mapped = self._mapper.process(self._mapper.sample(scan), Prior())
         state = mapped.state
         self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * scan.middle_offset_s))
@@ -67,7 +72,7 @@ RECORDED_SHARE = 0.3
 # Draws the simulated recordings.
 _SIMULATION_SEED = 0
 # To be raised whenever preparation, or the simulation, gives other results than before.
-_KIND = Kind("a recording prepared for training", version=4)
+_KIND = Kind("a recording prepared for training", version=5)
 
 Counter = Callable[[int], None]
 """Called with the number of scans that were prepared since the last call."""
@@ -209,7 +214,7 @@ def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: C
 
 def _key(piece: Stretch, config: TrainingConfig) -> dict[str, Any]:
     images = config.images.model_dump(mode="json")
-    key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": images}
+    key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": images, "version": _KIND.version}
     return key if piece.is_simulated else {**key, "teacher": config.teacher}
 
 

@@ -212,11 +212,13 @@ def format_errors(result: Validation) -> str:
     )
 
 
-def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None, is_interrupted: bool) -> str:
-    """The path of the weights, their errors, and the commands that use them."""
+def format_outcome(out: Path, step: int, kept_step: int, best: Validation | None, is_interrupted: bool) -> str:
+    """The path of the weights, their step and errors, and the commands that use them."""
+    weights = out / WEIGHTS
     errors = "" if best is None else f", on held-out scans {format_errors(best)}"
+    of_step = "" if kept_step == step else f" of step {kept_step:,}"
     lines = [
-        f"{count(steps, 'step')} done; weights written to {weights}{errors}",
+        f"{count(step, 'step')} done; weights{of_step} written to {weights}{errors}",
         f"use them:   {as_typed('lidarslam')} run SOURCE --weights {weights}",
         f"curves:     {as_typed('tensorboard')} --logdir {out / 'tensorboard'}",
     ]

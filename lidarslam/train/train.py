@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -60,7 +61,8 @@ class Devices:
         if is_cuda:
             torch.cuda.set_device(self.device)
         if self.processes > 1 and not distributed.is_initialized():
-            distributed.init_process_group("nccl" if is_cuda else "gloo")
+            # The first process prepares all recordings, and the others wait.
+            distributed.init_process_group("nccl" if is_cuda else "gloo", timeout=_PREPARED_WITHIN)
 
     def shared(self, module: nn.Module) -> nn.Module:
         """A module on the device, with gradients averaged over the processes."""
@@ -92,6 +94,8 @@ class Devices:
 LOG_EVERY, VALIDATE_EVERY = 50, 500
 # Validations of a training, at most.
 _MOST_VALIDATIONS = 10
+# Longest wait of a process for the others.
+_PREPARED_WITHIN = timedelta(hours=24)
 # Largest norm of the gradient; longer ones are clipped.
 _MOST_GRADIENT = 1.0
 # Rotation and translation errors that count the same when validations are compared: a degree and five centimetres.
@@ -160,6 +164,10 @@ class TrainingLoop:
                 if is_last or not progress.step % validate_every:
                     self._validate(recordings)
                     self._save()
+        if progress.step != config.steps and self._log is not None:
+            self._save_weights(files.LAST_WEIGHTS, None)
+            if not recordings.held_out:
+                self._save_weights(files.WEIGHTS, None)
         self._save()
         if self._log is not None:
             self._log.close()
@@ -176,6 +184,11 @@ class TrainingLoop:
         nn.utils.clip_grad_norm_(self._module.parameters(), _MOST_GRADIENT)
         self.optimizer.step()
         values = torch.stack(list(losses.values())).tolist()  # one transfer from the device
+        if not all(map(math.isfinite, values)):
+            raise ConfigError(
+                f"the loss is no longer a number at step {progress.step + 1}; lower training.learning_rate."
+                f" The last state in {self.out} is from before"
+            )
         for name, value in zip(losses, values, strict=True):
             progress.sums[name] = progress.sums.get(name, 0.0) + value
         progress.counted += 1
@@ -184,11 +197,6 @@ class TrainingLoop:
     def _report(self) -> None:
         config, progress = self.config, self.progress
         losses = {name: value / progress.counted for name, value in progress.sums.items()}
-        if not math.isfinite(losses["total"]):
-            raise ConfigError(
-                f"the loss is no longer a number at step {progress.step}; lower training.learning_rate."
-                f" The last state in {self.out} is from before"
-            )
         now = time.perf_counter()
         per_step = (now - self._clock) / progress.counted
         speed = config.batch * self.devices.processes / per_step
@@ -265,7 +273,8 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
     LidarSlamError where sources, configuration, weights or output directory are not usable.
     """
     earlier = files.earlier_training(request.out, request.resume, request.overwrite)
-    start = None if request.start_from is None else load_checkpoint(request.start_from)
+    has_state = request.resume and (request.out / files.STATE).exists()
+    start = None if request.start_from is None or has_state else load_checkpoint(request.start_from)
     config = with_network_of(start, request.config)
     stretches = [
         *(data.recorded(source, config.reader) for source in request.sources),
@@ -295,10 +304,10 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
                 say(f"going on after step {progress.step:,}")
             is_complete = loop.run(recordings, is_interrupted)
         if devices.is_first:
-            weights = request.out / files.WEIGHTS
-            kept = load_checkpoint(weights).about.get("validation")
+            written = load_checkpoint(request.out / files.WEIGHTS).about
+            kept = written.get("validation")
             best = kept and Validation(**{**kept, "covered_percent": tuple(kept["covered_percent"])})
-            say(files.format_outcome(request.out, weights, progress.step, best, not is_complete))
+            say(files.format_outcome(request.out, progress.step, written["steps"], best, not is_complete))
     return is_complete
 
 
@@ -425,6 +434,8 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
     earlier = out / files.CONFIG if options["resume"] and files.is_training(out) else None
     section = {} if earlier is None else read_yaml(earlier).get(SOURCES_SECTION)
     earlier_sources = section.get("sources", []) if isinstance(section, dict) else []
+    if earlier is not None and isinstance(section, dict):
+        start_from = section.get("from")  # also where it was killed before its first state
     if start_from is not None:
         start_from = default_weights() if start_from == "shipped" else Path(start_from)
     named = {"training.steps": options["steps"], "training.network.name": options["network"]}

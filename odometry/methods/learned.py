@@ -112,7 +112,8 @@ class LearnedOdometry(StatefulOdometry):
         middle, last = scan.stamp + scan.middle_offset_s, self._last
         if last is not None and not np.array_equal(last.images.R_image_lidar, images.R_image_lidar):
             self._forget()
-            last = None
+            self._begin(scan, images)
+            return Motion(np.eye(4), 0, "the axes of the images changed, as the scan before had few points")
         if last is None or self._described is None:
             self._begin(scan, images)
             return Motion(np.eye(4), images.alignment.with_normal())

@@ -209,18 +209,26 @@ def asked(
     empty: int | None = None,
     behind: int = 1,
     cell_m: float | None = CELL_M,
+    wider_from: int | None = None,
+    saved_at: int | None = None,
 ) -> list[int]:
-    """The indices of the scans that are asked for, where each pose comes so many scans late."""
+    """The indices of the scans that are asked for, where each pose comes so many scans late.
+
+    The cells of the map double at one scan, and the state is saved before another.
+    """
     times = 0.1 * np.arange(len(poses)) if stamps is None else stamps
     odometry = odometry_that_answers()
     gate = OdometryGate(odometry)
     for index, stamp in enumerate(times):
+        if index == saved_at:
+            gate.state()
         motion = gate.estimate(Scan(np.ones((0 if index == empty else 5, 3)), float(stamp)))
         assert motion.is_asked == (float(stamp) in stamps_of(odometry.estimate))
         done = index - behind + 1
         if done >= 0:
             status = (statuses or {}).get(done, Status.OK)
-            result = scan_estimate(float(times[done]), poses[done], status, cell_m=cell_m)
+            is_wider = wider_from is not None and done >= wider_from
+            result = scan_estimate(float(times[done]), poses[done], status, cell_m=2.0 * CELL_M if is_wider else cell_m)
             gate.follow(lambda result=result: result)
     asked, skipped = stamps_of(odometry.estimate), stamps_of(odometry.skip)
     assert sorted(asked + skipped) == times.tolist()
@@ -260,6 +268,15 @@ def test_after_a_gap_and_at_an_empty_scan_it_is_asked():
 def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked():
     assert asked(steady(), stamps=0.2 * np.arange(40)) == list(range(40))
     assert asked(steady(), cell_m=None) == list(range(40))
+
+
+def test_the_choice_does_not_depend_on_when_the_state_is_saved(rng):
+    """A shaken sensor that leaves a narrow place, where the cells of the map grow."""
+    poses = [T @ exp([0.0, 0.0, 0.0, *rng.normal(0.0, 0.03, 3)]) for T in steady(60)]
+    never = asked(poses, behind=2, wider_from=20)
+    assert 20 < len(never) < 60
+    for scan in range(12, 40):
+        assert asked(poses, behind=2, wider_from=20, saved_at=scan) == never
 
 
 def test_only_results_that_can_matter_are_waited_for():

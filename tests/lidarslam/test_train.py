@@ -18,8 +18,9 @@ import pytest
 import torch
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.geometry import inverse, log
+from lidarslam.core.geometry import inverse, log, make_transform
 from lidarslam.core.scan import Scan
+from lidarslam.core.spin_axis import image_axes
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import ImageConfig, SimulatedConfig
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of, read_tensor_file, write_tensor_file
@@ -70,16 +71,19 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("ready")
 
 
-class Console:
-    """Keeps the lines, and presses Ctrl-C after a validation."""
+LAST = "weights_last.safetensors"
 
-    def __init__(self, interrupt_at: int | None = None) -> None:
+
+class Console:
+    """Keeps the lines, and presses Ctrl-C after one."""
+
+    def __init__(self, interrupt_at: str | None = None) -> None:
         self.interrupt_at = interrupt_at
         self.lines: list[str] = []
 
     def __call__(self, line: str) -> None:
         self.lines.append(line)
-        if line.startswith(f"validation after {self.interrupt_at} steps"):
+        if self.interrupt_at is not None and line.startswith(self.interrupt_at):
             signal.raise_signal(signal.SIGINT)
 
     def validated(self) -> list[int]:
@@ -108,17 +112,23 @@ def losses(out: Path) -> list[dict[str, str]]:
 def assert_same(found: Path, expected: Path) -> None:
     assert losses(found) == losses(expected), found.name
     assert (found / "validation.csv").read_bytes() == (expected / "validation.csv").read_bytes(), found.name
-    a, b = (load_checkpoint(path / "weights_last.safetensors").weights for path in (found, expected))
+    a, b = (load_checkpoint(path / LAST).weights for path in (found, expected))
     assert all(torch.equal(a[name], b[name]) for name in a), found.name
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder, tmp_path, ready, whole):
-    parts, console = tmp_path / "parts", Console(interrupt_at=4)
+@pytest.mark.parametrize(("line", "steps", "validated"), [("validation after 4 steps", 4, [0, 4]), ("step 3/", 3, [0])])
+def test_an_interrupted_training_goes_on_as_if_it_had_not_been(
+    room_folder, tmp_path, ready, whole, line, steps, validated
+):
+    parts, console = tmp_path / "parts", Console(interrupt_at=line)
     assert not execute(request(room_folder, parts, ready), console)
-    assert console.validated() == [0, 4]
+    assert console.validated() == validated
     assert not any("best so far" in line for line in console.lines if line.startswith("validation after 0 steps"))
-    assert console.lines[-1].startswith("4 steps done; weights written to")
+    kept = {name: load_checkpoint(parts / name).about["steps"] for name in ("weights.safetensors", LAST)}
+    assert kept[LAST] == steps
+    of_step = "" if kept["weights.safetensors"] == steps else f" of step {kept['weights.safetensors']}"
+    assert console.lines[-1].startswith(f"{steps} steps done; weights{of_step} written to")
     assert "--resume" in console.lines[-1]
     assert execute(request(room_folder, parts, ready, resume=True), print)
     assert [row["step"] for row in losses(parts)] == ["3", "6", "8"]
@@ -286,9 +296,17 @@ def test_the_command_trains_goes_on_and_replaces(room_folder, tmp_path, ready):
     # On what it was begun, and how, is remembered.
     assert "going on after step 3" in succeeds(*options, "--resume", "--steps", 5)
     assert [row["step"] for row in losses(out)] == ["3", "5"]
-    succeeds(*options, room_folder, "--overwrite", "--steps", 2, "--from", out / "weights.safetensors")
+    shutil.copy(out / "weights.safetensors", begun := tmp_path / "begun.safetensors")
+    succeeds(*options, room_folder, "--overwrite", "--steps", 2, "--from", begun)
     assert [row["step"] for row in losses(out)] == ["2"]
-    assert load_checkpoint(out / "weights.safetensors").images.columns == 96
+    kept = load_checkpoint(out / LAST)
+    assert kept.images.columns == 96
+    # Killed before its first state, it begins with the same weights again.
+    (out / "state.safetensors").unlink()
+    succeeds(*options, "--resume")
+    resumed = load_checkpoint(out / LAST)
+    assert all(torch.equal(kept.weights[name], resumed.weights[name]) for name in kept.weights)
+    assert resumed.about["from"] == "begun.safetensors"
 
 
 def test_other_recordings_or_files_are_not_gone_on_with(room_folder, tmp_path, ready):
@@ -346,16 +364,23 @@ def at_speed() -> tuple[list[Scan], Trajectory]:
     return list(simulation.scans()), simulation.ground_truth
 
 
+# Axes of a camera: x to the right, y down, z forward.
+R_CAMERA_LIDAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
 @pytest.mark.long
-def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(at_speed):
+@pytest.mark.parametrize("R_recorded_lidar", [np.eye(3), R_CAMERA_LIDAR], ids=["upright", "camera"])
+def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(at_speed, R_recorded_lidar):
     scans, truth = at_speed
+    scans = [replace(scan, points=scan.points @ R_recorded_lidar.T) for scan in scans]
     teacher = MapTeacher()
     for scan in scans:
         teacher.follow(scan)
     taught = teacher.relabelled(prepare(iter(scans), ImageConfig()))
     middles = np.array([scan.stamp + scan.middle_offset_s for scan in scans[:-1]])
     poses = truth.at(middles, 0.1)
-    expected = inverse(poses[:-1]) @ poses[1:]
+    T_image_lidar = make_transform(image_axes(scans[0].points) @ R_recorded_lidar, np.zeros(3))
+    expected = T_image_lidar @ inverse(poses[:-1]) @ poses[1:] @ inverse(T_image_lidar)
     sure = taught.valid.numpy()[: SCANS - 2]
     assert sure.mean() > 0.7
     errors = log(inverse(taught.T_prev_curr.double().numpy()[: SCANS - 2]) @ expected)[sure]
