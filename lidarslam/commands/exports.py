@@ -81,7 +81,7 @@ def edit(sources: tuple[Path, ...], out: Path, overwrite: bool, **options: Any) 
         raise click.UsageError(f"--box {' '.join(f'{side:g}' for side in box)}: expected each from less than its to")
     if out.suffix == ".e57":
         require_format("e57")
-    require_new(out, overwrite)
+    require_new(out, overwrite, *sources)
     for line in edit_map(sources, out, MapEdits(**options)):
         say(line)
 
@@ -109,7 +109,7 @@ def export_bag(run: Path, out: Path, clouds: bool, frame: str, overwrite: bool) 
 
     if out.suffix not in SUFFIXES:
         raise click.UsageError(f"--out {out}: expected a file .mcap, .db3 or .bag, or a folder without a suffix")
-    require_new(out, overwrite)
+    require_new(out, overwrite, run)
     scans = read_run_scans(run)
     with show_count(out.name) as count:
         written = export_bag(scans, out, frame, clouds, count)
@@ -165,7 +165,7 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, overwrite: boo
 
     _require_suffix(out, GRID_SUFFIXES)
     for file in (out, out.with_suffix(".pgm")):
-        require_new(file, overwrite)
+        require_new(file, overwrite, run)
     for line in export_grid(run, out, resolution_m, heights):
         say(line)
 
@@ -186,7 +186,7 @@ def export_mesh(run: Path, out: Path, cell_m: float | None, overwrite: bool) -> 
     from lidarslam.exports.source import require_new
 
     _require_suffix(out, MESH_SUFFIXES)
-    require_new(out, overwrite)
+    require_new(out, overwrite, run)
     for line in export_mesh(run, out, cell_m):
         say(line)
 

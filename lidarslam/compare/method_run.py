@@ -234,6 +234,8 @@ def finished_before(run: MethodRun) -> MethodResult | None:
         result = MethodResult(run.name, **read_json(folder / PROCESS, _SHAPE))
         tree = read_yaml(folder / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
+        if run.request.config.reader.elevation_correction_deg == "auto":
+            tree["reader"]["elevation_correction_deg"] = "auto"  # config.yaml has the estimated value
         is_same = Config.model_validate(tree) == run.request.config
         peer = None if run.peer is None else peer_named(run.peer)
         described = describe_run(run.request) if peer is None else describe_peer(run.request, peer, run.range_m)

@@ -91,7 +91,8 @@ def read_imu_csv(path: Path) -> ImuSamples | None:
             raise InputError(f"{path}: {said}; mend it or move it away") from None
     stamps = table[:, 0]
     if len(stamps) and np.nanmedian(stamps) > _NANOSECONDS_FROM:
-        stamps = np.array([int(row.split(",")[0]) / 10**9 for row in rows])
+        words = (row.split(",")[0].strip() for row in rows)  # exact where they are whole numbers
+        stamps = np.array([int(word) / 10**9 if word.isdecimal() else float(word) / 1e9 for word in words])
     return usable_samples(stamps, table[:, 1:4], table[:, 4:], _extrinsic(path, comments))
 
 

@@ -457,4 +457,5 @@ def find_truth_file(folders: Sequence[Path], stem: str | None = None) -> Path | 
 
 def truth_beside(source: Path, name: str) -> Path | None:
     """The true trajectory in a recording's folder or its parent, or in the folder of its file."""
-    return find_truth_file([source, source.resolve().parent] if source.is_dir() else [source.parent], name)
+    above = [source, source.absolute().parent, source.resolve().parent] if source.is_dir() else [source.parent]
+    return find_truth_file(above, name)

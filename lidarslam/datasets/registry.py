@@ -231,6 +231,8 @@ def absent(source: Path) -> str:
 def result_of_program(source: Path) -> str | None:
     """The kind of a path that the program has written itself, from a recording; None of any other."""
     folder = source if source.is_dir() else source.parent
+    if source.is_file() and source.suffix.lower() not in SCAN_SUFFIXES and recognise(source) is not None:
+        return None  # a run writes no bags and no packets
     if source.is_dir() and (folder / "comparison.json").is_file():
         return f"{source}: is a comparison, not a recording; open {folder / 'report.html'}"
     head = ""

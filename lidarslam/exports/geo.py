@@ -98,7 +98,7 @@ def export_geo(run: Path, out: Path, overwrite: bool) -> Iterator[str]:
         )
     make_directory(out)
     for name in _FILES:
-        require_new(out / name, overwrite)
+        require_new(out / name, overwrite, run)
     T = placed.T_map_world @ trajectory.T_world_lidar
     T[:, :3, 3] = placed.positions(trajectory.positions)
     cloud, geodetic, name = load_map(run), utm.geodetic(T[:, :3, 3]), run.resolve().name

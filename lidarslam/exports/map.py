@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -106,6 +106,8 @@ def _read(source: Path, moved: int | None) -> Generator[str, None, _Map]:
         yield f"{source}: drawn again from the recording, {count(removed, 'point')} of moving objects removed"
         return _Map(cloud, positions)
     cloud, _ = read_map(source)
+    if not cloud.normals[:, :2].any():  # it has none
+        cloud = replace(cloud, normals=np.zeros_like(cloud.normals))
     tiles = read_summary(source).get("map_tiles")
     if tiles is not None:
         yield f"{source}: the overview of a map in tiles, {len(cloud):,} of {tiles['points']:,} points"

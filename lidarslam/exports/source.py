@@ -1,6 +1,7 @@
 """The recording and the scans of a finished run, as exports read them again."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,10 +31,15 @@ _SAME_S = 1e-6
 _GAP = 2.5
 
 
-def require_new(out: Path, overwrite: bool) -> None:
-    """Refuse to replace an exported file unless that is asked for."""
+def require_new(out: Path, overwrite: bool, *runs: Path) -> None:
+    """Refuse to replace an exported file unless that is asked for, and the recordings of the runs in any case."""
     if out.is_dir():
         raise OutputError(f"{out}: is a folder; name another place, or remove it")
+    for run in runs if out.exists() else ():
+        with suppress(InputError):
+            source = read_source(run, "").source.resolve()
+            if source in (out.resolve(), *out.resolve().parents):
+                raise OutputError(f"{out}: belongs to the recording of {run}; name another file")
     if out.exists() and not overwrite:
         raise OutputError(f"{out}: exists; name another file, or replace it with --overwrite")
 

@@ -44,7 +44,7 @@ from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.request import LiveRequest, RunRequest, describe_run, log_choices, require_possible
 from lidarslam.run.results import RunOutcome, Tracked, TrackedScans, reason_of, unless_damaged, write_results
 from lidarslam.run.summary import ScanLog
-from lidarslam.storage.directory import RERUN, RunDirectory, Unfinished
+from lidarslam.storage.directory import RERUN, UTM, RunDirectory, Unfinished
 from lidarslam.viewer.rerun_program import WebPage
 from lidarslam.viewer.viewer import Viewer
 
@@ -249,7 +249,7 @@ def write_in_utm(run: Path) -> None:
     from lidarslam.exports.geo import export_geo
 
     try:
-        for line in export_geo(run, run / "utm", overwrite=True):
+        for line in export_geo(run, run / UTM, overwrite=True):
             logger.info(line)
     except InputError as error:
         logger.warning("not written in UTM: %s", error)

@@ -52,10 +52,13 @@ RERUN = "recording.rrd"
 REPORT = "report.html"
 MAP_PNG = "map.png"
 TRAJECTORY_PNG = "trajectory.png"
+# The folder of trajectory and map in UTM.
+UTM = "utm"
+_UTM_FILES = ("map.laz", "trajectory_utm.tum", "trajectory.geojson", "trajectory.kml", "georeference.json")
 
 FILES = (
     CONFIG, TRAJECTORY_TUM, TRAJECTORY_KITTI, ODOMETRY_TUM, MAP_PLY, *MAPS.values(), POSE_GRAPH, SCANS_CSV, SUMMARY,
-    METRICS, RERUN, REPORT, MAP_PNG, TRAJECTORY_PNG,
+    METRICS, RERUN, REPORT, MAP_PNG, TRAJECTORY_PNG, *(f"{UTM}/{name}" for name in _UTM_FILES),
 )  # fmt: skip
 
 # Columns of scans.csv: standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
@@ -158,7 +161,7 @@ def tile_names(path: Path) -> list[str]:
 
 
 def _remove(path: Path, names: Iterable[str]) -> None:
-    """Remove files of a run, or the links in place of their folders, and the folder of tiles that is empty then.
+    """Remove files of a run, or the links in place of their folders, and the folders that are empty then.
 
     A folder in place of a file is not of the run.
     """
@@ -167,11 +170,11 @@ def _remove(path: Path, names: Iterable[str]) -> None:
         file = top if top.is_symlink() else path / name
         if file.is_symlink() or not file.is_dir():
             file.unlink(missing_ok=True)
-    folder = path / MAP_TILES
-    if folder.is_dir() and not folder.is_symlink():
-        remove_partial_files(folder)
-        with contextlib.suppress(OSError):  # other files are there
-            folder.rmdir()
+    for folder in (path / MAP_TILES, path / UTM):
+        if folder.is_dir() and not folder.is_symlink():
+            remove_partial_files(folder)
+            with contextlib.suppress(OSError):  # other files are there
+                folder.rmdir()
 
 
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:

@@ -122,6 +122,7 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
     _write_table(path, header, columns)
 
 
+_MOST_ROUNDING_M = 1e-4
 _NORMALS = ("nx", "ny", "nz")
 _COLOURS = ("red", "green", "blue")
 _Columns = dict[str, NDArray[np.generic]]
@@ -129,7 +130,10 @@ _Columns = dict[str, NDArray[np.generic]]
 
 def _columns(cloud: PointCloud) -> _Columns:
     """The columns (N,) of a table of the points, by the names of PLY properties."""
-    columns: _Columns = dict(zip("xyz", cloud.points.astype(np.float32).T, strict=True))
+    points: NDArray[np.floating] = cloud.points.astype(np.float32)
+    if np.abs(points - cloud.points).max(initial=0.0) > _MOST_ROUNDING_M:  # survey coordinates, or kilometres
+        points = cloud.points
+    columns: _Columns = dict(zip("xyz", points.T, strict=True))
     columns |= zip(_NORMALS, cloud.normals.astype(np.float32).T, strict=True)
     for name, values in cloud.attributes.present():
         columns |= zip(_COLOURS, values.T, strict=True) if name == "rgb" else [(name, values)]

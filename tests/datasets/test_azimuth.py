@@ -70,6 +70,13 @@ def test_times_of_a_sweep(direction, start, with_rings):
     np.testing.assert_allclose(found, expected, atol=PERIOD_S / COLUMNS)
 
 
+def test_a_sector_without_returns_does_not_stretch_the_times():
+    points, times, rings = sweep(0.0)
+    seen = times - times.min() < PERIOD_S * 5.0 / 6.0
+    found = offsets_from_order(RawCloud(points[seen], rings=rings[seen]), PERIOD_S)
+    np.testing.assert_allclose(found, times[seen] - times.min(), atol=2 * PERIOD_S / COLUMNS)
+
+
 def test_angles_between_the_lasers_of_one_firing_are_removed_by_rings():
     points, times, rings = sweep(0.0, start=0.5)
     points = _turned(points, np.radians(np.where(rings % 2, 6.0, -6.0)))
@@ -141,9 +148,12 @@ def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
     assert "'time' holds one value alone (0); the times follow from the azimuth" in warning
 
 
-def test_clouds_of_a_bag(bag_kit):
+@pytest.mark.parametrize("pause_s", [0.0, 4.0, 3600.0])
+def test_clouds_of_a_bag(bag_kit, pause_s):
+    """Also where the recording pauses, or the clock is set."""
     messages = []
     for number, stamp_ns in enumerate(stamps_ns(60)):
+        stamp_ns += round(1e9 * pause_s) * (number > 30)
         points, times, rings = sweep(number * PERIOD_S)
         records = point_table(points, ring=rings.astype("u2"))[None]
         messages.append((stamp_ns, bag_kit.cloud(records, stamp_ns)))

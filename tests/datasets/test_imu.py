@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.imu_samples import usable_samples
+from lidarslam.datasets.imu_samples import read_imu_csv, usable_samples
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros import made_messages
@@ -142,6 +142,12 @@ def folder_of_scans(path: Path, count=3):
         np.save(path / f"scan_{number}.npy", np.random.default_rng(number).uniform(1, 9, (50, 3)))
     (path / "timestamps.txt").write_text("".join(f"{STAMP_NS / 1e9 + 0.1 * k:.9f}\n" for k in range(count)))
     return path
+
+
+def test_nanoseconds_with_an_exponent(tmp_path):
+    table = np.column_stack([1.4e18 + 5e6 * np.arange(4), np.ones((4, 6))])
+    np.savetxt(tmp_path / "imu.csv", table, delimiter=",")
+    np.testing.assert_allclose(read_imu_csv(tmp_path / "imu.csv").stamps, 1.4e9 + 0.005 * np.arange(4), atol=1e-6)
 
 
 @pytest.mark.parametrize("unit", ["s", "ns"])

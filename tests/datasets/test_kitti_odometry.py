@@ -61,6 +61,14 @@ def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng, uncorrec
     np.testing.assert_allclose(recording.ground_truth.stamps, [scan.stamp for scan in scans], atol=0.0)
 
 
+def test_poses_beside_a_linked_sequence_are_found(tmp_path, rng, uncorrected):
+    write_sequence(tmp_path / "kitti", rng)
+    (tmp_path / "kitti/sequences/04").rename(tmp_path / "elsewhere")
+    (tmp_path / "kitti/sequences/04").symlink_to(tmp_path / "elsewhere")
+    recording = open_recording(tmp_path / "kitti/sequences/04")
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
+
+
 def test_a_single_sequence_folder_reads_the_same(tmp_path, sequence, monkeypatch):
     monkeypatch.chdir(sequence)
     whole = open_recording(tmp_path)

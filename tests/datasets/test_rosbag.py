@@ -254,6 +254,10 @@ def test_index_that_promises_more_messages(make_bag_kit, velodyne_clouds, caplog
         assert not caplog.records
         assert len(list(recording.scans())) == 2
     assert "lists 3 scans, it holds 2" in caplog.text
+    list(recording.scans(1, 3, 1, faults := Faults()))
+    assert faults.left_out == 1  # of those asked for
+    list(recording.scans(0, 3, 5, faults := Faults()))
+    assert faults.left_out == 0
     execute(kit.storage_file(path), "DELETE FROM messages")
     with pytest.raises(InputError, match="lists 3 messages of /points, it holds none"):
         list(recording.scans())
@@ -277,6 +281,14 @@ def test_two_sensors_that_send_to_one_topic_in_turn_are_told_apart(ros2_kit, vel
     assert stamps(Faults(), frame_id="rear") == [ns / 10**9 for ns in stamps_ns(8)[1::2]]
     with pytest.raises(InputError, match=r"reader\.frame_id is 'left', but /points begins with 'front', 'rear'"):
         stamps(Faults(), frame_id="left")
+
+
+def test_a_sensor_that_begins_later_can_be_named(ros2_kit, velodyne_clouds):
+    messages = velodyne_clouds(ros2_kit, 24)
+    for i, (_, cloud) in enumerate(messages):
+        cloud.header.frame_id = "rear" if i > 20 else "front"
+    recording = open_recording(ros2_kit.write({"/points": messages}), ReaderConfig(frame_id="rear"))
+    assert len(list(recording.scans(faults=Faults()))) == 3
 
 
 @pytest.mark.parametrize(("changes", "reason"), [

@@ -243,6 +243,12 @@ def test_a_stamp_file_comes_first(tmp_path, rng, name, above):
     assert [scan.stamp for scan in recording.scans()] == [0.5, 0.75, 1.5]
 
 
+def test_stamps_of_another_number_beside_the_folder_are_those_of_a_camera(tmp_path, rng):
+    _write_numbered(tmp_path / "lidar", rng, ["5.5.bin", "6.5.bin", "7.5.bin"])
+    (tmp_path / "times.txt").write_text("0.0\n0.25\n0.5\n0.75\n")
+    assert [scan.stamp for scan in open_recording(tmp_path / "lidar").scans()] == [5.5, 6.5, 7.5]
+
+
 @pytest.mark.parametrize(
     ("names", "lines", "stamps", "warning"),
     [

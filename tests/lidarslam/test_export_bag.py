@@ -173,3 +173,13 @@ def test_what_is_in_the_way(run, tmp_path):
     assert "leave them out with --no-clouds" in refused("export-bag", run, "--out", tmp_path / "slam.bag")
     assert not list(tmp_path.glob(".partial*"))
     succeeds("export-bag", run, "--out", tmp_path / "slam.bag", "--no-clouds")
+
+
+def test_the_recording_is_not_replaced(run, tmp_path):
+    """Nor a file of it."""
+    about = {"source": str(tmp_path / "site.mcap"), "start": 0, "stop": None, "step": 1}
+    (tmp_path / "site.mcap").write_text("recorded")
+    of_bag = write_run(tmp_path / "of_bag", read_run_scans(run).trajectory, **about)
+    for of, out in ((of_bag, tmp_path / "site.mcap"), (run, tmp_path / "recording/000000.npy")):
+        out.rename(named := out.with_suffix(".mcap"))
+        assert "belongs to the recording" in refused("export-bag", of, "--out", named, "--overwrite")

@@ -100,14 +100,18 @@ class ScanFolderRecording(CloudRecording, FileRecording):
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         files, notes, warnings = _find_scans(folder)
-        places = (folder, folder.resolve().parent)
+        places = (folder, folder.absolute().parent, folder.resolve().parent)
         stamp_file = first_file(places, *_STAMP_FILES)
         stamps, self._has_stamps = np.arange(len(files)) / config.rate_hz, True
         named = stamps_from_names([path.stem for path in files])
+        is_named = named is not None and len(set(named)) == len(named)
+        if stamp_file is not None and is_named and stamp_file.parent != folder:
+            is_of_camera = len(read_stamps(stamp_file)) != len(files)
+            stamp_file = None if is_of_camera else stamp_file
         if stamp_file is not None:
             stamps, faults = _read_stamp_file(stamp_file, files)
             warnings += faults
-        elif named is not None and len(set(named)) == len(named):
+        elif named is not None and is_named:
             notes.append("The stamps are the file names.")
             order = np.argsort(named)  # not that of the names: 5.36 comes before 5.4
             files, stamps = [files[i] for i in order], named[order]
@@ -115,7 +119,7 @@ class ScanFolderRecording(CloudRecording, FileRecording):
             self._has_stamps = False
             if named is not None:
                 warnings.append("The file names look like stamps, but some are equal.")
-        above = places[1]
+        above = places[2]
         whole = above.parent if above.name == "velodyne_points" else above
         if folder.resolve().name == "velodyne" or whole != above:
             warnings.append(

@@ -73,9 +73,10 @@ class KittiOdometryRecording(BinRecording):
                 f" {len(self._times)}; complete it, or remove it to use the rate"
             )
         self.stamps = self._stamps_of(self._numbers)
-        whole = folder.resolve()
-        poses = first_file((whole.parent.parent / "poses",), f"{whole.name}.txt")
-        self._pose_file = poses or first_file((whole,), "poses.txt")
+        # Of a link, beside it or beside its target.
+        wholes = (folder.absolute(), folder.resolve())
+        poses = (first_file((whole.parent.parent / "poses",), f"{whole.name}.txt") for whole in wholes)
+        self._pose_file = next(filter(None, poses), None) or first_file(wholes, "poses.txt")
         self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
 
     def _read_times(self) -> FloatArray:

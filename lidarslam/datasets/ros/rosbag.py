@@ -8,6 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
@@ -51,7 +53,7 @@ _TOPICS_LISTED = 20
 _NEGLIGIBLE = 0.05
 # Number of pairs of messages that are compared at their seams, spread over this many of the first.
 _PAIRS, _LOOKED_AT = 40, 600
-_FRAMES_LOOKED_AT = 10
+_FRAMES_LOOKED_AT, _STAMPS_LOOKED_AT = 10, 50
 
 _DAMAGED = "damaged places in the bag were met, where reading its file stopped"
 _MISSING = "scans are missing that the index lists"
@@ -126,7 +128,7 @@ class BagRecording(CloudRecording):
             f"scans were left out: they come from another sensor than {self._frame_id!r}; for that one set"
             " reader.frame_id"
         )
-        for index, message in enumerate(islice(self._messages(faults), max(0, wanted.stop))):
+        for index, message in enumerate(islice(self._messages(wanted, faults), max(0, wanted.stop))):
             if index not in wanted:
                 continue
             if message.damage is not None:
@@ -138,7 +140,7 @@ class BagRecording(CloudRecording):
             else:
                 yield message
 
-    def _messages(self, faults: Faults) -> Iterator[BagMessage]:
+    def _messages(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
         count, damages = 0, list[str]()
 
         def note(damage: str) -> None:
@@ -152,10 +154,14 @@ class BagRecording(CloudRecording):
             remedy = " reindex it, or give one of its .db3 or .mcap files instead of the folder"
             raise InputError(damages[0] if damages else lists + remedy)
         if count < len(self):
-            faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", len(self) - count)
+            missing = sum(index >= count for index in wanted)
+            faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", missing)
 
     def _sound_items(self) -> Iterator[BagMessage]:
         return (message for message in self._bag.messages(self._topic) if message.damage is None)
+
+    def _of_sensor(self) -> Iterator[BagMessage]:
+        return (message for message in self._sound_items() if message.frame_id == self._frame_id)
 
     @cached_property
     def _frame_id(self) -> str:
@@ -164,7 +170,7 @@ class BagRecording(CloudRecording):
         wanted = self._config.frame_id
         if wanted is None:
             return max(frames, key=lambda frame: frames[frame], default="")
-        if wanted not in frames:
+        if wanted not in frames and not any(m.frame_id == wanted for m in self._sound_items()):
             found = ", ".join(repr(frame) for frame in frames)
             raise InputError(
                 f"{self._source}: reader.frame_id is {wanted!r}, but {self._topic.name} begins with {found}"
@@ -191,10 +197,10 @@ class BagRecording(CloudRecording):
 
     @cached_property
     def _period_s(self) -> float | None:
-        first = next(self._sound_items(), None)
-        if first is None or self._last_recorded_stamp is None or len(self) < 2:
-            return None
-        return (self._last_recorded_stamp - self._stamp(first)) / (len(self) - 1)
+        """The median interval of the first stamps that increase."""
+        stamps = np.array([self._stamp(message) for message in islice(self._of_sensor(), _STAMPS_LOOKED_AT)])
+        steps = np.diff(stamps[stamps > self._stamps.before_first])
+        return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else None
 
     @property
     def _defined_time(self) -> tuple[TimeUnit, TimeReference, TimeUnit | None]:
@@ -207,7 +213,7 @@ class BagRecording(CloudRecording):
     def _runs(self) -> Iterator[list[BagMessage]]:
         apart = max(2, min(self._topic.messages, _LOOKED_AT) // _PAIRS)
         pair: list[BagMessage] = []
-        for number, message in enumerate(islice(self._sound_items(), _LOOKED_AT)):
+        for number, message in enumerate(islice(self._of_sensor(), _LOOKED_AT)):
             if number % apart < 2:
                 pair.append(message)
             if number % apart == 1:

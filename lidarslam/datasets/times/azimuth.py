@@ -122,7 +122,8 @@ def offsets_from_order(cloud: RawCloud, sweep_s: float) -> FloatArray | None:
     if order is None:
         return None
     offsets = np.full(len(cloud.points), np.nan)
-    offsets[cloud.returns] = order.turned_deg * (sweep_s / order.turned_deg.max())
+    # Sweeps of less than a turn lack returns.
+    offsets[cloud.returns] = order.turned_deg * (sweep_s / max(360.0, order.turned_deg.max()))
     return offsets
 
 
