@@ -152,8 +152,8 @@ def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
 def test_clouds_of_a_bag(bag_kit, pause_s):
     """Also where the recording pauses, or the clock is set."""
     messages = []
-    for number, stamp_ns in enumerate(stamps_ns(60)):
-        stamp_ns += round(1e9 * pause_s) * (number > 30)
+    for number, regular_ns in enumerate(stamps_ns(60)):
+        stamp_ns = regular_ns + round(1e9 * pause_s) * (number > 30)
         points, times, rings = sweep(number * PERIOD_S)
         records = point_table(points, ring=rings.astype("u2"))[None]
         messages.append((stamp_ns, bag_kit.cloud(records, stamp_ns)))

@@ -108,7 +108,7 @@ def test_clouds_are_joined_where_they_lie(tmp_path):
 
 
 def test_survey_coordinates_stay_exact_and_no_normals_are_invented(tmp_path, rng):
-    utm = rng.uniform(0.0, 10.0, (500, 3)) + [691_000.0, 5_334_000.0, 520.0]
+    utm = np.array([691_000.0, 5_334_000.0, 520.0]) + rng.uniform(0.0, 10.0, (500, 3))
     write_cloud(tmp_path / "utm.ply", PointCloud(utm, np.tile([0.0, 0.0, 1.0], (500, 1))))
     for name in ("cut.ply", "cut.pcd"):
         cloud, _ = edited(tmp_path / name, tmp_path / "utm.ply", "--box", 0, 1e7, 0, 1e7, 0, 1e4)
