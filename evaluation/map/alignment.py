@@ -279,7 +279,8 @@ def _register(source: FloatArray, target: FloatArray, cell_m: float) -> FloatArr
     ]
     estimation = registration.TransformationEstimationPointToPoint(False)
     end = registration.RANSACConvergenceCriteria(_ITERATIONS, _CONFIDENCE)
-    found = registration.registration_ransac_based_on_feature_matching(
-        moving, still, features, target_features, True, inlier_m, estimation, 3, checkers, end
-    )
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        found = registration.registration_ransac_based_on_feature_matching(
+            moving, still, features, target_features, True, inlier_m, estimation, 3, checkers, end
+        )
     return np.array(found.transformation, dtype=np.float64)

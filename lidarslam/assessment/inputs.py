@@ -235,7 +235,7 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
     if len(ours) != len(true):
         raise InputError(
             f"{estimate.poses.label} has {len(ours):,} poses, {reference.label} has {len(true):,}, and KITTI's text"
-            " format has no stamps to match them by; give both as TUM files, or the same poses in both"
+            " format has no stamps to match them by; name the recording as --reference, or give both as TUM files"
         )
     stamps = ours.stamps if estimate.poses.has_stamps else true.stamps
     return Trajectory(stamps, ours.T_world_lidar), Trajectory(stamps, true.T_world_lidar)

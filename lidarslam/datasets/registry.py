@@ -238,10 +238,12 @@ def result_of_program(source: Path) -> str | None:
     head = ""
     with suppress(OSError, UnicodeDecodeError), (folder / "config.yaml").open(encoding="utf-8") as file:
         head = file.read(4096)
-    if not head.startswith("run:") or not (folder / "trajectory.tum").is_file():
+    is_merge = "\n  sources:" in head.partition("\n\n")[0]
+    if not head.startswith("run:") or not (is_merge or (folder / "trajectory.tum").is_file()):
         return None
     recording = f"; its recording is {match[1].strip(chr(39))}" if (match := _SOURCE.search(head)) else ""
-    kind = "is a run directory" if source.is_dir() else f"is a file of the run {folder}"
+    what = "merge" if is_merge else "run"
+    kind = f"is a {what} directory" if source.is_dir() else f"is a file of the {what} {folder}"
     return f"{source}: {kind}, not a recording{recording}. lidarslam view {folder} shows it"
 
 

@@ -2,9 +2,11 @@
 
 import contextlib
 import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
@@ -15,6 +17,8 @@ from lidarslam.core.tracking import Status
 if TYPE_CHECKING:  # slow to load, and not needed by a bar
     from lidarslam.pipeline.estimates import ScanEstimate
 
+# Seconds between lines where there is no terminal for a bar.
+_LINE_EVERY_S = 30.0
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
 
 
@@ -45,6 +49,8 @@ class RunProgress:
         self._bar = bar
         self._task = bar.add_task(one_line(name), total=None, state="")
         self._lost = 0
+        self._name, self._began = one_line(name), time.monotonic()
+        self._last_line, self._before = self._began, 0  # scans done before the first one here
 
     def __call__(self, number: int, total: int, result: "ScanEstimate") -> None:
         """Show that a scan is done, its number from 1, and the total."""
@@ -52,6 +58,13 @@ class RunProgress:
         lost = f" [red]{self._lost} lost[/]" if self._lost else ""
         state = f"[{_COLOURS[result.status]}]{result.status.value}[/]{lost}"
         self._bar.update(self._task, completed=number, total=total, state=state)
+        self._before = self._before or number
+        now = time.monotonic()
+        if self._bar.disable and now - self._last_line > _LINE_EVERY_S:
+            self._last_line = now
+            left_s = (now - self._began) / max(1, number - self._before) * (total - number)
+            lost = f", {self._lost:,} lost" if self._lost else ""
+            click.echo(f"{self._name}: {number:,} of {total:,} scans{lost}, {left_s / 60.0:.0f} min left", err=True)
 
     def phase(self, words: str) -> None:
         """Show the current step."""

@@ -394,6 +394,8 @@ _WALKING_MPS = 1.5
 _SHORTEST_MOTION_M = 0.02
 # Of a vehicle, m/s^2.
 _MOST_ACCELERATION = 4.0
+# A motion that is faster than those before and after it by this many m/s is a jump from or to a wrong place.
+_JUMP_MPS = 5.0
 
 
 def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
@@ -421,7 +423,10 @@ def _unconstrained_m(log: ScanLog) -> float:
     # The standard deviation along a motion, times its length; NaN, and no noise, without a covariance.
     scaled_m2 = np.linalg.norm(moved * log.table["sigmas"][1:, 3:], axis=1)
     is_noise = (whole_m > _SHORTEST_MOTION_M) & (whole_m**2 < scaled_m2)
-    lengths_m = np.where(is_noise, whole_m, np.linalg.norm(moved * open_axes, axis=1))
+    speeds = whole_m / np.diff(log.stamps)
+    around = np.pad(speeds, 1, mode="edge")
+    is_jump = speeds > np.maximum(around[:-2], around[2:]) + _JUMP_MPS
+    lengths_m = np.where(is_noise | is_jump, whole_m, np.linalg.norm(moved * open_axes, axis=1))
     is_unknown = degenerate.all(axis=1)
     lengths_m[is_unknown] = np.maximum(lengths_m, _WALKING_MPS * np.diff(log.stamps))[is_unknown]
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))

@@ -38,6 +38,8 @@ _FEW_POINTS, _LIKELY = 800, 0.5
 _LEAST_SCANS = 5
 # A search takes a second: scans until the first, growth of the intervals, and the longest.
 _FIRST_WAIT, _WAIT_GROWTH, _LONGEST_WAIT = 5, 1.5, 60
+# How many times as well a scan has to fit elsewhere as where it follows from a relocalisation.
+_CLEARLY = 1.3
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
 
@@ -324,6 +326,9 @@ class Tracker(Stateful):
         if counts and in_vain:
             return near
         found = self._found(matcher, near.prediction)
+        follows = self.tracking.is_unconfirmed and near.status is Status.OK
+        if found is not None and follows and found.quality < _CLEARLY * near.quality:
+            return near
         return best_of(filter(None, (near if counts and not self.is_searching else None, found)))
 
     def _found(self, matcher: ScanMatcher, prediction: Prediction, nearby: bool = False) -> Attempt | None:

@@ -133,6 +133,7 @@ def test_a_scale_in_doubt_is_not_corrected(scale):
 @pytest.mark.parametrize(("values", "said"), [
     (np.zeros(100), "one value alone (0)"), (np.full(100, STAMP), "one value alone (1.7e+09)"),
     (np.full(100, np.nan), "no number"), ((STAMP + SWEEP * 2000).astype("f4"), "too coarse"),
+    (np.linspace(0.0, 1.009, 200), "fractions of a sweep, from 0 to 1; --set reader.time_unit=s"),
 ])  # fmt: skip
 def test_what_is_no_time_is_said(values, said):
     cloud = RawCloud(np.ones((len(values), 3)), "stamps", values)

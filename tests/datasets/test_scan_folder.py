@@ -217,6 +217,29 @@ def test_names_that_are_no_stamps(stems):
     assert stamps_from_names(stems) is None
 
 
+@pytest.mark.parametrize(("names", "numbers", "missing"), [
+    (["000000", "000001", "000004", "000005"], [0, 1, 4, 5], 2), (["scan_8", "scan_10", "scan_14"], [0, 1, 3], 1),
+    (["a10", "a20", "a30"], [0, 1, 2], 0), (["1", "7001", "29002"], [0, 1, 2], 0), (["a", "b1", "c2"], [0, 1], 0),
+])  # fmt: skip
+def test_missing_numbers_are_gaps_in_the_assumed_stamps(tmp_path, rng, names, numbers, missing):
+    _write_numbered(tmp_path, rng, [f"{name}.bin" for name in names])
+    recording = open_recording(tmp_path)
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], np.array(numbers) / 10.0)
+    said = [warning for warning in recording.warnings if "missing among the names of the scans" in warning]
+    assert [warning.split()[0] for warning in said] == ([str(missing)] if missing else [])
+
+
+@pytest.mark.parametrize("others", [1, 3])
+def test_scans_of_another_format_are_a_warning(tmp_path, rng, others):
+    _write_numbered(tmp_path, rng, [f"{number:06d}.bin" for number in range(10)])
+    for number in range(others):
+        np.save(tmp_path / f"{10 + number:06d}.npy", np.ones((5, 3)))
+    recording = open_recording(tmp_path)
+    said = f"{others} other file{'s' if others > 1 else ''} not taken for scans, such as 000010.npy."
+    assert (said in recording.warnings) == (others == 3)
+    assert said in recording.describe().notes
+
+
 @pytest.mark.parametrize(
     ("config", "rate_hz", "told"),
     [(ReaderConfig(), 10.0, "--set reader.rate_hz=5"), (ReaderConfig(rate_hz=20.0), 20.0, "as set")],

@@ -139,6 +139,25 @@ def test_a_first_motion_counts_as_unknown_where_no_vehicle_accelerates_to_the_se
     assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
 
 
+@pytest.mark.parametrize(("jump_m", "unknown"), [(0.4, False), (2.4, True)])
+def test_jumps_of_the_pose_count_as_unknown(jump_m, unknown):
+    """To a place that looks the same, and back; walking speeds else."""
+    log = ScanLog()
+    for scan in range(60):
+        x_m = 0.1 * scan + jump_m * (20 <= scan < 40)
+        log.add(result(0.1 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])))
+    assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
+
+
+def test_without_a_terminal_lines_say_how_far_a_run_is(monkeypatch, capsys):
+    monkeypatch.setattr("lidarslam.run.progress._LINE_EVERY_S", 0.0)
+    with show_progress("site") as progress:
+        progress(1, 4, result(0.0))
+        progress(2, 4, result(0.1, status=Status.LOST))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["site: 1 of 4 scans, 0 min left", "site: 2 of 4 scans, 1 lost, 0 min left"]
+
+
 def test_the_programs_that_results_depend_on_are_named():
     found = versions()
     assert {"lidarslam", "kiss-icp", "numpy", "onnxruntime", "python"} <= set(found)

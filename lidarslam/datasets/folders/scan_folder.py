@@ -1,11 +1,13 @@
 """A folder of scan files: .bin, .pcd, .ply or .npy, one sweep each; their stamps, and the files next to them."""
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
@@ -24,6 +26,10 @@ from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stam
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 # Pairs of consecutive scans that are compared at their seams, spread over the recording.
 _PAIRS = 40
+# Other numbered files, as a share of the scans, that are more than a few maps.
+_FEW_OTHERS = 0.1
+# The number at the end of a name, digits of it that count, and how many numbers per scan are a count of scans.
+_NUMBER, _MOST_DIGITS, _MOST_MISSING = re.compile(r"\d+$"), 9, 3
 # Scans that are farther apart may be stamped in another unit.
 _LOWEST_RATE_HZ = 0.1
 
@@ -39,13 +45,29 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
     files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
     skipped = sorted(path.name for path in set(candidates) - set(files))
+    are_scans = len(skipped) > _FEW_OTHERS * len(files) and any(c.isdecimal() for c in skipped[0])
     gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
-    no_files = "is no file" if len(gone) == 1 else "are no files"
-    return (
-        files,
-        [f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."] if skipped else [],
-        [f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}."] if gone else [],
-    )
+    notes, warnings = list[str](), list[str]()
+    if skipped:
+        others = f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."
+        (warnings if are_scans else notes).append(others)
+    if gone:
+        no_files = "is no file" if len(gone) == 1 else "are no files"
+        warnings.append(f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}.")
+    return files, notes, warnings
+
+
+def _numbers(files: Sequence[Path]) -> NDArray[np.intp]:
+    """The numbers (N,) of scans in their order, from 0: those in their names, in steps of their greatest divisor."""
+    found = [_NUMBER.search(path.stem) for path in files]
+    numbers = np.array([int(match[0][-_MOST_DIGITS:]) for match in found if match is not None], dtype=np.int64)
+    steps = np.diff(numbers)
+    if len(numbers) < len(files) or not (steps > 0).all() or not len(steps):
+        return np.arange(len(files))
+    steps //= np.gcd.reduce(steps)
+    # Where most are missing, the numbers are of another kind.
+    is_count = steps.sum() < _MOST_MISSING * len(files)
+    return np.concatenate([[0], np.cumsum(steps)]) if is_count else np.arange(len(files))
 
 
 def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, list[str]]:
@@ -102,7 +124,8 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         files, notes, warnings = _find_scans(folder)
         places = (folder, folder.absolute().parent, folder.resolve().parent)
         stamp_file = first_file(places, *_STAMP_FILES)
-        stamps, self._has_stamps = np.arange(len(files)) / config.rate_hz, True
+        numbers = _numbers(files)
+        stamps, self._has_stamps = numbers / config.rate_hz, True
         named = stamps_from_names([path.stem for path in files])
         is_named = named is not None and len(set(named)) == len(named)
         if stamp_file is not None and is_named and stamp_file.parent != folder:
@@ -117,6 +140,8 @@ class ScanFolderRecording(CloudRecording, FileRecording):
             files, stamps = [files[i] for i in order], named[order]
         else:
             self._has_stamps = False
+            if (missing := int(numbers[-1]) + 1 - len(files)) > 0:
+                warnings.append(f"{count(missing, 'number')} missing among the names of the scans; these leave gaps.")
             if named is not None:
                 warnings.append("The file names look like stamps, but some are equal.")
         above = places[2]

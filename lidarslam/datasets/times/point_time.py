@@ -33,6 +33,9 @@ _SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
 _PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
 # A span so near to the time between scans, in another unit than expected, determines the unit.
 _WHOLE_SWEEP = (0.8, 1.1)
+# Values from about zero to one are fractions of a sweep, where that is shorter than this.
+_WHOLE = (-0.02, 1.1)
+_LONGEST_FRACTION_S = 0.5
 _IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
 # Times coarser than this part of the sweep do not separate its points.
 _COARSEST_OF_SWEEP = 0.1
@@ -178,18 +181,14 @@ def infer_point_time(
     """
     if reference in ("none", "azimuth") or not len(values):
         return LearnedTime()
-    spread = value_spread(values)
-    if spread is None:
-        known = values[np.isfinite(values)]
-        holds = f"one value alone ({float(np.median(known)):.9g})" if len(known) else "no number"
-        return LearnedTime(None, f"The time field {field!r} holds {holds}")
-    if spread.resolution > _COARSEST_OF_SWEEP * spread.span:
-        return LearnedTime(None, f"The time field {field!r} is too coarse, with steps of {spread.resolution:g}")
+    spread, sweep_s = value_spread(values), period_s if period_s is not None and _is_plausible(period_s) else _SWEEP_S
+    fault = _fault(values, spread, sweep_s, unit)
+    if spread is None or fault is not None:
+        return LearnedTime(None, f"The time field {field!r} {fault}")
     given = defined_unit if unit == "auto" else unit
     units = tuple(UNITS_PER_SECOND) if given is None else (given,)
     by_clock = None if reference == "relative" else _unit_by_clock(spread, stamp, units)
     found = by_clock or given or _unit_by_span(spread, period_s)
-    sweep_s = period_s if period_s is not None and _is_plausible(period_s) else _SWEEP_S
     mistaken = _unit_by_whole_sweep(spread, found, sweep_s) if unit == "auto" else None
     if mistaken is not None:
         return LearnedTime(
@@ -245,6 +244,20 @@ def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
         return None
     resolution = 1.0 if whole else float(np.spacing(values.dtype.type(np.abs(numbers).max())))
     return ValueSpread(float(base + first), float(base + middle), float(base + last), float(last - first), resolution)
+
+
+def _fault(values: NDArray[np.generic], spread: ValueSpread | None, sweep_s: float, unit: TimeUnit) -> str | None:
+    """Why values (N,) are no times, the end of a sentence; None where they may be."""
+    if spread is None:
+        known = values[np.isfinite(values)]
+        return f"holds one value alone ({float(np.median(known)):.9g})" if len(known) else "holds no number"
+    if spread.resolution > _COARSEST_OF_SWEEP * spread.span:
+        return f"is too coarse, with steps of {spread.resolution:g}"
+    is_whole = _WHOLE[0] <= spread.first and spread.last <= _WHOLE[1] and spread.span >= _WHOLE_SWEEP[0]
+    if is_whole and values.dtype.kind == "f" and unit == "auto" and sweep_s < _LONGEST_FRACTION_S:
+        setting = f"reader.time_unit=s --set reader.time_reference=relative --set reader.time_scale={sweep_s:.3g}"
+        return f"has fractions of a sweep, from 0 to 1; --set {setting} takes them"
+    return None
 
 
 def _is_plausible(period_s: float) -> bool:
