@@ -11,13 +11,12 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.files import cannot_write, make_directory
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes
 from lidarslam.datasets.ros import made_messages as made
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
+from lidarslam.datasets.ros.bag_message import serialize, typestore
 from lidarslam.datasets.ros.made_messages import write_chunk_checksums
 from lidarslam.exports.source import RunScans
 from lidarslam.storage.finished_run import load_map
@@ -124,22 +123,18 @@ class RosTopics:
     def __init__(self, bag: Rosbag1Writer | Rosbag2Writer) -> None:
         self._bag: Any = bag
         self._ros2 = isinstance(bag, Rosbag2Writer)
-        self.store = get_typestore(Stores.ROS2_JAZZY if self._ros2 else Stores.ROS1_NOETIC)
-        if not self._ros2:  # ROS 2's store has it
-            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+        self.store = typestore(self._ros2)
         self._sequence = 0
         self._connections: dict[str, Any] = {}
         self.counts: dict[str, int] = {}
 
     def write(self, topic: str, stamp: float, message: Any) -> None:
         """Write a message, recorded at its stamp."""
-        message_type = message.__msgtype__
         if topic not in self._connections:
             latched = topic in _LATCHED
             how = {"offered_qos_profiles": [_qos(latched)]} if self._ros2 else {"latching": int(latched)}
-            self._connections[topic] = self._bag.add_connection(topic, message_type, typestore=self.store, **how)
-        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
-        self._bag.write(self._connections[topic], round(stamp * 10**9), bytes(serialize(message, message_type)))
+            self._connections[topic] = self._bag.add_connection(topic, message.__msgtype__, typestore=self.store, **how)
+        self._bag.write(self._connections[topic], round(stamp * 10**9), serialize(message, self._ros2))
         self.counts[topic] = self.counts.get(topic, 0) + 1
 
     def transforms(self, stamp: float, *poses: tuple[str, str, FloatArray]) -> Any:

@@ -21,7 +21,8 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
 from lidarslam.core.errors import InputError
-from lidarslam.live.messages import Publish, message_types
+from lidarslam.datasets.ros.bag_message import typestore
+from lidarslam.live.messages import Publish
 from lidarslam.live.receiving import PublishedTopic, Received
 
 # A cloud of 3 MB arrives as a burst of datagrams that the default buffer, 1 MB, does not hold; the kernel grants up to
@@ -130,7 +131,7 @@ def _ros_type(type_name: str) -> str | None:
 def _struct(message_type: str) -> Any:
     """The library's type for a ROS message; its objects have the serialised message as `raw`, and nothing else."""
     package, _, name = message_type.split("/")
-    _, fields = message_types().fielddefs[message_type]
+    _, fields = typestore(ros2=True).fielddefs[message_type]
     members = {field: _member(kind, of) for field, (kind, of) in fields}
     struct: Any = make_idl_struct(f"{name}_", f"{package}::msg::dds_::{name}_", members)
 

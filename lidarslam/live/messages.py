@@ -2,10 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
@@ -17,7 +13,7 @@ from lidarslam.datasets.mounting import corrected, transform_of
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, BagMessage, decode, read_header
+from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header, serialize, typestore
 from lidarslam.datasets.times.azimuth import PointTiming
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
 from lidarslam.pipeline.estimates import ScanEstimate
@@ -149,22 +145,11 @@ class CloudDecoder:
 Publish = Callable[[bytes], None]
 
 
-@cache
-def message_types() -> Typestore:
-    """The definitions of all message types in use."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for message_type in bag_message.CUSTOM_MESSAGE_TYPES:
-        point_type = message_type.replace("CustomMsg", "CustomPoint")
-        store.register(get_types_from_msg(bag_message.CUSTOM_POINT_DEFINITION, point_type))
-        store.register(get_types_from_msg(bag_message.CUSTOM_MESSAGE_DEFINITION, message_type))
-    return store
-
-
 def serialize_transform(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_child: FloatArray) -> bytes:
     """A tf2_msgs/TFMessage with one transform, the pose (4, 4) of the child."""
-    store = message_types()
+    store = typestore(ros2=True)
     message = made.transforms(store, (made.header(store, stamp_ns, frame_id), child_frame_id, T_frame_child))
-    return bytes(store.serialize_cdr(message, TRANSFORMS_TYPE))
+    return serialize(message, ros2=True)
 
 
 class PosePublisher:
@@ -192,11 +177,11 @@ class PosePublisher:
             return
         # With A the adjoint of T_body_lidar, an error or velocity xi of the LiDAR is A xi of the body.
         T = self._T_body_lidar @ estimate.T_world_lidar @ inverse(self._T_body_lidar)
-        A, store = adjoint(self._T_body_lidar), message_types()
+        A, store = adjoint(self._T_body_lidar), typestore(ros2=True)
         covariance = None if estimate.covariance is None else A @ estimate.covariance @ A.T
         velocity = None if estimate.velocity is None else A @ estimate.velocity
         header = made.header(store, stamp_ns, self._fixed_frame)
         message = made.odometry(store, header, self._body_frame, T, covariance, velocity)
-        self._odometry(bytes(store.serialize_cdr(message, made.ODOMETRY_TYPE)))
+        self._odometry(serialize(message, ros2=True))
         if self._transforms is not None:
             self._transforms(serialize_transform(stamp_ns, self._fixed_frame, self._body_frame, T))

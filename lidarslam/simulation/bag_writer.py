@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
 from lidarslam.datasets.ros import bag_message
@@ -86,7 +85,6 @@ DRIVERS: dict[str, DriverCloud] = {
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
 _STATIC_TRANSFORMS = "/tf_static"
-_CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
 
 _LIDAR_ID = 192  # the last byte of the sensor's address
 _CDR_ALIGNMENT = 4
@@ -142,7 +140,7 @@ def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", ri
         placed = bag.add_connection(_STATIC_TRANSFORMS, bag_message.TRANSFORMS_TYPE, typestore=store)
         parent = made.header(store, CLOCK_START_NS, driver.frame_id)
         message = made.transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
-        yield placed, CLOCK_START_NS, serializer.serialized(message, bag_message.TRANSFORMS_TYPE)
+        yield placed, CLOCK_START_NS, serializer.serialized(message)
     connection = bag.add_connection(driver.imu_topic, _IMU_TYPE, typestore=store)
     orientation, unknown = store.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.zeros(9)
     no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition requires
@@ -157,7 +155,7 @@ def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", ri
             linear_acceleration=made.vector(store, imu.accelerations[number]),
             linear_acceleration_covariance=unknown,
         )
-        yield connection, stamp_ns, serializer.serialized(sample, _IMU_TYPE)
+        yield connection, stamp_ns, serializer.serialized(sample)
 
 
 class MessageSerializer:
@@ -165,28 +163,23 @@ class MessageSerializer:
 
     def __init__(self, ros2: bool) -> None:
         self._ros2 = ros2
-        self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-        self.store.register(get_types_from_msg(bag_message.CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
-        self.store.register(get_types_from_msg(bag_message.CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
-        if not ros2:  # ROS 2's store has it
-            self.store.register(get_types_from_msg(bag_message.TRANSFORMS_DEFINITION, bag_message.TRANSFORMS_TYPE))
+        self.store = bag_message.typestore(ros2)
 
     def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
         """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
         message_header = made.header(self.store, stamp_ns, driver.frame_id, sequence)
         if driver.message_type != _CUSTOM_MESSAGE:
-            return self.serialized(made.point_cloud(self.store, message_header, records), driver.message_type)
+            return self.serialized(made.point_cloud(self.store, message_header, records))
         rsvd = np.zeros(3, np.uint8)
         message = self.store.types[_CUSTOM_MESSAGE](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
         # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
         # empty list, which ends the message with its length.
-        without_points = self.serialized(message, _CUSTOM_MESSAGE)[:-4]
+        without_points = self.serialized(message)[:-4]
         return without_points + len(records).to_bytes(4, "little") + self._packed(records)
 
-    def serialized(self, message: Any, message_type: str) -> bytes:
+    def serialized(self, message: Any) -> bytes:
         """The bytes of a message."""
-        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
-        return bytes(serialize(message, message_type))
+        return bag_message.serialize(message, self._ros2)
 
     def _packed(self, records: Records) -> bytes:
         """Points one after the other; in CDR each begins at a multiple of four bytes."""

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.scan import Scan, ScanSequence
-from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion import mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
@@ -41,33 +39,6 @@ _MOUNT_WEIGHTS = {"upright": 0.7, "upside-down": 0.15, "tilted": 0.15}
 _FIRST_SEED = 1_000_000
 
 
-@dataclass(frozen=True, eq=False)
-class Excerpt:
-    """Some consecutive scans of a recording, as a recording of their own."""
-
-    whole: ScanSequence
-    first: int
-    count: int
-
-    @property
-    def name(self) -> str:
-        """The recording's, and the place of the excerpt in it."""
-        return f"{self.whole.name}@{self.first}"
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The recording's."""
-        return self.whole.ground_truth
-
-    def __len__(self) -> int:
-        return self.count
-
-    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)` of the excerpt."""
-        chosen = range(self.first, self.first + self.count)[start:stop:step]
-        return self.whole.scans(chosen.start, chosen.stop, chosen.step)
-
-
 @dataclass(frozen=True)
 class Ingredients:
     """The names of a recording's parts; `speed_mps` where it is not the carrier's own."""
@@ -79,7 +50,7 @@ class Ingredients:
     speed_mps: float | None = None
 
 
-def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Excerpt]:
+def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Simulation]:
     """Recordings of `scans` scans each; number i of a seed is the same for any `first`."""
     for number in range(first, first + recordings):
         rng = np.random.default_rng([seed, number])
@@ -90,7 +61,7 @@ def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[
         motion = motion_along_route(chosen.carrier, world, world_seed, chosen.speed_mps)
         start = int(rng.integers(max(1, int(motion.duration_s * sensor.rate_hz) - scans)))
         T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
-        yield Excerpt(Simulation(world, sensor, motion, T_body_lidar, start + scans, world_seed), start, scans)
+        yield Simulation(world, sensor, motion, T_body_lidar, scans, world_seed, first=start)
 
 
 def ingredients_of(number: int, seed: int) -> Ingredients:

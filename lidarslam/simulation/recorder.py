@@ -77,7 +77,7 @@ class Echoes:
 class Simulation:
     """A recording that is made while it is read; a `ScanSequence` that takes no memory but the world's.
 
-    Scan i starts at i / rate seconds of simulated time and depends on nothing but the attributes and i.
+    Sweep i starts at i / rate seconds of simulated time and depends on nothing but the attributes and i.
     """
 
     world: World
@@ -87,6 +87,7 @@ class Simulation:
     scan_count: int
     seed: int = 0  # of the noise
     imu_model: ImuModel = MEMS_IMU  # of the IMU on the LiDAR
+    first: int = 0  # number of the sweep that the first scan is of
 
     @property
     def name(self) -> str:
@@ -96,7 +97,11 @@ class Simulation:
     @property
     def stamps(self) -> FloatArray:
         """(N,) the start of each sweep."""
-        return np.arange(self.scan_count) / self.sensor.rate_hz
+        return np.array(self._sweeps) / self.sensor.rate_hz
+
+    @property
+    def _sweeps(self) -> range:
+        return range(self.first, self.first + self.scan_count)
 
     @cached_property
     def ground_truth(self) -> Trajectory:
@@ -110,8 +115,8 @@ class Simulation:
     @cached_property
     def imu(self) -> ImuSamples:
         """The samples of the IMU on the LiDAR, from the first sweep's start to the last one's end."""
-        last_s = self.scan_count / self.sensor.rate_hz
-        return sample_imu(self.imu_model, self.T_world_lidar_at, 0.0, last_s, self.seed)
+        first_s, last_s = (sweep / self.sensor.rate_hz for sweep in (self.first, self._sweeps.stop))
+        return sample_imu(self.imu_model, self.T_world_lidar_at, first_s, last_s, self.seed)
 
     def T_world_lidar_at(self, times: FloatArray) -> FloatArray:
         """(N, 4, 4) at times (N,) in seconds, exact."""
@@ -131,7 +136,7 @@ class Simulation:
 
     def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`; the ones between are not made."""
-        for index in range(self.scan_count)[start:stop:step]:
+        for index in self._sweeps[start:stop:step]:
             yield self.scan(index).scan
 
     def scan(self, index: int, echoes: Echoes | None = None) -> SimulatedScan:

@@ -1,11 +1,9 @@
 """Mixtures are drawn by a seed and a number alone."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from lidarslam.simulation.mixture import MIXED_WORLDS, Excerpt, ingredients_of, mixture
+from lidarslam.simulation.mixture import MIXED_WORLDS, ingredients_of, mixture
 from lidarslam.simulation.motion import MOUNTS
 from lidarslam.simulation.recorder import Simulation
 
@@ -14,37 +12,14 @@ SCANS = 3
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[Excerpt]:
+def drawn() -> list[Simulation]:
     return list(mixture(2, SCANS, SEED))
-
-
-@pytest.mark.parametrize(
-    ("chosen", "expected"),
-    [((), [10, 11, 12, 13]), ((1, 99), [11, 12, 13]), ((0, None, 3), [10, 13]), ((2, 1), [])],
-)
-def test_an_excerpt_is_a_recording_of_its_own(chosen, expected):
-    made = []
-
-    def scans(start=0, stop=None, step=1):
-        for number in range(20)[start:stop:step]:
-            made.append(number)
-            yield number
-
-    excerpt = Excerpt(SimpleNamespace(scans=scans, name="numbered", ground_truth=None), 10, 4)
-    assert len(excerpt) == 4
-    assert list(excerpt.scans(*chosen)) == expected == made
-    assert excerpt.name == "numbered@10"
-
-
-def simulation(excerpt: Excerpt) -> Simulation:
-    assert isinstance(excerpt.whole, Simulation)
-    return excerpt.whole
 
 
 @pytest.mark.long
 def test_recordings_are_as_their_ingredients_say(drawn):
     for number, excerpt in enumerate(drawn):
-        of, made = ingredients_of(number, SEED), simulation(excerpt)
+        of, made = ingredients_of(number, SEED), excerpt
         assert (of.world, of.sensor, of.carrier) == (made.world.name, made.sensor.name, made.motion.name)
         assert of.mount in MOUNTS
     drawn_names = [vars(ingredients_of(number, SEED)) for number in range(len(MIXED_WORLDS))]
@@ -64,7 +39,7 @@ def test_the_draw_of_a_number_does_not_change():
 
 def test_a_number_is_the_same_whatever_comes_before_it(drawn):
     (alone,) = mixture(1, SCANS, SEED, first=1)
-    again, there = simulation(alone), simulation(drawn[1])
+    again, there = alone, drawn[1]
     assert (alone.name, alone.first) == (drawn[1].name, drawn[1].first)
     np.testing.assert_array_equal(again.T_body_lidar, there.T_body_lidar)
     scan, other = next(iter(alone.scans())), next(iter(drawn[1].scans()))

@@ -214,15 +214,26 @@ def _type_name(field: PointFieldMessage) -> str:
 
 def deserialize(raw: bytes, message_type: str, ros2: bool) -> Any:
     """A message of a type that ROS itself defines, by its fixed definition."""
-    store = _typestore(ros2)
+    store = typestore(ros2)
     return (store.deserialize_cdr if ros2 else store.deserialize_ros1)(raw, message_type)
 
 
+def serialize(message: Any, ros2: bool) -> bytes:
+    """The bytes of a message made with `typestore`: CDR in ROS 2, packed in ROS 1."""
+    store = typestore(ros2)
+    return bytes((store.serialize_cdr if ros2 else store.serialize_ros1)(message, message.__msgtype__))
+
+
 @cache
-def _typestore(ros2: bool) -> Typestore:
+def typestore(ros2: bool) -> Typestore:
+    """The definitions of all message types in use."""
     store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
     if TRANSFORMS_TYPE not in store.types:  # ROS 1 has it in another package than rosbags knows
         store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+    for message_type in CUSTOM_MESSAGE_TYPES:
+        point_type = message_type.replace("CustomMsg", "CustomPoint")
+        store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, point_type))
+        store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, message_type))
     return store
 
 
