@@ -293,3 +293,23 @@ def time_scale_warning(found: tuple[float, int] | None) -> str | None:
         " times as fast as from scan to scan; check reader.time_unit and reader.time_field, or correct them with"
         f" --set reader.time_scale={'-1' if ratio < 0.0 else 'FACTOR'}"
     )
+
+
+# Motions, metres, that are compared, and their least number; the error, metres and as a share of a motion, of one that
+# is another's, and the share of such.
+_LEAST_MOTION_M, _FEWEST_MOTIONS = 0.02, 10
+_OTHER_M, _OTHER_SHARE, _MOSTLY = 0.05, 0.5, 0.5
+
+
+def prior_warning(prior: Trajectory, registered: Trajectory) -> str | None:
+    """Warning that most motions of a given trajectory are not the registered ones, at the same stamps; else None."""
+    given, found = prior.relative_motions(), registered.relative_motions()
+    moved_m = np.linalg.norm(found[:, :3, 3], axis=1)
+    off_m = np.linalg.norm((inverse(given) @ found)[:, :3, 3], axis=1)
+    is_other = (off_m > np.maximum(_OTHER_M, _OTHER_SHARE * moved_m))[moved_m > _LEAST_MOTION_M]
+    if len(is_other) < _FEWEST_MOTIONS or is_other.mean() < _MOSTLY:
+        return None
+    return (
+        f"the motions of the prior are not those of the scans on {is_other.sum():,} of {len(is_other):,} moving scans;"
+        " its poses have to be those of the LiDAR (T_odom_lidar), in its axes and of this recording"
+    )

@@ -37,7 +37,7 @@ from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
-from lidarslam.run.calibration import Elevation, imu_samples, open_inertial, with_elevations
+from lidarslam.run.calibration import Elevation, imu_samples, open_inertial, prior_warning, with_elevations
 from lidarslam.run.checkpoints import Checkpoints, describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
@@ -310,7 +310,8 @@ def track(
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
     elevation = Elevation.found(recording, estimator)
     log.warn(*(inertial.warnings if inertial is not None else ()))
-    log.warn(odometry.warning if isinstance(odometry, ExternalOdometry) else None)
+    if isinstance(odometry, ExternalOdometry):
+        log.warn(odometry.warning, prior_warning(log.odometry, log.trajectory))
     log.warn(None if elevation is None else elevation.warning)
     tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)

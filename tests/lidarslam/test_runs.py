@@ -21,7 +21,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
-from lidarslam.run.calibration import time_scale, time_scale_warning
+from lidarslam.run.calibration import prior_warning, time_scale, time_scale_warning
 
 from ..conftest import Drive, lidarslam, succeeds, write_recording
 from ..mapping.runs import errors
@@ -147,6 +147,19 @@ def test_the_scale_holds_for_any_mounting(walk, mounting):
     configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))
     (recorded,), (scaled,) = (list(open_recording(walk, config).scans(stop=1)) for config in configs)
     np.testing.assert_array_equal(scaled.time_offsets, -0.5 * recorded.time_offsets)
+
+
+@pytest.mark.parametrize(("T_lidar_body", "is_warned"), [
+    (np.eye(4), False), (exp([0.0, 0.0, 0.0, 0.3, 0.0, 0.2]), False),
+    (exp([0.0, 0.0, 0.5 * np.pi, 0.0, 0.0, 0.0]), True),
+], ids=["lidar", "displaced", "turned"])  # fmt: skip
+def test_a_prior_in_other_axes_is_a_warning(T_lidar_body, is_warned):
+    steps = exp(np.tile([0.0, 0.0, 0.02, 0.3, 0.0, 0.0], (40, 1)))
+    T_world_lidar = chain(np.eye(4), steps)
+    stamps = 0.1 * np.arange(len(T_world_lidar))
+    warning = prior_warning(Trajectory(stamps, T_world_lidar @ T_lidar_body), Trajectory(stamps, T_world_lidar))
+    assert (warning is not None) == is_warned
+    assert warning is None or "on 40 of 40 moving scans" in warning
 
 
 def documented(heading: str, column: int = 1) -> list[str]:

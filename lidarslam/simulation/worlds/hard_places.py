@@ -106,7 +106,6 @@ def _plant_yard(yard: Room, grounds: Grounds, clearance: Clearance) -> None:
 RISE_M, TREAD_M = 0.17, 0.28
 _SLAB_M, _RAIL_ASIDE_M = 0.2, 0.06
 _TURN_M = 1.3  # from the lobby's end to where the route turns
-x = 0.4, 2.1, 0.8
 
 
 @dataclass(frozen=True)
