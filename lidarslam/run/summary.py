@@ -424,8 +424,8 @@ def _unconstrained_m(log: ScanLog) -> float:
     scaled_m2 = np.linalg.norm(moved * log.table["sigmas"][1:, 3:], axis=1)
     is_noise = (whole_m > _SHORTEST_MOTION_M) & (whole_m**2 < scaled_m2)
     speeds = whole_m / np.diff(log.stamps)
-    around = np.pad(speeds, 1, mode="edge")
-    is_jump = speeds > np.maximum(around[:-2], around[2:]) + _JUMP_MPS
+    before, after = np.append(speeds[:1], speeds[:-1]), np.append(speeds[1:], speeds[-1:])
+    is_jump = speeds > np.maximum(before, after) + _JUMP_MPS
     lengths_m = np.where(is_noise | is_jump, whole_m, np.linalg.norm(moved * open_axes, axis=1))
     is_unknown = degenerate.all(axis=1)
     lengths_m[is_unknown] = np.maximum(lengths_m, _WALKING_MPS * np.diff(log.stamps))[is_unknown]

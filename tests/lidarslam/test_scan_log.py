@@ -139,11 +139,11 @@ def test_a_first_motion_counts_as_unknown_where_no_vehicle_accelerates_to_the_se
     assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
 
 
-@pytest.mark.parametrize(("jump_m", "unknown"), [(0.4, False), (2.4, True)])
-def test_jumps_of_the_pose_count_as_unknown(jump_m, unknown):
+@pytest.mark.parametrize(("jump_m", "scans", "unknown"), [(0.4, 60, False), (2.4, 60, True), (0.0, 1, False)])
+def test_jumps_of_the_pose_count_as_unknown(jump_m, scans, unknown):
     """To a place that looks the same, and back; walking speeds else."""
     log = ScanLog()
-    for scan in range(60):
+    for scan in range(scans):
         x_m = 0.1 * scan + jump_m * (20 <= scan < 40)
         log.add(result(0.1 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])))
     assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown

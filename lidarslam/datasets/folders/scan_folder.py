@@ -28,7 +28,7 @@ _STAMP_FILES = ("timestamps.txt", "times.txt")
 _PAIRS = 40
 # Other numbered files, as a share of the scans, that are more than a few maps.
 _FEW_OTHERS = 0.1
-# The number at the end of a name, digits of it that count, and how many numbers per scan are a count of scans.
+# The number at the end of a name, its digits that count, and the most numbers per scan of names that count scans.
 _NUMBER, _MOST_DIGITS, _MOST_MISSING = re.compile(r"\d+$"), 9, 3
 # Scans that are farther apart may be stamped in another unit.
 _LOWEST_RATE_HZ = 0.1

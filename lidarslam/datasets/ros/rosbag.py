@@ -153,8 +153,7 @@ class BagRecording(CloudRecording):
             lists = f"{self._source}: its index lists {len(self)} messages of {self._topic.name}, it holds none;"
             remedy = " reindex it, or give one of its .db3 or .mcap files instead of the folder"
             raise InputError(damages[0] if damages else lists + remedy)
-        if count < len(self):
-            missing = sum(index >= count for index in wanted)
+        if missing := sum(index >= count for index in wanted):
             faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", missing)
 
     def _sound_items(self) -> Iterator[BagMessage]:
