@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
@@ -64,7 +63,8 @@ class RunProgress:
             self._last_line = now
             left_s = (now - self._began) / max(1, number - self._before) * (total - number)
             lost = f", {self._lost:,} lost" if self._lost else ""
-            click.echo(f"{self._name}: {number:,} of {total:,} scans{lost}, {left_s / 60.0:.0f} min left", err=True)
+            line = f"{self._name}: {number:,} of {total:,} scans{lost}, {left_s / 60.0:.0f} min left"
+            print(line, file=sys.stderr, flush=True)
 
     def phase(self, words: str) -> None:
         """Show the current step."""
