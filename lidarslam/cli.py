@@ -117,7 +117,9 @@ def _require_surroundings() -> None:
 
 
 @click.group(
-    "lidarslam", cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    "lidarslam",
+    cls=_Group,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
 )
 @click.version_option(package_name="lidarslam", message="%(prog)s %(version)s")
 def main() -> None:

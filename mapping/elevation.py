@@ -143,10 +143,9 @@ class _System:
         """Of points (N, 3) with their scans' numbers (N,), at poses (K, 4, 4)."""
         world = np.einsum("nij,nj->ni", poses[number, :3, :3], points) + poses[number, :3, 3]
         _, cube = np.unique(point_keys(world, edge_m), return_inverse=True)
-        middle = _means(world, cube)
-        away = world - middle[cube]
-        products = np.stack([away[:, i] * away[:, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))], 1)
-        values, axes = np.linalg.eigh(_means(products, cube)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+        away = world - _means(world, cube)[cube]
+        products = np.einsum("ni,nj->nij", away, away).reshape(-1, 9)
+        values, axes = np.linalg.eigh(_means(products, cube).reshape(-1, 3, 3))
         spread = np.sqrt(np.maximum(values, 0.0)).T
         key, row = np.unique(cube * len(poses) + number, return_inverse=True)
         plane, scan = np.divmod(key, len(poses))

@@ -390,10 +390,7 @@ QUANTITIES: dict[str, Quantity] = {
     **{
         f"segment_{m}_{key}": Quantity(f"{_SEGMENTS}{m}/{key}", f"{m} m {label}", unit, 3)
         for m in SHORT_LENGTHS_M
-        for key, label, unit in (
-            ("translation_percent", "t_rel", "%"),
-            ("rotation_deg_per_10m", "r_rel", "deg/10 m"),
-        )
+        for key, label, unit in (("translation_percent", "t_rel", "%"), ("rotation_deg_per_10m", "r_rel", "deg/10 m"))
     },
     "map_accuracy_mean_m": Quantity(_MAP + "accuracy_mean_m", "map accuracy", "m", 3),
     "map_completeness_mean_m": Quantity(_MAP + "completeness_mean_m", "map completeness", "m", 3),

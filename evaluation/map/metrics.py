@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import median_gap_m
 from lidarslam.evaluation.map.voxel_thinning import thin
 
 F_SCORE_THRESHOLDS_M = (0.1, 0.2, 0.5)
@@ -101,7 +102,7 @@ def compare_maps(
     map_errors = CloudErrors(mapped + origin, _distances(mapped, reference), _in_box(mapped, reference))
     reference_errors = CloudErrors(reference + origin, _distances(reference, mapped), in_range)
     metrics = _metrics(map_errors, reference_errors)
-    return MapComparison(metrics, map_errors, reference_errors, _median_gap(mapped))
+    return MapComparison(metrics, map_errors, reference_errors, median_gap_m(mapped, _GAP_SAMPLES))
 
 
 def _metrics(mapped: CloudErrors, reference: CloudErrors) -> MapMetrics:
@@ -138,14 +139,6 @@ def _distances(points: FloatArray, others: FloatArray, bound_m: float = np.inf) 
     tree = cKDTree(others, balanced_tree=False, compact_nodes=False)
     distances, _ = tree.query(points, distance_upper_bound=bound_m, workers=-1)
     return np.asarray(distances, dtype=np.float64)
-
-
-def _median_gap(points: FloatArray) -> float | None:
-    if len(points) < 2:
-        return None
-    sample = points[:: max(1, len(points) // _GAP_SAMPLES)]
-    distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2, workers=-1)
-    return float(np.median(np.asarray(distances)[:, 1]))
 
 
 def _in_box(points: FloatArray, reference: FloatArray) -> NDArray[np.bool_]:

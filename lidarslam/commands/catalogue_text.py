@@ -60,10 +60,7 @@ def find_on_disk(folders: Sequence[Path]) -> OnDisk:
 def _recordings(places: Iterable[Path], depth: int) -> Iterator[tuple[Path, str]]:
     """Recordings at and below some places, in no other recording, and their readers."""
     for place in map(Path.absolute, places):
-        reader = None
-        with suppress(OSError):
-            reader = recognise(place)
-        if reader is not None:
+        if (reader := recognise(place)) is not None:
             yield place, reader
         elif depth and place.is_dir():
             with suppress(OSError):

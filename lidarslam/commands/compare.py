@@ -34,7 +34,6 @@ _SECONDS = click.FloatRange(min=0.0)
     "--alignment",
     type=click.Choice(["se3", "first_pose", "none"]),
     default="se3",
-    show_default=True,
     help="Alignment of the trajectory to the reference for the ATE.",
 )
 @click.option("--tolerance-s", type=_SECONDS, help="Largest time between matching poses.  [default: 0.02]")
@@ -50,7 +49,6 @@ _SECONDS = click.FloatRange(min=0.0)
     "--map-alignment",
     metavar="[auto|trajectory|global|none|FILE]",
     default="auto",
-    show_default=True,
     help="Alignment of the map to the reference map: by the trajectories, by a global search, none, or the 4x4 matrix"
     " in a text file, which takes the map to the reference.",
 )
@@ -63,15 +61,8 @@ _SECONDS = click.FloatRange(min=0.0)
     help="Distance from the path up to which the map should be complete, m.  [default: the range of the run's map]",
 )
 @click.option("--errors", type=PATH, multiple=True, metavar="FILE", help="Save the map coloured by error: .ply, .rrd.")
-@click.option(
-    "--errors-clip",
-    "errors_clip_m",
-    type=POSITIVE,
-    default=0.5,
-    show_default=True,
-    help="Error of the brightest colour, m.",
-)
-@click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.  [default: report]")
+@click.option("--errors-clip", "errors_clip_m", type=POSITIVE, default=0.5, help="Error of the brightest colour, m.")
+@click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.")
 @opt.gate_options(with_method=False)
 @click.option("-o", "--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
 @click.pass_context
@@ -202,10 +193,8 @@ def compare(
 
 
 @opt.command("lidarslam demo -o demo")
-@click.option(
-    "-o", "--out", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
-)
-@click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
+@click.option("-o", "--out", type=PATH, default=Path("demo"), metavar="DIR", help="Folder of the results.")
+@click.option("--scans", type=click.IntRange(min=20), default=400, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:
     """Simulate an office, map it, and compare with KISS-ICP."""
     from lidarslam.compare.demo import format_demo, run_demo

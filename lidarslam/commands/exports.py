@@ -93,10 +93,8 @@ def edit(sources: tuple[Path, ...], out: Path, overwrite: bool, **options: Any) 
 )
 @_RUN
 @_out("FILE", "ROS 2: .mcap or .db3, or a folder without a suffix; ROS 1: .bag.")
-@click.option(
-    "--clouds/--no-clouds", default=True, help="Read the recording again for deskewed clouds.  [default: clouds]"
-)
-@click.option("--frame", default="lidar", show_default=True, help="Name of the frame of the LiDAR.")
+@click.option("--clouds/--no-clouds", default=True, help="Read the recording again for deskewed clouds.")
+@click.option("--frame", default="lidar", help="Name of the frame of the LiDAR.")
 @_OVERWRITE
 def export_bag(run: Path, out: Path, clouds: bool, frame: str, overwrite: bool) -> None:
     """Write a run as a bag: odometry, tf, path, clouds and map.
@@ -131,28 +129,16 @@ def export_bag(run: Path, out: Path, clouds: bool, frame: str, overwrite: bool) 
     type=POSITIVE,
     help="Edge of a cell, m.  [default: 0.05, or the voxels of the map if they are larger]",
 )
-@click.option(
-    "--min-height", "min_height_m", type=POSITIVE, default=0.15, show_default=True, help="Least height of obstacles, m."
-)
-@click.option(
-    "--max-height", "max_height_m", type=POSITIVE, default=1.8, show_default=True, help="Height of the robot, m."
-)
+@click.option("--min-height", "min_height_m", type=POSITIVE, default=0.15, help="Least height of obstacles, m.")
+@click.option("--max-height", "max_height_m", type=POSITIVE, default=1.8, help="Height of the robot, m.")
 @click.option(
     "--robot-radius",
     "robot_radius_m",
     type=POSITIVE,
     default=0.3,
-    show_default=True,
     help="Distance from the path within which cells are free, m.",
 )
-@click.option(
-    "--max-range",
-    "max_range_m",
-    type=POSITIVE,
-    default=30.0,
-    show_default=True,
-    help="Largest distance from the path, m.",
-)
+@click.option("--max-range", "max_range_m", type=POSITIVE, default=30.0, help="Largest distance from the path, m.")
 @_OVERWRITE
 def export_grid(run: Path, out: Path, resolution_m: float | None, overwrite: bool, **heights: float) -> None:
     """Write the map as an occupancy grid for Nav2.

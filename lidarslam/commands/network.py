@@ -21,11 +21,7 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say
 @click.option("--resume", is_flag=True, help="Continue the training in DIR, on the same recordings.")
 @click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
 @click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="auto: a GPU where there is one.",
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", help="auto: a GPU where there is one."
 )
 @click.option("--steps", type=click.IntRange(min=1), help="Training steps.  [default: 12000]")
 @click.option("--network", type=click.Choice(["correlation", "delora"]), help="What to train.  [default: correlation]")

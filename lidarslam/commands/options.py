@@ -153,16 +153,15 @@ reader_options = together(
     click.option("--sequence", metavar="NAME", help="Sequence of a data set's root, such as 04 of KITTI odometry."),
 )
 scan_options = together(
-    click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan."),
+    click.option("--start", type=click.IntRange(min=0), default=0, help="First scan."),
     click.option("--stop", type=click.IntRange(min=0), help="Scan to stop before."),
-    click.option("--step", type=click.IntRange(min=1), default=1, show_default=True, help="Take every n-th scan."),
+    click.option("--step", type=click.IntRange(min=1), default=1, help="Take every n-th scan."),
 )
 jobs_options = together(
     click.option(
         "--jobs",
         type=click.IntRange(min=1),
         default=1,
-        show_default=True,
         metavar="N",
         help="Compute in N processes; needs the extra ray.",
     ),

@@ -58,9 +58,9 @@ def info(source: Path, as_json: bool, **options: Any) -> None:
     lidarslam simulate -o recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25"""
 )
 @opt.out_option("Folder of the recording.", "recordings/WORLD_TIME")
-@click.option("--world", type=_WORLD, default="office", show_default=True, help="Scene.")
-@click.option("--sensor", type=_SENSOR, default="vlp-16", show_default=True, help="LiDAR model.")
-@click.option("--motion", type=_CARRIER, default="handheld", show_default=True, help="Carrier of the LiDAR.")
+@click.option("--world", type=_WORLD, default="office", help="Scene.")
+@click.option("--sensor", type=_SENSOR, default="vlp-16", help="LiDAR model.")
+@click.option("--motion", type=_CARRIER, default="handheld", help="Carrier of the LiDAR.")
 @click.option(
     "--speed",
     "speed_mps",
@@ -68,11 +68,11 @@ def info(source: Path, as_json: bool, **options: Any) -> None:
     metavar="M/S",
     help="Speed on straight stretches.  [default: that of the carrier, within the limit of the route]",
 )
-@click.option("--mount", type=_MOUNT, default="upright", show_default=True, help="Mounting of the LiDAR.")
-@click.option("--scans", type=click.IntRange(min=1), default=300, show_default=True, help="Number of scans.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
-@click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
-@click.option("--imu/--no-imu", default=False, show_default=True, help="Record an IMU of 200 Hz on the LiDAR too.")
+@click.option("--mount", type=_MOUNT, default="upright", help="Mounting of the LiDAR.")
+@click.option("--scans", type=click.IntRange(min=1), default=300, help="Number of scans.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the random numbers.")
+@click.option("--format", type=_FORMAT, default="mcap", help="Format of the files.")
+@click.option("--imu/--no-imu", default=False, help="Record an IMU of 200 Hz on the LiDAR too.")
 @opt.jobs_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path | None, **options: Any) -> None:

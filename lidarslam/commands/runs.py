@@ -21,10 +21,9 @@ _RERUN = click.option(
     "--rerun",
     type=click.Choice(["off", "save", "web", "spawn"]),
     default="off",
-    show_default=True,
     help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
 )
-_REPORT = click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
+_REPORT = click.option("--report/--no-report", default=True, help="Draw report.html and pictures.")
 _OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 _odometry_options = opt.together(
     click.option(
@@ -153,25 +152,17 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
 )
 @click.option("--topic", metavar="TOPIC", help="Topic of the clouds.  [default: the only one]")
 @click.option(
-    "--domain",
-    type=click.IntRange(0, 232),
-    envvar="ROS_DOMAIN_ID",
-    show_envvar=True,
-    default=0,
-    show_default=True,
-    help="DDS domain.",
+    "--domain", type=click.IntRange(0, 232), envvar="ROS_DOMAIN_ID", show_envvar=True, default=0, help="DDS domain."
 )
 @opt.out_option("Run directory for the results.", "runs/TOPIC_TIME")
 @click.option("--duration", "duration_s", type=opt.POSITIVE, metavar="S", help="End so long after the first scan.")
 @click.option("--scans", type=click.IntRange(min=1), metavar="N", help="End after so many scans.")
-@click.option("--odom-frame", default="odom", show_default=True, metavar="FRAME", help="Fixed frame of the poses.")
+@click.option("--odom-frame", default="odom", metavar="FRAME", help="Fixed frame of the poses.")
 @click.option(
     "--base-frame", metavar="FRAME", help="Moving frame; /tf_static connects it with the LiDAR.  [default: the LiDAR's]"
 )
-@click.option("--tf/--no-tf", "publish_tf", default=True, help="Publish the pose on /tf as well.  [default: tf]")
-@click.option(
-    "--queue", type=click.IntRange(min=1), default=20, show_default=True, help="Scans that may wait for registration."
-)
+@click.option("--tf/--no-tf", "publish_tf", default=True, help="Publish the pose on /tf as well.")
+@click.option("--queue", type=click.IntRange(min=1), default=20, help="Scans that may wait for registration.")
 @_odometry_options
 @_mapping_options
 @_POSE_GRAPH

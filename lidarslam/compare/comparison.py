@@ -93,7 +93,7 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
             request = fill_request(request, benchmark)
             require_data(request, benchmark)
         require_methods(request.gates, [method.name for method in request.methods])
-        make_recordings(request, show_count)
+        make_recordings(request)
         outcome = compare(request, Narrator(show_count, tell))
     say(format_comparison(outcome.comparison, request.out))
     if outcome.is_empty:

@@ -4,8 +4,7 @@ The command line names methods BASE[@VOXEL][+map|+loam][+graph], or PEER[@scene]
 """
 
 import re
-from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -31,6 +30,7 @@ from lidarslam.evaluation.comparison.comparison import MissingRecording, TablePl
 from lidarslam.evaluation.comparison.gates import Gate
 from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import ODOMETRIES
+from lidarslam.run.progress import show_count
 from lidarslam.run.request import RunRequest
 from lidarslam.simulation.record import README, REFERENCE_MAP, RecordRequest, record
 from lidarslam.storage import directory as files
@@ -368,9 +368,7 @@ def require_data(request: CompareRequest, benchmark: Benchmark) -> None:
     raise InputError(f"{benchmark.title}: none of its recordings is in {place}; {needed}")
 
 
-def make_recordings(
-    request: CompareRequest, counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-) -> None:
+def make_recordings(request: CompareRequest) -> None:
     """Simulate the recordings that are not there yet."""
     wanted = [
         RecordRequest(entry.source, **entry.simulate.model_dump())
@@ -381,17 +379,13 @@ def make_recordings(
     require_no_link([request.out / RECORDINGS, *made])
     if request.where.jobs == 1 or len(wanted) < 2:  # a cluster may have other disks
         for one in wanted:
-            with counting(f"recording {one.out.name}") as counter:
+            with show_count(f"recording {one.out.name}") as counter:
                 record(one, counter)
         return
-    with counting(f"{len(wanted)} recordings side by side") as counter, open_tasks(request.where) as tasks:
+    with show_count(f"{len(wanted)} recordings side by side") as counter, open_tasks(request.where) as tasks:
         scans = [one.scans for one in wanted]
-        for number, _ in enumerate(tasks.run(_record, wanted), start=1):
+        for number, _ in enumerate(tasks.run(record, wanted), start=1):
             counter(sum(scans[:number]), sum(scans))
-
-
-def _record(request: RecordRequest) -> None:
-    record(request, lambda *_: None)
 
 
 def _located(entry: RecordingEntry, benchmark: Benchmark, data: Path | None, out: Path) -> RecordingEntry:

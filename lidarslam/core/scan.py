@@ -175,6 +175,17 @@ def squared_ranges(points: FloatArray) -> FloatArray:
     return squared
 
 
+def median_gap_m(points: FloatArray, samples: int) -> float | None:
+    """Median distance of some of the points (N, 3) from their nearest neighbours; None of fewer than two points."""
+    from scipy.spatial import cKDTree  # takes a while to load
+
+    if len(points) < 2:
+        return None
+    some = points[:: max(1, len(points) // samples)]
+    distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(some, k=2)
+    return float(np.median(np.asarray(distances)[:, 1]))
+
+
 @compiled
 def _write_squared_ranges(points: FloatArray, squared: FloatArray) -> None:
     for n in range(len(points)):

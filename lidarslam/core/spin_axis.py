@@ -32,7 +32,7 @@ def image_axes(points: FloatArray) -> FloatArray:
     about_z = float(_spreads(fine, np.eye(3)[2:])[0])
     if about_z < _WIDE:
         return np.eye(3)
-    axes = np.concatenate([np.eye(3), _hemisphere(_AXES)])
+    axes = np.concatenate([np.eye(3), fibonacci_lattice((np.arange(_AXES) + 0.5) / _AXES)])
     axis = axes[int(np.argmin(_spreads(directions[:: max(1, len(directions) // _DIRECTIONS)], axes)))]
     axis, spread = _refined(axis, fine)
     own = _spreads(fine, np.eye(3))
@@ -71,9 +71,8 @@ def _refined(axis: FloatArray, directions: FloatArray) -> tuple[FloatArray, floa
     return axis, spread
 
 
-def _hemisphere(count: int) -> FloatArray:
-    """Unit vectors (count, 3), evenly over the upper half of the sphere (a Fibonacci lattice)."""
-    numbers = np.arange(count) + 0.5
-    z, azimuth = numbers / count, np.pi * (1.0 + np.sqrt(5.0)) * numbers
+def fibonacci_lattice(z: FloatArray) -> FloatArray:
+    """Unit vectors (N, 3) with evenly spaced z (N,): they lie evenly over that part of the sphere."""
+    azimuth = np.pi * (1.0 + np.sqrt(5.0)) * (np.arange(len(z)) + 0.5)
     across = np.sqrt(1.0 - z**2)
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])

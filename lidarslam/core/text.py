@@ -5,7 +5,7 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from lidarslam.core.errors import ConfigError
@@ -53,6 +53,12 @@ def command_line(*words: str) -> str:
 def count(number: int, noun: str) -> str:
     """A number with its noun: 1 scan, 2,000 scans."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def first_few(names: Sequence[object], most: int) -> str:
+    """The first few of some names, and how many more there are: a, b and 3 more."""
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return f"{', '.join(map(str, names[:most]))}{more}"
 
 
 def scan_span(first: int, last: int) -> str:

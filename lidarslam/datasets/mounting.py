@@ -13,7 +13,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.spin_axis import image_axes
+from lidarslam.core.spin_axis import fibonacci_lattice, image_axes
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
@@ -258,7 +258,8 @@ def planes(points: FloatArray) -> list[Plane]:
     thinned, on, normals = _normals(points)
     if len(normals) < _FEWEST:
         return []
-    seeds = _sphere(_SEEDS)
+    spread = fibonacci_lattice(1.0 - 2.0 * (np.arange(_SEEDS) + 0.5) / _SEEDS)
+    seeds = np.concatenate([np.eye(3), -np.eye(3), spread])
     found: list[Plane] = []
     for seed in seeds[np.argsort(-(normals @ seeds.T > _PARALLEL).sum(axis=0), kind="stable")]:
         plane = _plane(seed, thinned, on, normals)
@@ -318,15 +319,6 @@ def _normals(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     flat = variances[:, 0] < _FLAT * variances[:, 1]
     on, normals = means[flat], axes[flat, :, 0]
     return thinned, on, normals * -np.sign(np.einsum("ni,ni->n", normals, on))[:, None]
-
-
-def _sphere(count: int) -> FloatArray:
-    """Unit vectors (count, 3), evenly over the sphere, and the axes."""
-    numbers = np.arange(count) + 0.5
-    z, azimuth = 1.0 - 2.0 * numbers / count, np.pi * (1.0 + np.sqrt(5.0)) * numbers
-    across = np.sqrt(1.0 - z**2)
-    spread = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
-    return np.concatenate([np.eye(3), -np.eye(3), spread])
 
 
 def guess_mounting(scans: Iterable[FloatArray]) -> Guess:

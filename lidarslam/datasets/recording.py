@@ -15,6 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan, ScanSequence
+from lidarslam.core.text import first_few
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
@@ -30,7 +31,6 @@ _INSTALL = {
     "velodyne_decoder": "pip install 'lidarslam[velodyne]'",
     "ouster.sdk": "pip install --no-deps ouster-sdk",
 }
-_LISTED = 8
 STORAGE_SUFFIXES = (".db3", ".mcap")  # of rosbag2
 _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
 # Of the points of KITTI, and of the .bin files of others.
@@ -422,11 +422,9 @@ def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun
     ]
     if len(fitting) == 1:
         return fitting[0]
-    more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
-    listed = f"{', '.join(names[:_LISTED])}{more}"
     if wanted is None:
-        raise InputError(f"{source}: holds {len(names):,} {noun}s; choose one with --sequence: {listed}")
-    raise InputError(f"{source}: has no {noun} {wanted!r}; there are: {listed}")
+        raise InputError(f"{source}: holds {len(names):,} {noun}s; choose one with --sequence: {first_few(names, 8)}")
+    raise InputError(f"{source}: has no {noun} {wanted!r}; there are: {first_few(names, 8)}")
 
 
 def _last_number(name: str) -> int | None:

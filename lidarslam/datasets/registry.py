@@ -15,7 +15,7 @@ from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
-from lidarslam.core.text import count
+from lidarslam.core.text import count, first_few
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
@@ -25,7 +25,6 @@ from lidarslam.datasets.recording import STORAGE_SUFFIXES, Recording, storage_fi
 
 logger = logging.getLogger(__name__)
 
-_LISTED = 5
 # Depth of the search for recordings, and the largest number of entries of a folder.
 _DEPTH, _MOST_ENTRIES = 3, 1000
 _URL = re.compile(r"[a-z][a-z0-9+]+:/", re.IGNORECASE)
@@ -257,9 +256,7 @@ def _unrecognised(source: Path) -> str | None:
         reader = recognise(found[0])
         if len(found) == 1:
             return f"{source}: holds the recording {found[0]} ({reader}); name that"
-        more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
-        listed = ", ".join(str(path) for path in found[:_LISTED])
-        return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {listed}{more}"
+        return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {first_few(found, 5)}"
     return None
 
 

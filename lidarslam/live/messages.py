@@ -160,12 +160,7 @@ class PosePublisher:
     """
 
     def __init__(
-        self,
-        odometry: Publish,
-        transforms: Publish | None,
-        fixed_frame: str,
-        body_frame: str,
-        T_body_lidar: FloatArray,
+        self, odometry: Publish, transforms: Publish | None, fixed_frame: str, body_frame: str, T_body_lidar: FloatArray
     ) -> None:
         self._odometry, self._transforms = odometry, transforms
         self._fixed_frame, self._body_frame = fixed_frame, body_frame

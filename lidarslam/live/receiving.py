@@ -269,10 +269,7 @@ class LiveCounts:
     def warnings(self) -> list[str]:
         """Sentences about losses."""
         losses = (
-            (
-                self.missing,
-                "missing between the stamps of those received; net.core.rmem_max bounds the network",
-            ),
+            (self.missing, "missing between the stamps of those received; net.core.rmem_max bounds the network"),
             (self.dropped, "dropped, as registration was slower than the sensor: take --odometry constant-velocity"),
         )
         return [f"{count(number, 'scan')} {remedy}" for number, remedy in losses if number]

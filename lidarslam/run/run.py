@@ -69,10 +69,7 @@ class NoScanError(InputError):
 
 
 def execute(
-    request: RunRequest,
-    progress: Progress,
-    phase: Callable[[str], None] = lambda _: None,
-    page: WebPage | None = None,
+    request: RunRequest, progress: Progress, phase: Callable[[str], None] = lambda _: None, page: WebPage | None = None
 ) -> RunOutcome:
     """Run, and write the run directory.
 

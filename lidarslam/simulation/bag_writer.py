@@ -32,7 +32,7 @@ class DriverCloud:
     record: np.dtype[np.void]  # type of a point, padding included
     imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one next to it
     imu_frame_id: str = "imu_link"
-    message_type: str = made.POINT_CLOUD2_TYPE
+    message_type: str = bag_message.POINT_CLOUD2_TYPE
 
     def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
         """The points (N,) of a sweep whose message is stamped `stamp_ns`."""

@@ -242,7 +242,7 @@ def _chunk(task: tuple[RecordRequest, range]) -> tuple[list[SimulatedScan], KeyA
 _simulation_of_process = lru_cache(maxsize=1)(make_simulation)  # built once in each process
 
 
-def record(request: RecordRequest, progress: Callable[[int, int], None]) -> RecordingSummary:
+def record(request: RecordRequest, progress: Callable[[int, int], None] = lambda *_: None) -> RecordingSummary:
     """Make the recording's folder; it appears when everything in it is complete.
 
     After every scan `progress` is called with its number from 1 and how many there will be.

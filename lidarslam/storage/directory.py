@@ -25,6 +25,7 @@ from lidarslam.core.files import (
 )
 from lidarslam.core.json_text import read_json
 from lidarslam.core.state import Saved, read_state
+from lidarslam.core.text import first_few
 
 _TILE = re.compile(r"-?\d+_-?\d+\.laz")
 
@@ -96,7 +97,7 @@ class RunDirectory:
                 try:
                     yield directory
                 except BaseException:
-                    if not describes_run(path):  # files that no config.yaml describes would obstruct the next attempt
+                    if not config_begins_with(path, RUN_SECTION):  # the next attempt would refuse its files
                         _remove(path, directory._written)
                     raise
                 _remove(path, directory._stale)
@@ -188,25 +189,22 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
         return [*present, *([] if resume else [ABOUT])]
     if present and not resume:
         listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
-        if not describes_run(path):
+        if not config_begins_with(path, RUN_SECTION):
             raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
         if not overwrite:
             raise OutputError(f"{path}: holds a run ({listed}); name another directory, or replace it with --overwrite")
     return present
 
 
-def describes_run(path: Path) -> bool:
-    """Whether there is a run's config.yaml: its first section describes the run."""
+def config_begins_with(path: Path, section: str) -> bool:
+    """Whether there is a config.yaml with this as its first section, the one that describes a run or a training."""
     try:
-        return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{RUN_SECTION}:")
+        return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{section}:")
     except (OSError, UnicodeDecodeError):
         return False
 
 
 logger = logging.getLogger(__name__)
-
-# Differences to another run that an error lists.
-_LISTED = 3
 
 # Running; stopped, its results so far written; running, with the results of an earlier run still whole.
 Standing = Literal["at work", "stopped", "over an earlier run"]
@@ -274,10 +272,9 @@ def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None
     old, new = flat(was), flat(asked)
     names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
     if names:
-        listed = ", ".join(f"{name} {old.get(name)} (now {new.get(name)})" for name in names[:_LISTED])
-        more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+        changes = first_few([f"{name} {old.get(name)} (now {new.get(name)})" for name in names], 3)
         raise InputError(
-            f"{run}: was begun with {listed}{more}; give the options it was begun with, or begin again with --overwrite"
+            f"{run}: was begun with {changes}; give the options it was begun with, or begin again with --overwrite"
         )
 
 
@@ -320,7 +317,7 @@ def remove_run(run: Path) -> None:
     """Remove a run, finished or not, and its directory when it is empty then; OutputError where it is running."""
     with only_writer(run):
         remove_partial_files(run)
-        if (run / ABOUT).exists() or describes_run(run):
+        if (run / ABOUT).exists() or config_begins_with(run, RUN_SECTION):
             remove_files(run)
             CheckpointFiles(run).remove()
     if not any(run.iterdir()):

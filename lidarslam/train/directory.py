@@ -20,6 +20,7 @@ from lidarslam.core.files import make_own_folder, open_own, replacing
 from lidarslam.core.text import as_typed, count, one_line
 from lidarslam.odometry.network.checkpoint import Kind, read_tensor_file, write_tensor_file
 from lidarslam.odometry.training.losses import Validation
+from lidarslam.storage.directory import config_begins_with
 
 CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"
@@ -65,10 +66,7 @@ def remove_results(path: Path, names: Iterable[str]) -> None:
 
 def is_training(path: Path) -> bool:
     """Whether the directory is of a training: the first section of its configuration names the recordings."""
-    try:
-        return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{SOURCES_SECTION}:")
-    except (OSError, UnicodeDecodeError):
-        return False
+    return config_begins_with(path, SOURCES_SECTION)
 
 
 _KIND = Kind("the state of a training", version=1)

@@ -16,7 +16,7 @@ from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import BlockFile, Shape
-from lidarslam.mapping.surfels.voxel_hash import BITS, EMPTY, OFFSET, PREFETCHED, cell_of, key_of, reach_m
+from lidarslam.mapping.surfels.voxel_hash import BITS, EMPTY, OFFSET, PREFETCHED, Keys, cell_of, key_of, reach_m
 
 POSITION, VIEW, COUNT = slice(0, 3), slice(3, 6), 6
 _GEOMETRY = 7
@@ -25,7 +25,6 @@ _INTENSITY, _RGB, _FIRST = 2, 4, 3
 _NO_FIRST = (np.inf, 0.0, -1.0)
 _MASK = (1 << BITS) - 1
 
-Keys = NDArray[np.int64]
 Rows = NDArray[np.float32]
 
 _reach_m = compiled_part(reach_m)

@@ -10,7 +10,6 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import (
     FloatArray,
@@ -21,6 +20,7 @@ from lidarslam.core.geometry import (
     rotation_angle,
     transform_points,
 )
+from lidarslam.core.scan import median_gap_m
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.local_map import vertical_of
@@ -75,7 +75,7 @@ class FixedMap:
     def __init__(self, points: FloatArray, normals: FloatArray) -> None:
         self._points = points
         self._normals = normals
-        self._least_cell_m = _CELLS_PER_SPACING * _spacing_m(points)
+        self._least_cell_m = _CELLS_PER_SPACING * (median_gap_m(points, _SAMPLES) or 0.0)
         self._up = vertical_of(normals)
         self._views: tuple[float, list[BirdsEyeMap]] = (0.0, [])
 
@@ -102,15 +102,6 @@ class FixedMap:
             parts = _parts(points[:, :2], _VIEW_CELLS * pixel_m, _OVERLAP_CELLS * pixel_m)
             self._views = cell_m, [BirdsEyeMap.of(points[part], self._up, pixel_m) for part in parts]
         return self._views[1]
-
-
-def _spacing_m(points: FloatArray) -> float:
-    """Median distance of points (M, 3) from their nearest neighbours."""
-    if len(points) < 2:
-        return 0.0
-    sample = points[:: max(1, len(points) // _SAMPLES)]
-    distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2)
-    return float(np.median(np.asarray(distances)[:, 1]))
 
 
 def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bool_]]:

@@ -12,14 +12,7 @@ from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import (
-    FADING,
-    LOST_MOTION,
-    MotionState,
-    Prediction,
-    Prior,
-    corrected_by_motion,
-)
+from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior, corrected_by_motion
 from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap

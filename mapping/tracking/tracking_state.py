@@ -7,14 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import (
-    MotionState,
-    OdometryNoise,
-    Prediction,
-    Prior,
-    ProcessNoise,
-    predict,
-)
+from lidarslam.mapping.motion.prediction import MotionState, OdometryNoise, Prediction, Prior, ProcessNoise, predict
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 
 # After a gap of this length between scans the pose is uncertain.

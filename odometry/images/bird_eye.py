@@ -7,11 +7,9 @@ uprightness and azimuth of their normals, and heights.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
-
-Floats = NDArray[np.float32]
+from lidarslam.odometry.images.projection import Floats
 
 CELLS = 96
 """Cells along x and along y, the sensor between the two in the middle."""

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
-
-Floats = NDArray[np.float32]
+from lidarslam.odometry.images.projection import Floats
 
 # All in single precision, for twice as many numbers per vector instruction.
 _ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0))

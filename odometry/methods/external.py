@@ -11,11 +11,13 @@ from lidarslam.core.state import TRANSFORM
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.interface import Motion, StatefulOdometry
 
-# A gap is never shorter than this, nor than this many of the trajectory's usual steps.
-_LEAST_GAP_S = 1.0
-_LEAST_GAP_STEPS = 5.0
 # A scan this close to a given pose is covered by it, whatever lies on the other side.
 _SAME_INSTANT_S = 1e-3
+
+
+def longest_bridged_s(stamps: FloatArray) -> float:
+    """The longest interval of poses (N,) that is no gap: a second, or five of the usual steps if those are longer."""
+    return max(1.0, 5.0 * float(np.median(np.diff(stamps))))
 
 
 class ExternalOdometry(StatefulOdometry):
@@ -34,8 +36,7 @@ class ExternalOdometry(StatefulOdometry):
             raise InputError(f"a prior trajectory needs two poses or more, this one has {len(trajectory)}")
         self._trajectory = trajectory
         self._tolerance_s = tolerance_s
-        median_step_s = float(np.median(np.diff(trajectory.stamps)))
-        self._largest_interval_s = max(_LEAST_GAP_S, _LEAST_GAP_STEPS * median_step_s)
+        self._largest_interval_s = longest_bridged_s(trajectory.stamps)
         self._T_odom_prev = None
         self._scans = self._uncovered = 0
 

@@ -19,7 +19,8 @@ from lidarslam.core.geometry import is_rigid
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_kitti_poses, read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE, header, point_cloud
+from lidarslam.datasets.ros.bag_message import POINT_CLOUD2_TYPE
+from lidarslam.datasets.ros.made_messages import header, point_cloud
 from lidarslam.storage.directory import UNFINISHED, About
 
 from ..conftest import fuzzed, succeeds

@@ -26,7 +26,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.voxels import TileStore
-from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.odometry.methods.external import ExternalOdometry, longest_bridged_s
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
@@ -90,8 +90,6 @@ PEER_KEY = "peer"
 _MIN_POINTS = 10
 # Poses are extrapolated to stamps up to this far outside their instants: the longest sweep.
 _EXTRAPOLATION_S = 0.25
-# Poses farther apart than this, and than this many of their usual steps, are not interpolated.
-_LONGEST_GAP_S, _LONGEST_GAP_STEPS = 1.0, 5.0
 
 
 class Estimate(NamedTuple):
@@ -222,5 +220,4 @@ def is_covered(instants: FloatArray, stamps: FloatArray) -> NDArray[np.bool_]:
     steps = np.diff(instants)
     left = np.clip(np.searchsorted(instants, stamps, side="right") - 1, 0, len(steps) - 1)
     outside_s = np.maximum(instants[0] - stamps, stamps - instants[-1])
-    longest_s = max(_LONGEST_GAP_S, _LONGEST_GAP_STEPS * float(np.median(steps)))
-    return np.asarray((steps[left] <= longest_s) & (outside_s <= _EXTRAPOLATION_S))
+    return np.asarray((steps[left] <= longest_bridged_s(instants)) & (outside_s <= _EXTRAPOLATION_S))

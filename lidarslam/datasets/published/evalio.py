@@ -16,6 +16,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
+from lidarslam.core.text import first_few
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
@@ -32,7 +33,6 @@ MISSING_EXTRA = "evalio is not installed, which this data set needs; pip install
 DATA_SETS = tuple(one.name for one in CATALOGUE if one.reader == "evalio")
 # Published where programs cannot download.
 _BY_HAND = ("botanic_garden",)
-_LISTED = 6
 _POINT = attrgetter("x", "y", "z", "intensity", "row")
 _FIELDS = (*((name, "float64") for name in ("x", "y", "z", "intensity")), ("t", "ns"), ("row", "uint8"))
 # Their true orientations are missing or made up.
@@ -105,8 +105,7 @@ def absent(source: Path) -> str | None:
 
 def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
     names = [f"{PREFIX}{data_set}/{name}" for name in known.get(data_set, ())]
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f": {', '.join(names[:_LISTED])}{more}" if names else ""
+    return f": {first_few(names, 6)}" if names else ""
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

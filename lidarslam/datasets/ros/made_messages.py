@@ -11,10 +11,9 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
+from lidarslam.datasets.ros.bag_message import POINT_CLOUD2_TYPE, TRANSFORMS_TYPE
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 # Rotation first, as errors and velocities have it here, to translation first, as ROS has it.
 _ROS_ORDER = (3, 4, 5, 0, 1, 2)
 

@@ -15,13 +15,7 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.packets.ouster import (
-    OusterRecording,
-    find_metadata,
-    frames_of_packets,
-    packets_of,
-    read_sensor,
-)
+from lidarslam.datasets.packets.ouster import OusterRecording, find_metadata, frames_of_packets, packets_of, read_sensor
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import (
     CloudRecording,
