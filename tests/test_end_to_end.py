@@ -110,7 +110,9 @@ def test_by_default_scans_are_laid_on_a_map_and_a_pose_graph_is_built_on_request
     assert graph["edges"] == sum(line.startswith("EDGE_SE3:QUAT") for line in lines)
     assert outcome.summary.to_json()["loop_closures"] == 0
     assert np.percentile(map_errors(out, room, room_truth), 95) < 0.02
-    assert sorted(path.name for path in out.iterdir()) == sorted(set(FILES) - set(MAPS.values()))
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        {name for name in FILES if "/" not in name} - set(MAPS.values())
+    )
     assert not len(load_run(out).loops)
     assert "method: learned" in (out / "config.yaml").read_text()
     assert {row["status"] for row in scan_rows(out)} == {"ok"}
