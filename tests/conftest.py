@@ -196,6 +196,12 @@ def room() -> Room:
 
 
 @pytest.fixture(scope="session")
+def uneven_room(room: Room) -> Room:
+    """A room that does not look alike after half a turn."""
+    return Room(pillars=(*room.pillars, (5.3, 3.3, 1.5), (-1.0, -4.0, 0.9)))
+
+
+@pytest.fixture(scope="session")
 def drive() -> Drive:
     """A smooth path through the room: poses (N, 4, 4) at times (N,); about 0.8 m/s, turning 17 degrees a second."""
 

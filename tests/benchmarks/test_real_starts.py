@@ -31,20 +31,14 @@ def test_runs_near_the_end_are_as_short_as_half_of_what_is_wanted() -> None:
     assert [len(run) for run in runs] == [50] * 6 + [40, 30]
 
 
-def test_a_run_of_every_third_scan_has_as_many_scans() -> None:
+def test_a_run_of_every_third_scan_has_as_many_scans_and_a_short_recording_one_run() -> None:
     assert starts_of(scans=400, every=200, wanted=50, step=3) == [range(0, 150, 3), range(200, 350, 3)]
-
-
-def test_a_short_recording_has_one_run() -> None:
     assert starts_of(scans=12, every=10, wanted=50, step=1) == [range(12)]
 
 
-def test_a_path_that_is_too_long_is_so_in_percent_of_the_true_one() -> None:
-    assert length_error(_straight(55.0), _straight(50.0)) == pytest.approx(10.0)
-
-
-def test_a_sensor_that_stands_is_judged_by_the_shortest_length() -> None:
-    assert length_error(_straight(0.5), _straight(0.0)) == pytest.approx(10.0)
+@pytest.mark.parametrize(("found_mps", "true_mps"), [(55.0, 50.0), (0.5, 0.0)], ids=["too long", "standing"])
+def test_an_error_of_the_length_is_in_percent_of_the_true_or_the_shortest_one(found_mps, true_mps) -> None:
+    assert length_error(_straight(found_mps), _straight(true_mps)) == pytest.approx(10.0)
 
 
 def test_without_truth_there_is_no_ate_but_a_length() -> None:

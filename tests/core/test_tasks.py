@@ -57,16 +57,12 @@ def tasks(request: pytest.FixtureRequest) -> Iterator[Tasks]:
 
 
 @pytest.mark.long
-def test_results_are_in_order_whoever_is_first(tasks):
+def test_results_are_in_order_whoever_is_first_and_an_error_of_a_task_is_that_of_the_user(tasks):
     done: list[tuple[int, float]] = []
     assert list(tasks.run(square, [0.0, 1.0, 2.0, 3.0, 4.0], lambda *one: done.append(one))) == SQUARES
     assert sorted(done) == list(enumerate(SQUARES))
     assert list(tasks.run(square, [0.0, 1.0, 2.0, 3.0, 4.0], ahead=2)) == SQUARES
     assert list(tasks.run(square, [])) == []
-
-
-@pytest.mark.long
-def test_an_error_of_a_task_is_that_of_the_user(tasks):
     with pytest.raises(InputError, match="three 3"):
         list(tasks.run(fail_at_three, [1.0, 2.0, 3.0, 4.0]))
 
@@ -110,10 +106,7 @@ def test_the_message_names_the_extra(monkeypatch):
 
 def test_a_cluster_that_is_not_there_is_named():
     pytest.importorskip("ray")
-    with (
-        pytest.raises(ConfigError, match=r"--ray 127.0.0.1:9: no cluster answers there"),
-        open_tasks(Where(cluster="127.0.0.1:9")),
-    ):
+    with pytest.raises(ConfigError, match=r"--ray 127.0.0.1:9: no cluster"), open_tasks(Where(cluster="127.0.0.1:9")):
         pass
 
 

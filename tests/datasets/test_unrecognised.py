@@ -40,21 +40,18 @@ def test_a_run_is_no_recording_and_its_recording_is_named(tmp_path: Path, name: 
     assert f"lidarslam view {tmp_path / 'run'} shows it" in said
 
 
-def test_a_merge_is_no_recording(tmp_path: Path) -> None:
+def test_neither_a_merge_nor_a_comparison_is_a_recording(tmp_path: Path) -> None:
     write(tmp_path / "map.ply", tmp_path / "pose_graph.g2o")
     write(tmp_path / "config.yaml", content=b"run:\n  version: 0.1.0\n  sources:\n  - a\n\n# Settings\nreader:\n")
     assert f"is a merge directory, not a recording. lidarslam view {tmp_path} shows it" in refused(tmp_path)
+    write(tmp_path / "compared" / "comparison.json")
+    assert "is a comparison, not a recording" in refused(tmp_path / "compared")
 
 
 def test_a_bag_in_the_folder_of_a_run_is_a_recording(tmp_path: Path) -> None:
     write(tmp_path / "site.mcap", tmp_path / "trajectory.tum")
     write(tmp_path / "config.yaml", content=b"run:\n  version: 0.1.0\n")
     assert choose_reader(tmp_path / "site.mcap") == "rosbag"
-
-
-def test_a_comparison_is_no_recording(tmp_path: Path) -> None:
-    write(tmp_path / "compared" / "comparison.json")
-    assert "is a comparison, not a recording" in refused(tmp_path / "compared")
 
 
 def test_the_drives_of_a_date_are_named(tmp_path: Path) -> None:

@@ -100,13 +100,7 @@ def test_points_times_rings_and_intensities_of_a_capture(capture):
     for scan in scans:
         assert_as_measured(scan, sent)
     assert 384 * len(sent) - sum(len(scan) for scan in scans) in (0, 1)  # the library may drop one at azimuth zero
-
-
-def test_a_part_of_a_capture(capture):
-    path, _ = capture
-    recording = open_recording(path)
-    stamps = [scan.stamp for scan in recording.scans()]
-    assert [scan.stamp for scan in recording.scans(1, None, 2)] == stamps[1::2]
+    assert [scan.stamp for scan in recording.scans(1, None, 2)] == [scan.stamp for scan in scans][1::2]
     untimed = open_recording(path, ReaderConfig(time_reference="none"))
     assert next(untimed.scans()).time_offsets is None
     assert untimed.describe().point_time is None
@@ -190,11 +184,7 @@ def test_damaged_captures(capture, tmp_path):
     assert len(list(open_recording(cut).scans())) == 2
     cut.write_bytes(whole[: 24 + 200 * (16 + 42 + 1206) + 7])  # within the head of a packet
     assert len(list(open_recording(cut).scans())) == 2
-    for content, said in (
-        (b"", "no capture that can be read"),
-        (b"nonsense" * 50, "editcap -F pcap"),
-        (whole[:24], "no packets"),
-    ):
+    for content, said in ((b"", "no capture that"), (b"nonsense" * 50, "editcap -F pcap"), (whole[:24], "no packets")):
         cut.write_bytes(content)
         with pytest.raises(InputError, match=said):
             open_recording(cut).describe()

@@ -133,10 +133,7 @@ def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        lambda directory: directory.write_text(CONFIG, "run:\n  version: 1\n"),
-        lambda directory: TileWriter(directory)._begin(),
-    ],
+    [lambda directory: directory.write_text(CONFIG, "run:\n"), lambda directory: TileWriter(directory)._begin()],
 )
 def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(tmp_path, caplog, change):
     """What lies there at an instant is what a run leaves that is killed then."""

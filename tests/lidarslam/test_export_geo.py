@@ -100,7 +100,10 @@ def test_the_path_for_maps_on_the_web(run, tmp_path):
     np.testing.assert_allclose(points, np.array(feature["geometry"]["coordinates"])[:, :2], atol=1e-9)
 
 
-def test_what_cannot_be_placed_is_refused(run, tmp_path, monkeypatch):
+def test_what_cannot_be_placed_is_refused(run, small_recording, tmp_path, monkeypatch):
+    """GNSS needs positions and the graph."""
+    assert "has no GNSS positions" in refused("run", small_recording, "--out", tmp_path / "run", "--gnss")
+    assert lidarslam("run", small_recording, "--gnss", "--no-pose-graph").exit_code == 2
     succeeds("export-geo", run, "--out", tmp_path / "utm")
     assert "--overwrite" in refused("export-geo", run, "--out", tmp_path / "utm")
     few = read_tum(run / "trajectory.tum").select(slice(0, 12))
@@ -129,8 +132,3 @@ def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path, room):
     written = read_tum(out / "utm" / "trajectory_utm.tum")
     np.testing.assert_allclose(written.positions, truth[:, :3, 3], atol=0.05)
     assert (out / "utm" / "map.laz").exists()
-
-
-def test_gnss_needs_positions_and_the_graph(small_recording, tmp_path):
-    assert "has no GNSS positions" in refused("run", small_recording, "--out", tmp_path / "run", "--gnss")
-    assert lidarslam("run", small_recording, "--gnss", "--no-pose-graph").exit_code == 2

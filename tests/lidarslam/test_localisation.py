@@ -88,16 +88,13 @@ def errors_of(localised: list[ScanEstimate], truth: FloatArray) -> tuple[FloatAr
     return errors(np.array([result.T_world_lidar for result in localised]), inverse(truth[0]) @ truth)
 
 
-def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(room_scans, room_truth, rng):
+def test_the_odometrys_own_path_is_its_motions_or_the_mappers_where_it_measured_nothing(room_scans, room_truth, rng):
     errors = exp(rng.normal(0.0, [0.01] * 3 + [0.02] * 3, (len(room_scans) - 1, 6)))
     wrong = [np.eye(4), *(room_truth.relative_motions() @ errors)]
     localised = localise_all(room_scans, [Motion(T, 100) for T in wrong])
     chained = list(accumulate(wrong, np.matmul))
     np.testing.assert_allclose([found.T_odom_lidar for found in localised], chained, atol=1e-9)
     assert np.linalg.norm(chained[-1][:3, 3] - localised[-1].T_world_lidar[:3, 3]) > 0.02, "but not the pose"
-
-
-def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(room_scans, room_truth):
     nothing = [Motion(np.eye(4), 0, "covered") for _ in room_scans]
     localised = localise_all(room_scans, nothing)
     moved = np.linalg.norm(localised[-1].T_odom_lidar[:3, 3])

@@ -23,14 +23,8 @@ def record(folder: Path, room: Any, drive: Drive) -> Path:
 
 
 @pytest.fixture(scope="module")
-def room(room: Any) -> Any:
-    """A room that does not look alike after half a turn."""
-    return type(room)(pillars=(*room.pillars, (5.3, 3.3, 1.5), (-1.0, -4.0, 0.9)))
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive) -> Path:
-    return record(tmp_path_factory.mktemp("recordings") / "room", room, drive)
+def recording(tmp_path_factory: pytest.TempPathFactory, uneven_room: Any, drive: Drive) -> Path:
+    return record(tmp_path_factory.mktemp("recordings") / "room", uneven_room, drive)
 
 
 @pytest.fixture(scope="module")

@@ -88,23 +88,15 @@ def test_each_direction_is_believed_as_its_own_covariance_says():
         assert np.delete(sigmas, 3).max() < 2e-4
 
 
-def test_an_odometry_is_believed_less_than_it_says_by_the_caution():
-    motion = MOVED @ exp(OFF)
-    cautious = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.01), caution=5.0))
-    told = predicted(measured(motion, VELOCITY + 1.0, isotropic(0.05)))
-    for name, value in vars(cautious).items():
-        np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
-
-
-def test_an_odometry_that_does_not_say_is_believed_as_configured():
+def test_an_odometry_is_believed_less_than_it_says_by_the_caution_or_as_configured_where_it_does_not_say():
     config = MappingConfig(prior_rotation_deg=2.0, prior_translation_m=0.3)
     sigmas = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)
-    motion = MOVED @ exp(OFF)
-    silent = predicted(measured(motion, VELOCITY + 1.0), config)
-    told = predicted(measured(motion, VELOCITY + 1.0, np.diag(sigmas**2)))
-    for name, value in vars(silent).items():
-        np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
-    other = predicted(measured(motion, VELOCITY + 1.0), MappingConfig(prior_translation_m=0.01))
+    moved = MOVED @ exp(OFF), VELOCITY + 1.0
+    cautious, silent = predicted(Prior(*moved, isotropic(0.01), caution=5.0)), predicted(measured(*moved), config)
+    for found, told in ((cautious, isotropic(0.05)), (silent, np.diag(sigmas**2))):
+        for name, value in vars(predicted(measured(*moved, told))).items():
+            np.testing.assert_allclose(getattr(found, name), value, atol=1e-12)
+    other = predicted(measured(*moved), MappingConfig(prior_translation_m=0.01))
     assert not np.allclose(silent.T_world_lidar, other.T_world_lidar, atol=1e-4)
 
 
@@ -253,12 +245,13 @@ def exponentials(points: FloatArray, offsets: FloatArray, velocity: FloatArray) 
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-7, 0.0])
-def test_equals_the_exponential_of_every_points_time(rng, scale):
+def test_equals_the_exponential_of_every_points_time_whose_logarithm_is_the_velocity(rng, scale):
     points = rng.normal(0.0, 10.0, (200, 3))
     offsets = rng.uniform(-0.1, 0.1, 200)
     velocity = np.array([3.0 * scale, -2.0 * scale, 5.0 * scale, 10.0, 2.0, -1.0])
     expected = exponentials(points, offsets, velocity)
     np.testing.assert_allclose(deskew(points, offsets, velocity, velocity), expected, atol=1e-9)
+    np.testing.assert_allclose(body_velocity(exp(0.3 * velocity), 0.3), velocity, atol=1e-9)
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.05, 0.05), (0.0, 0.1)])
@@ -268,11 +261,6 @@ def test_points_before_and_after_the_stamp_move_with_their_own_velocity(rng, low
     ends = [exponentials(points, offsets, velocity) for velocity in (before, after)]
     expected = np.where(offsets[:, None] < 0.0, *ends)
     np.testing.assert_allclose(deskew(points, offsets, before, after), expected, atol=1e-9)
-
-
-def test_a_velocity_makes_its_motion_in_its_time(rng):
-    velocity = rng.normal(size=6)
-    np.testing.assert_allclose(body_velocity(exp(0.3 * velocity), 0.3), velocity, atol=1e-9)
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])

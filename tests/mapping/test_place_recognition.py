@@ -99,15 +99,12 @@ def test_shapes_of_what_points_lie_on():
     assert (found.kinds[z == 2.0] == 0).all()  # a single ring of a sensor looks like this
 
 
-def test_the_range_image_holds_the_nearest_range():
+def test_the_range_image_holds_the_nearest_range_without_points_out_of_range_or_not_finite():
     points = np.array([[4.0, 0.01, 0.01], [6.0, 0.015, 0.015], [0.0, -7.0, 0.01]])
     found = SparseSubmap.of(points, 60.0)
     image = found.range_image
     assert found.nearest_ranges(np.array([[9.0, 0.02, 0.02], [5.0, 5.0, 0.0]])) == pytest.approx([4.0, 0.0], abs=0.01)
     assert sorted(image[image > 0.0].tolist()) == pytest.approx([4.0, 7.0], abs=0.01)
-
-
-def test_points_out_of_range_or_not_finite_are_left_out():
     points = np.array([[0.1, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 1.0, 1.0], [99.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])
     assert SparseSubmap.of(points, 60.0).points == pytest.approx(np.array([[5.0, 0.0, 0.0]]))
 

@@ -57,15 +57,11 @@ def test_only_points_within_range_are_left(rng):
     assert 9.8 < ranges.max() < 10.0
 
 
-def test_times_stay_with_their_points(rng):
+def test_times_and_elevations_stay_with_their_points(rng):
     scan = shell(rng, 5.0)
     sampled = sample(scan, cell_m=0.3, min_range_m=4.7, keypoints=150)
     for sweep in (sampled.sweep, sampled.keypoints):
         np.testing.assert_array_equal(sweep.points, scan.points[np.round(1e6 * sweep.times).astype(int)])
-
-
-def test_elevations_are_those_of_their_points(rng):
-    sampled = sample(shell(rng, 5.0), cell_m=0.3)
     upward = np.hypot(sampled.sweep.points[:, 0], sampled.sweep.points[:, 1])
     np.testing.assert_allclose(sampled.elevations, np.arctan2(sampled.sweep.points[:, 2], upward), atol=1e-12)
 

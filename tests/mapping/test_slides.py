@@ -99,11 +99,8 @@ def test_a_slide_at_one_place_is_found_there(scans):
     assert stretch.shift_m == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_vehicle_that_drives_ahead_does_not_contradict(street):
+def test_neither_a_vehicle_that_drives_ahead_nor_a_colonnade_that_repeats_itself_contradicts(street):
     assert found(record(street, ahead=8.0), TRUE) == ()
-
-
-def test_a_colonnade_that_repeats_itself_does_not_contradict(street):
     assert found(record(replace(street, pillars=COLONNADE)), TRUE) == ()
 
 

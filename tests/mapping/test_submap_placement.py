@@ -127,15 +127,12 @@ def as_registered(
     return placement.as_registered(measured, *ends, list(way))
 
 
-def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip):
+def test_where_the_map_held_the_place_the_trajectory_measures_the_closure_wherever_the_submap_was_laid(round_trip):
+    """In the end the local map was drawn anew before the last ten scans, which are registered to its surfaces."""
     found = as_registered(closure(round_trip, NEAR), round_trip, 100.0)
     np.testing.assert_allclose(found.T_first_second, inverse(round_trip[0]) @ round_trip[-1], atol=1e-12)
     assert found.accepted
     assert np.linalg.eigvalsh(found.covariance - REGISTERED).min() > 0.0, "both registrations err"
-
-
-def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip):
-    """The local map was drawn anew before the last ten scans, which are registered to its surfaces."""
     T_odom_first = round_trip[0] @ exp(0.5 * NEAR)
     drawn = Drawn(len(round_trip) - 10, np.array([0]), 1, T_odom_first[None])
     found = as_registered(closure(round_trip, NEAR), round_trip, 30.0, drawn=(drawn,))

@@ -258,19 +258,15 @@ def test_where_much_has_no_normal_nothing_is_left_open_for_all_one_knows(corrido
     assert len(alignment.find_degeneracy(corridor_walls, 4000, sweep)) == count
 
 
-def test_a_motion_goes_on_along_open_directions_and_only_there(corridor_walls):
+def test_motion_and_covariance_are_the_expected_ones_along_open_directions_and_only_there(corridor_walls):
     degeneracy = alignment.find_degeneracy(corridor_walls, 4000, images())
     aligned, expected = exp([0.01, 0.0, 0.2, 0.02, -0.1, 0.05]), exp([0.0, 0.1, 0.19, 0.4, 0.3, 0.0])
     motion = alignment.replaced_along(aligned, expected, degeneracy)
     change = log(motion @ inverse(aligned))
     np.testing.assert_allclose(change[[0, 1, 2, 4, 5]], 0.0, atol=1e-9)
     assert log(expected @ inverse(motion))[3] == pytest.approx(0.0, abs=0.01)
-
-
-def test_the_covariance_is_the_expected_one_along_and_the_seen_one_across(corridor_walls):
-    expected = np.diag([0.02, 0.02, 0.02, 0.3, 0.3, 0.3]) ** 2
-    degeneracy = alignment.find_degeneracy(corridor_walls, 4000, images())
-    joined = np.linalg.inv(alignment.joined_information(corridor_walls, expected, degeneracy))
+    covariance = np.diag([0.02, 0.02, 0.02, 0.3, 0.3, 0.3]) ** 2
+    joined = np.linalg.inv(alignment.joined_information(corridor_walls, covariance, degeneracy))
     assert np.sqrt(joined[3, 3]) == pytest.approx(0.3)
     free = np.ix_([0, 1, 2, 4, 5], [0, 1, 2, 4, 5])
     np.testing.assert_allclose(joined[free], np.linalg.inv(corridor_walls[free]), rtol=1e-3, atol=1e-9)

@@ -73,12 +73,13 @@ def test_motions_are_found_from_wrong_guesses(box_room):
     assert all(motion.points_used > 1000 for motion in (first, *motions))
 
 
-def test_an_empty_scan_is_a_failure_and_the_next_motion_goes_past_it(box_room):
+def test_an_empty_scan_and_one_that_is_not_later_are_failures_and_the_next_motion_goes_past_them(box_room):
     scans = box_room.scans(4, TWIST)
     scans[2] = Scan(np.zeros((0, 3)), scans[2].stamp)
     motions = estimates(scans, Told(moved(), moved() @ moved()))
     assert_failed(motions[2], "empty")
     assert_close(motions[3], moved() @ moved())
+    assert_failed(estimates([scans[0], scans[0]], Told(moved()))[1], "not later than the one before")
 
 
 def test_another_place_is_a_failure_and_the_next_pair_works_again(box_room):
@@ -89,11 +90,6 @@ def test_another_place_is_a_failure_and_the_next_pair_works_again(box_room):
     for motion in (motions[2], motions[4]):
         assert_failed(motion, "does not fit the last one")
     assert_close(motions[5], moved())
-
-
-def test_a_scan_that_is_not_later_is_a_failure(box_room):
-    scan = box_room.scans(1, TWIST)[0]
-    assert_failed(estimates([scan, scan], Told(moved()))[1], "not later than the one before")
 
 
 @pytest.mark.parametrize(("speed", "dropped"), [(1.5, 0), (1.0, 1)])

@@ -233,16 +233,12 @@ def test_confidence_is_best_at_the_standard_deviation_of_a_laplace_distribution(
     assert float(gradient) == pytest.approx(5.0, abs=0.02)
 
 
-def shift(x: float, y: float) -> Tensor:
-    """(1, 4, 4) translations."""
-    return exp(torch.tensor([[0.0, 0.0, 0.0, x, y, 0.3]]))
-
-
 @pytest.mark.parametrize(("part", "size", "target", "shares"), [
     ("turn", (WIDTH,), yaw(3.0), {3: 1.0}), ("turn", (WIDTH,), yaw(3.25), {3: 0.75, 4: 0.25}),
     ("turn", (WIDTH,), yaw(-0.25), {WIDTH - 1: 0.25, 0: 0.75}), ("turn", (WIDTH,), yaw(-11.5), {12: 0.5, 13: 0.5}),
-    ("shift", (37, 37), shift(2.0, -1.0), {(17, 20): 1.0}),
-    ("shift", (37, 37), shift(0.25, 0.5), {(18, 18): 0.375, (18, 19): 0.125, (19, 18): 0.375, (19, 19): 0.125}),
+    ("shift", (37, 37), exp(torch.tensor([[0.0, 0.0, 0.0, 2.0, -1.0, 0.3]])), {(17, 20): 1.0}),
+    ("shift", (37, 37), exp(torch.tensor([[0.0, 0.0, 0.0, 0.25, 0.5, 0.3]])),
+     {(18, 18): 0.375, (18, 19): 0.125, (19, 18): 0.375, (19, 19): 0.125}),
 ])  # fmt: skip
 def test_turn_and_translation_are_shared_by_the_columns_and_cells_around_them(part, size, target, shares):
     """The loss of even scores, whose gradient pulls at those of the target."""

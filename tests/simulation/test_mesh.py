@@ -80,7 +80,7 @@ def test_cylinders_are_closed_and_hold_as_much_as_round_ones(cylinders):
     np.testing.assert_allclose(areas(mesh).reshape(-1, per_solid).sum(axis=1), round_areas, rtol=0.004)
 
 
-def test_height_field_is_the_surface_of_height_at(field, rng):
+def test_height_field_is_the_surface_of_height_at_which_goes_on_level_outside_its_grid(field, rng):
     mesh = height_field_mesh(field)
     assert mesh.triangles.shape == (2 * 5 * 8, 3)
     np.testing.assert_array_equal(mesh.vertices[:, 2], field.heights.ravel())
@@ -89,6 +89,8 @@ def test_height_field_is_the_surface_of_height_at(field, rng):
     np.testing.assert_allclose(field.height_at(points[:, :2]), points[:, 2], atol=1e-12)
     np.testing.assert_allclose(field.height_at(mesh.vertices[:, :2]), mesh.vertices[:, 2], atol=1e-12)
     np.testing.assert_allclose(normals_of(mesh)[:, 2], field.cell_m**2)  # it faces up and covers its grid once
+    small = HeightField(np.zeros(2), 1.0, np.array([[0.0, 1.0], [2.0, 3.0]]))
+    np.testing.assert_allclose(small.height_at(np.array([[-5.0, -5.0], [9.0, 9.0], [9.0, 0.0]])), [0.0, 3.0, 2.0])
 
 
 def test_world_mesh_holds_everything_that_stands(boxes, cylinders, field):
@@ -167,19 +169,10 @@ def test_rays_along_an_axis_meet_boxes():
     np.testing.assert_array_equal(distances, [4.0, np.inf, np.inf, np.inf])  # the last starts inside
 
 
-def test_outside_its_grid_a_field_goes_on_level():
-    field = HeightField(np.zeros(2), 1.0, np.array([[0.0, 1.0], [2.0, 3.0]]))
-    np.testing.assert_allclose(field.height_at(np.array([[-5.0, -5.0], [9.0, 9.0], [9.0, 0.0]])), [0.0, 3.0, 2.0])
-
-
-@pytest.fixture
-def mover() -> Mover:
+def test_a_mover_goes_round_at_its_speed_and_looks_where_it_goes():
     """Round a rectangle of 10 m by 5 m on a slope, counter-clockwise."""
     corners = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 1.0], [10.0, 5.0, 1.0], [0.0, 5.0, 0.0]])
-    return Mover(UNIT_BOX, corners, 2.0, 3.0)
-
-
-def test_a_mover_goes_round_at_its_speed(mover):
+    mover = Mover(UNIT_BOX, corners, 2.0, 3.0)
     period = (2.0 * 5.0 + 2.0 * np.sqrt(101.0)) / mover.speed_mps
     poses = mover.pose_at(np.linspace(0.0, 3.0 * period, 40001))
     assert is_rigid(poses)
@@ -188,9 +181,6 @@ def test_a_mover_goes_round_at_its_speed(mover):
     expected = 3.0 * period / 40000 * mover.speed_mps
     assert steps.max() <= expected * (1.0 + 1e-6)
     np.testing.assert_allclose(np.median(steps), expected)
-
-
-def test_a_mover_looks_where_it_goes(mover):
     poses = mover.pose_at(np.array([0.0, 4.5, 7.5]))
     np.testing.assert_allclose(poses[0, :3, 3], 3.0 / np.sqrt(101.0) * np.array([10.0, 0.0, 1.0]))
     np.testing.assert_allclose(poses[:, :2, 0], [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]], atol=1e-12)

@@ -39,9 +39,8 @@ def test_the_draw_of_a_number_does_not_change():
 
 def test_a_number_is_the_same_whatever_comes_before_it(drawn):
     (alone,) = mixture(1, SCANS, SEED, first=1)
-    again, there = alone, drawn[1]
     assert (alone.name, alone.first) == (drawn[1].name, drawn[1].first)
-    np.testing.assert_array_equal(again.T_body_lidar, there.T_body_lidar)
+    np.testing.assert_array_equal(alone.T_body_lidar, drawn[1].T_body_lidar)
     scan, other = next(iter(alone.scans())), next(iter(drawn[1].scans()))
     assert scan.points.tobytes() == other.points.tobytes()
     assert scan.time_offsets.tobytes() == other.time_offsets.tobytes()

@@ -58,30 +58,24 @@ def test_only_what_was_seen_is_kept():
     assert len(sample_seen(SQUARE, SeenSurfaces(), 0.1).points) == 0
 
 
-def test_the_far_side_of_a_wall_stays_out():
+def test_the_far_side_of_a_wall_stays_out_and_normals_are_of_the_side_that_was_seen():
     wall = box_mesh(Boxes(np.array([[0.0, 0.0, 1.0]]), np.array([[0.05, 4.0, 1.0]]), np.eye(3)[None]))
     seen, _ = see([0.05], np.arange(-4.0, 4.0, 0.1), np.arange(0.0, 2.0, 0.1), normal=(1.0, 0.0, 0.0))
     sampled, normals = sample_seen(wall, seen, spacing_m=0.05)
     np.testing.assert_allclose(sampled[:, 0], 0.05, atol=1e-12)
     np.testing.assert_allclose(normals, np.tile([1.0, 0.0, 0.0], (len(normals), 1)), atol=1e-12)
-
-
-def test_normals_are_of_the_side_that_was_seen():
     seen, _ = see(ALL, ALL, [0.0], from_behind=True)  # a ceiling
     normals = sample_seen(SQUARE, seen, spacing_m=0.2).normals
     np.testing.assert_allclose(normals, np.tile([0.0, 0.0, -1.0], (len(normals), 1)), atol=1e-12)
 
 
-def test_the_map_covers_the_scans(recording, yard_map):
+def test_the_map_covers_the_scans_and_movers_are_not_in_it(recording, yard_map):
     sweep = recording.scan(80)
     still = ~sweep.moving & np.isfinite(sweep.true_ranges)
     gaps, _ = KDTree(yard_map.points).query(in_world(recording, sweep.scan)[still])
     assert np.quantile(gaps, 0.98) < 0.25
     inside = np.linalg.norm(yard_map.points[:, :2], axis=1).min()
     assert inside > 2.5  # the middle block's inside is not seen
-
-
-def test_movers_are_not_in_the_map(recording, yard_map):
     still = replace(recording, world=replace(recording.world, movers=()))
     without = reference_map(still, spacing_m=0.15, step=40)
     gaps, _ = KDTree(without.points).query(yard_map.points)

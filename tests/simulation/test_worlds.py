@@ -274,25 +274,16 @@ def test_a_crowd_is_around_the_start_and_half_of_it_goes_along(seed: int) -> Non
     assert apart[:, times > 1.0].min() > world.route.free_side_m
 
 
-def town_plan(seed: int) -> tuple[FloatArray, list[tuple[int, int]], list[int]]:
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_lap_takes_every_street_once_in_either_direction_and_corners_that_a_car_can_take(seed):
     rng = np.random.default_rng(seed)
     nodes, streets = town.draw_network(rng)
-    return nodes, streets, town.draw_tour(rng, len(nodes), streets)
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_lap_takes_every_street_once_in_either_direction(seed):
-    nodes, streets, tour = town_plan(seed)
+    tour = town.draw_tour(rng, len(nodes), streets)
     driven = Counter(pairwise([*tour, tour[0]]))
     assert driven == Counter([*streets, *(street[::-1] for street in streets)])
     assert not any(before == after for before, after in zip(tour, [*tour[2:], *tour[:2]], strict=True))  # no turn round
     steps = nodes[tour] - np.roll(nodes[tour], 1, axis=0)
     assert 9_000.0 < np.linalg.norm(steps, axis=1).sum() < 13_000.0
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_streets_meet_at_corners_that_a_car_can_take(seed):
-    nodes, streets, _ = town_plan(seed)
     assert len(streets) < 60
     assert np.bincount(np.ravel(streets)).min() >= 2
     for node in range(len(nodes)):
@@ -301,26 +292,17 @@ def test_streets_meet_at_corners_that_a_car_can_take(seed):
         assert np.diff([*angles, angles[0] + 2.0 * np.pi]).min() > np.deg2rad(40.0)
 
 
-@pytest.fixture(scope="module")
-def small_town() -> World:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(town, "_ROWS", 3)
-        patch.setattr(town, "_LEFT_OUT", 2)
-        return town.town(0)
-
-
 @pytest.mark.slow
-def test_nothing_stands_in_the_way_of_the_car(small_town):
+def test_a_car_goes_round_and_round_and_nothing_stands_in_its_way(monkeypatch):
+    monkeypatch.setattr(town, "_ROWS", 3)
+    monkeypatch.setattr(town, "_LEFT_OUT", 2)
+    small_town = town.town(0)
     lane = subdivide_loop(small_town.route.waypoints, 1.0)
     clear = Caster(small_town).distances(lane + np.array([0.0, 0.0, town.FREE_SIDE_M]))
     assert clear.min() > town.FREE_SIDE_M - 0.6  # over the ground's own unevenness
     assert len(small_town.boxes) > 1000
     assert (small_town.cylinders.radii == 0.33).sum() > 20  # wheels
     assert small_town.movers
-
-
-@pytest.mark.slow
-def test_a_car_goes_round_and_round(small_town):
     motion = motion_along_route("car-fast", small_town, 0)
     way = np.linalg.norm(np.diff(motion.base[:, :2], axis=0), axis=1)
     assert way.max() * (len(way) / motion.duration_s) < 14.5

@@ -20,10 +20,6 @@ def nothing_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def _datasets(*arguments: str) -> Result:
-    return lidarslam("datasets", *arguments)
-
-
 def _line(result: Result, name: str) -> str:
     return next(line for line in result.output.splitlines() if line.startswith(f"{name} "))
 
@@ -46,28 +42,29 @@ def test_the_list_counts_recordings_on_disk(tmp_path: Path) -> None:
     (tmp_path / "published" / "hilti_2022" / "basement_2").mkdir(parents=True)
     (tmp_path / "disk" / "kitti" / "2011_09_26" / "drive_a" / "velodyne_points" / "data").mkdir(parents=True)
     (tmp_path / "disk" / "other" / "sequences").mkdir(parents=True)
-    result = _datasets("disk")
+    result = lidarslam("datasets", "disk")
     assert result.exit_code == 0
     assert _line(result, "hilti_2022").endswith("yes  1 recording")
     assert _line(result, "kitti_raw").endswith("1 recording")
     assert _line(result, "kitti_odometry").endswith("1 recording")
     assert _line(result, "boreas").endswith("-")
-    assert _line(_datasets(), "kitti_raw").endswith("-")
+    assert _line(lidarslam("datasets"), "kitti_raw").endswith("-")
 
 
 def test_one_data_set_has_sequences_and_commands(tmp_path: Path) -> None:
     pytest.importorskip("evalio")
-    (tmp_path / "published" / "hilti_2022" / "basement_2").mkdir(parents=True)
-    lines = {line[:11].strip(): line[11:] for line in _datasets("hilti_2022").output.splitlines()[1:]}
+    downloaded = tmp_path / "published" / "hilti_2022" / "basement_2"
+    downloaded.mkdir(parents=True)
+    lines = {line[:11].strip(): line[11:] for line in lidarslam("datasets", "hilti_2022").output.splitlines()[1:]}
     assert lines["download"] == "evalio dl hilti_2022/construction_upper_level_1"
     assert lines["run"] == "lidarslam run evalio:hilti_2022/construction_upper_level_1"
     assert lines["sensor"] == "Hesai PandarXT-32"
-    assert str(tmp_path / "published" / "hilti_2022" / "basement_2") in _datasets("evalio:hilti_2022").output
+    assert str(downloaded) in lidarslam("datasets", "evalio:hilti_2022").output
 
 
 def test_without_evalio_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "evalio", None)
-    output = _datasets("oxford_spires").output
+    output = lidarslam("datasets", "oxford_spires").output
     assert "pip install 'lidarslam[datasets]'" in output
     assert "evalio dl oxford_spires/SEQUENCE" in output
 
@@ -75,11 +72,11 @@ def test_without_evalio_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 def test_json_has_all_facts(tmp_path: Path) -> None:
     folder = tmp_path / "drive_a"
     (folder / "velodyne_points" / "data").mkdir(parents=True)
-    content = {one["name"]: one for one in json.loads(_datasets("--json", "drive_a").output)}
+    content = {one["name"]: one for one in json.loads(lidarslam("datasets", "--json", "drive_a").output)}
     assert len(content) == len(CATALOGUE)
     assert content["kitti_raw"]["on_disk"] == [str(folder)]
     assert content["enwide"]["truth"] == "total station, positions alone"
-    (one,) = json.loads(_datasets("kitti_raw", "--json").output)
+    (one,) = json.loads(lidarslam("datasets", "kitti_raw", "--json").output)
     assert one["on_disk"] == []
 
 

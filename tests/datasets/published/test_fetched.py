@@ -74,7 +74,7 @@ def test_what_is_a_url() -> None:
     assert fetched("office.mcap") == Path("office.mcap")
 
 
-def test_a_folder_is_fetched_once_from_a_server(server: str, recording: Path) -> None:
+def test_a_folder_is_fetched_once_from_a_server_or_this_machine(server: str, recording: Path) -> None:
     path = fetched(f"{server}/walk/")
     assert path.name == "walk"
     assert path.is_relative_to(cache_folder())
@@ -83,9 +83,6 @@ def test_a_folder_is_fetched_once_from_a_server(server: str, recording: Path) ->
     asked = len(Quiet.asked)
     assert fetched(f"{server}/walk/") == path
     assert len(Quiet.asked) == asked
-
-
-def test_a_folder_is_fetched_from_this_machine(recording: Path) -> None:
     url = f"file://{recording}"
     assert _same_files(fetched(url), recording)
     assert fetched(Path(url)) == fetched(url)

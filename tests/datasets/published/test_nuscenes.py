@@ -90,11 +90,8 @@ def test_the_scene_has_to_be_chosen(nuscenes: SimpleNamespace) -> None:
 def test_a_sweep_that_is_not_there_is_left_out(nuscenes: SimpleNamespace) -> None:
     next((nuscenes.root / "sweeps" / "LIDAR_TOP").iterdir()).unlink()
     faults = Faults()
-    counts = [
-        len(list(open_recording(nuscenes.root, ReaderConfig(sequence=name)).scans(faults=faults)))
-        for name in ("61", "103")
-    ]
-    assert (sum(counts), faults.left_out) == (11, 1)
+    recordings = (open_recording(nuscenes.root, ReaderConfig(sequence=name)) for name in ("61", "103"))
+    assert (sum(len(list(one.scans(faults=faults))) for one in recordings), faults.left_out) == (11, 1)
 
 
 @pytest.mark.parametrize("place", ["../../outside", "/outside", "samples/../../outside"])
