@@ -47,7 +47,7 @@ _TOPICS_LISTED = 20
 _NEGLIGIBLE = 0.05
 # Number of pairs of messages that are compared at their seams, spread over this many of the first.
 _PAIRS, _LOOKED_AT = 40, 600
-_FRAMES_LOOKED_AT, _STAMPS_LOOKED_AT = 10, 50
+_FRAMES_LOOKED_AT, _STAMPS_LOOKED_AT = 10, 20
 
 _DAMAGED = "damaged places in the bag were met, where reading its file stopped"
 _MISSING = "scans are missing that the index lists"
