@@ -24,14 +24,14 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
 from lidarslam.compare.peers.estimation import describe_peer, execute_peer, peer_named
-from lidarslam.config.settings import Config, dump_yaml, read_yaml
+from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.files import open_own, remove_partial_files
 from lidarslam.core.json_text import read_json
 from lidarslam.core.tasks import bound
 from lidarslam.datasets.recording import Recording
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
-from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.request import RunRequest, describe_run, written_request
 from lidarslam.run.run import execute
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import SUMMARY, RunDirectory
@@ -232,14 +232,10 @@ def finished_before(run: MethodRun) -> MethodResult | None:
     try:
         folder = run.request.out
         result = MethodResult(run.name, **read_json(folder / PROCESS, _SHAPE))
-        tree = read_yaml(folder / files.CONFIG)
-        was_run = tree.pop(files.RUN_SECTION)
-        if run.request.config.reader.elevation_correction_deg == "auto":
-            tree["reader"]["elevation_correction_deg"] = "auto"  # config.yaml has the estimated value
-        is_same = Config.model_validate(tree) == run.request.config
+        was_run, was = written_request(folder, run.request.config)
         peer = None if run.peer is None else peer_named(run.peer)
         described = describe_run(run.request) if peer is None else describe_peer(run.request, peer, run.range_m)
-        is_same = is_same and all(was_run.get(key) == value for key, value in described.items())
+        is_same = was == run.request.config and all(was_run.get(key) == value for key, value in described.items())
     except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
     return _collect(run, result) if is_same and result.status in WHOLE else None

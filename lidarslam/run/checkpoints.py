@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.config.settings import CheckpointConfig, Config, read_yaml
+from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, write_state
@@ -19,7 +19,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.request import RunRequest, describe_run, written_request
 from lidarslam.run.summary import ScanLog
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RERUN, About, Unfinished
@@ -52,16 +52,13 @@ def lost_when_finished(request: RunRequest) -> bool | None:
     if About.read(out) is not None or not (out / files.CONFIG).is_file() or not (out / files.SUMMARY).is_file():
         return None
     try:
-        tree = read_yaml(out / files.CONFIG)
-        was_run = tree.pop(files.RUN_SECTION)
-        was = Config.model_validate(tree).model_dump(exclude=WITHOUT_EFFECT)
+        was_run, was = written_request(out, request.config)
         summary = read_summary(out)
         lost = where_astray(summary) is not None
     except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
-    if request.config.reader.elevation_correction_deg == "auto":
-        was["reader"]["elevation_correction_deg"] = "auto"  # config.yaml has the estimated value
-    if was_run != describe_run(request) or was != request.config.model_dump(exclude=WITHOUT_EFFECT):
+    was_same = was.model_dump(exclude=WITHOUT_EFFECT) == request.config.model_dump(exclude=WITHOUT_EFFECT)
+    if was_run != describe_run(request) or not was_same:
         raise InputError(f"{out}: holds another finished run; name another directory, or replace it with --overwrite")
     return lost
 

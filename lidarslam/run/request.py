@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lidarslam.config.settings import Config
+from lidarslam.config.settings import Config, read_yaml
 from lidarslam.core.errors import OutputError
 from lidarslam.core.tasks import THREADS, usable_cores
 from lidarslam.core.text import count
@@ -17,6 +17,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat
 from lidarslam.mapping.loops.closure import GivenLoops
+from lidarslam.storage.directory import CONFIG, RUN_SECTION
 from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.viewer import RerunMode
 
@@ -106,3 +107,16 @@ def describe_run(request: RunRequest) -> dict[str, Any]:
         "prior": None if request.prior is None else str(request.prior.resolve()),
         **{name: [list(pair) for pair in pairs] for name, pairs in given.items() if pairs},
     }
+
+
+def written_request(run: Path, asked: Config) -> tuple[dict[str, Any], Config]:
+    """The section of a run's config.yaml that describes it, as of `describe_run`, and its configuration.
+
+    `reader.elevation_correction_deg` is 'auto' where it is in `asked`: the file has the estimated value.
+    """
+    tree = read_yaml(run / CONFIG)
+    described, config = tree.pop(RUN_SECTION), Config.model_validate(tree)
+    if asked.reader.elevation_correction_deg == "auto":
+        reader = config.reader.model_copy(update={"elevation_correction_deg": "auto"})
+        config = config.model_copy(update={"reader": reader})
+    return described, config
