@@ -295,21 +295,21 @@ def time_scale_warning(found: tuple[float, int] | None) -> str | None:
     )
 
 
-# Motions, metres, that are compared, and their least number; the error, metres and as a share of a motion, of one that
-# is another's, and the share of such.
+# The shortest motions that are compared, metres, and their least number. Two motions disagree where they differ by more
+# than both bounds, in metres and as a share of the motion; the share of disagreeing ones of a wrong prior.
 _LEAST_MOTION_M, _FEWEST_MOTIONS = 0.02, 10
-_OTHER_M, _OTHER_SHARE, _MOSTLY = 0.05, 0.5, 0.5
+_DISAGREEING_M, _DISAGREEING_SHARE, _MOSTLY = 0.05, 0.5, 0.5
 
 
 def prior_warning(prior: Trajectory, registered: Trajectory) -> str | None:
-    """Warning that most motions of a given trajectory are not the registered ones, at the same stamps; else None."""
+    """A warning where most motions of a prior disagree with the registered ones at the same stamps; else None."""
     given, found = prior.relative_motions(), registered.relative_motions()
     moved_m = np.linalg.norm(found[:, :3, 3], axis=1)
     off_m = np.linalg.norm((inverse(given) @ found)[:, :3, 3], axis=1)
-    is_other = (off_m > np.maximum(_OTHER_M, _OTHER_SHARE * moved_m))[moved_m > _LEAST_MOTION_M]
-    if len(is_other) < _FEWEST_MOTIONS or is_other.mean() < _MOSTLY:
+    disagree = (off_m > np.maximum(_DISAGREEING_M, _DISAGREEING_SHARE * moved_m))[moved_m > _LEAST_MOTION_M]
+    if len(disagree) < _FEWEST_MOTIONS or disagree.mean() < _MOSTLY:
         return None
     return (
-        f"the motions of the prior are not those of the scans on {is_other.sum():,} of {len(is_other):,} moving scans;"
+        f"the motions of the prior are not those of the scans on {disagree.sum():,} of {len(disagree):,} moving scans;"
         " its poses have to be those of the LiDAR (T_odom_lidar), in its axes and of this recording"
     )

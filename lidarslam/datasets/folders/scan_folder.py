@@ -26,7 +26,7 @@ from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stam
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 # Pairs of consecutive scans that are compared at their seams, spread over the recording.
 _PAIRS = 40
-# Other numbered files, as a share of the scans, that are more than a few maps.
+# Share of the scans above which other numbered files are scans in a second format, rather than a few maps.
 _FEW_OTHERS = 0.1
 # The number at the end of a name, its digits that count, and the most numbers per scan of names that count scans.
 _NUMBER, _MOST_DIGITS, _MOST_MISSING = re.compile(r"\d+$"), 9, 3
