@@ -23,7 +23,7 @@ from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.calibration import Elevation, time_scale, time_scale_warning
 from lidarslam.storage.directory import SCANS_CSV, SIGMAS
-from lidarslam.storage.finished_run import is_unconstrained
+from lidarslam.storage.finished_run import is_seen_through, is_unconstrained, where_astray
 
 COLUMNS = (
     *("index", "stamp", "status", "points", "points_dropped", "points_used", "residual_m", "inlier_ratio"),
@@ -309,9 +309,8 @@ class RunSummary:
 
     @property
     def went_astray(self) -> bool:
-        """Whether a scan is lost, the map contradicts itself, or much of the path is a prediction."""
-        is_uncertain = is_unconstrained(self.unconstrained_m, self.length_m)
-        return bool(self.lost_scans or self.contradictions or is_uncertain)
+        """Whether there is a reason for exit status 3."""
+        return where_astray(self.to_json()) is not None
 
     @property
     def lost_scans(self) -> int:
@@ -379,7 +378,7 @@ def summarise(
         odometry_asked=int(log.table["odometry_asked"].sum()),
         graph=graph,
         map=written,
-        warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m, scale)),
+        warnings=(*log.warnings, *_warnings(log, skipped, contradictions, written, unconstrained_m, scale)),
         contradictions=contradictions,
         slowest=SlowestScan.of(stage_ms),
         elevation=elevation,
@@ -451,7 +450,7 @@ def _unconfirmed_start_m(log: ScanLog) -> float:
 
 
 def _warnings(
-    log: ScanLog, skipped: int, contradictions: Sequence[Contradiction], unconstrained_m: float,
+    log: ScanLog, skipped: int, contradictions: Sequence[Contradiction], written: WrittenMap, unconstrained_m: float,
     scale: tuple[float, int] | None,
 ) -> Iterator[str]:  # fmt: skip
     if skipped:
@@ -485,6 +484,12 @@ def _warnings(
         yield (
             f"the map contradicts itself between scans {clearest.first} and {clearest.last}: the scans fit one another"
             f" {abs(clearest.shift_m):.1f} m {direction} their poses, which indicates a slip of registration{more}"
+        )
+    if is_seen_through(written.points, written.moved, length_m, log.trajectory.duration_s):
+        share = written.moved / (written.points + written.moved)
+        yield (
+            f"scans see through {100.0 * share:.0f} % of the points that others mapped,"
+            " which indicates a slip of registration, as with much range noise, or objects that move all around"
         )
 
 

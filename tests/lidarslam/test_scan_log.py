@@ -192,3 +192,13 @@ def test_before_the_first_scan_the_bar_says_what_goes_on(monkeypatch):
         progress.phase("compiling loops")
     assert "compiling loops" in terminal.getvalue()
     assert "a[red]b[/nothing]" in terminal.getvalue()
+
+
+@pytest.mark.parametrize(("moved", "step_m", "wrong"), [(40, 0.1, True), (15, 0.1, False), (40, 0.002, False)])
+def test_a_moving_sensor_that_sees_through_its_map_has_wrong_poses(moved, step_m, wrong):
+    log = ScanLog()
+    for scan in range(20):
+        log.add(result(0.1 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, step_m * scan, 0.0, 0.0])))
+    summary = summarise(log, WrittenMap(100 - moved, 0.1, moved), skipped=0)
+    assert summary.went_astray == wrong
+    assert any("see through" in warning for warning in summary.warnings) == wrong
