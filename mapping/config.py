@@ -51,14 +51,20 @@ class MappingConfig(Settings):
     )
     max_range_m: float = Field(100.0, ge=1.0, le=10_000.0, description="farther points are ignored")
     keypoints: int = Field(
-        3000, ge=100, le=10**6, description="points of a scan that are registered, at most (LOAM: planar ones)"
+        3000, ge=100, le=10**6, description="maximum number of registered points per scan (LOAM: of planar ones)"
     )
     continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
     prior_rotation_deg: float = Field(
-        3.0, ge=0.01, le=180.0, description="deviation of an odometry's rotation about each axis, if it gives none"
+        3.0,
+        ge=0.01,
+        le=180.0,
+        description="standard deviation of the odometry's rotation about each axis, where it has no covariance",
     )
     prior_translation_m: float = Field(
-        0.15, ge=1e-3, le=100.0, description="deviation of an odometry's translation along each axis, if it gives none"
+        0.15,
+        ge=1e-3,
+        le=100.0,
+        description="standard deviation of the odometry's translation along each axis, where it has no covariance",
     )
     budget_ms: BudgetMs = Field(
         None,
@@ -88,14 +94,17 @@ class GlobalMapConfig(Settings):
     """The merged map of a run."""
 
     voxel_size_m: float | None = Field(
-        None, ge=0.01, le=10.0, description="one point a voxel; null: follows the median range of the first scan"
+        None,
+        ge=0.01,
+        le=10.0,
+        description="one point per voxel; null: 1/50 of the first scan's median range, 0.05 to 0.25",
     )
     min_range_m: float = Field(
-        0.5, ge=0.0, le=10_000.0, description="nearer points, mostly the carrier itself, are left out"
+        0.5, ge=0.0, le=10_000.0, description="nearer points, mostly the carrier itself, are ignored"
     )
-    max_range_m: float = Field(80.0, ge=1.0, le=10_000.0, description="farther points, sparse and noisy, are left out")
+    max_range_m: float = Field(80.0, ge=1.0, le=10_000.0, description="farther points, sparse and noisy, are ignored")
     leave_out_moved: bool = Field(
-        True, description="leave out what other scans saw through where it was: people and vehicles that passed"
+        True, description="remove points that other scans see through: people and vehicles that passed"
     )
     most_points: int | None = Field(
         20_000_000,
@@ -106,7 +115,7 @@ class GlobalMapConfig(Settings):
     )
     fields: tuple[MapField, ...] = Field(
         ("intensity", "rgb"),
-        description="attributes of points that the map has where scans have them: intensity, rgb, ring, time",
+        description="point attributes of the map, where scans have them: intensity, rgb, ring, time",
     )
 
     @model_validator(mode="after")
@@ -119,22 +128,31 @@ class KeyframeConfig(Settings):
     """When a scan becomes a keyframe; see `mapping.pose_graph.keyframe_graph`."""
 
     distance_m: float | None = Field(
-        None, ge=0.1, le=100.0, description="way from one to the next; null: a quarter of the median range, 0.5 to 4 m"
+        None,
+        ge=0.1,
+        le=100.0,
+        description="distance between keyframes; null: a quarter of the median range, 0.5 to 4 m",
     )
-    turn_deg: float = Field(25.0, ge=1.0, le=180.0, description="turn from one to the next")
+    turn_deg: float = Field(25.0, ge=1.0, le=180.0, description="rotation between keyframes")
 
 
 class LoopConfig(Settings):
     """Loop detection and verification; see `mapping.loops.detection`."""
 
-    max_range_m: float = Field(60.0, ge=1.0, le=10_000.0, description="farther points of a keyframe are left out")
+    max_range_m: float = Field(60.0, ge=1.0, le=10_000.0, description="farther points of a keyframe are ignored")
     drift_percent: float = Field(
-        1.0, ge=0.01, le=100.0, description="deviation of the drift; in attitude 2 degrees in 100 m for each percent"
+        1.0,
+        ge=0.01,
+        le=100.0,
+        description="standard deviation of the drift, per distance; 1 % also means 2 degrees of attitude per 100 m",
     )
     min_way_m: float | None = Field(
-        None, ge=0.0, le=1e6, description="shorter ways back are no loops; null: three median ranges, at least 10 m"
+        None,
+        ge=0.0,
+        le=1e6,
+        description="least distance travelled between two visits; null: three median ranges, at least 10 m",
     )
-    min_overlap: float = Field(0.75, ge=0.0, le=1.0, description="inliers among what two keyframes see of each other")
+    min_overlap: float = Field(0.75, ge=0.0, le=1.0, description="least inlier ratio where two keyframes overlap")
 
     @property
     def drift_rates(self) -> tuple[float, float]:
@@ -146,10 +164,8 @@ class PoseGraphConfig(Settings):
     """Keyframes, loop closures and their optimisation; see `mapping.pose_graph.slam_graph`."""
 
     enabled: bool = Field(False, description="build a pose graph, close loops, and correct trajectory and map")
-    corrects_local_map: bool = Field(
-        True, description="surfels only: draw the local map anew after a loop closure, while the run goes on"
-    )
-    gnss: bool = Field(False, description="hold the graph by the recording's GNSS positions; lidarslam run alone")
+    corrects_local_map: bool = Field(True, description="surfels only: rebuild the local map after a loop closure")
+    gnss: bool = Field(False, description="add the recording's GNSS positions as factors; `run` only")
     keyframes: KeyframeConfig = KeyframeConfig()
     loops: LoopConfig = LoopConfig()
 

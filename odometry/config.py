@@ -23,25 +23,27 @@ class LearnedConfig(Settings):
         None, description="file of `lidarslam train` or folder of `lidarslam export`; null: the shipped network"
     )
     device: str = Field("cpu", min_length=1, description="torch's name of the device, such as cpu or cuda")
-    threads: int = Field(1, ge=1, le=256, description="of the network; mapping works beside it")
-    alignment: bool = Field(True, description="false: the network's motion as it is, for ablations")
+    threads: int = Field(1, ge=1, le=256, description="of the network; registration has its own")
+    alignment: bool = Field(
+        True, description="refine the network's motion by point-to-plane alignment; false: for ablations"
+    )
     when: Literal["needed", "always"] = Field(
         "needed",
-        description="needed: with a mapping, only at scans whose motion it does not predict well enough by itself",
+        description="needed: with a mapping, only for scans whose motion the mapping does not predict well enough",
     )
 
 
 class KissConfig(Settings):
     """KISS-ICP; the defaults are its own."""
 
-    max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="points farther away are left out")
-    min_range_m: float = Field(0.0, ge=0.0, le=1000.0, description="points nearer are left out")
+    max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="farther points are ignored")
+    min_range_m: float = Field(0.0, ge=0.0, le=1000.0, description="nearer points are ignored")
     voxel_size_m: float | None = Field(
         None, ge=0.05, le=10.0, description="of the map; null: a hundredth of max_range_m"
     )
     max_points_per_voxel: int = Field(20, ge=1, le=1000, description="of the map")
     initial_threshold_m: float = Field(
-        2.0, ge=0.1, le=100.0, description="first distance of correspondences, adapted later"
+        2.0, ge=0.1, le=100.0, description="initial correspondence distance, then adaptive"
     )
     deskew: bool = Field(True, description="compensate the sensor's motion within each scan")
     threads: int = Field(0, ge=0, le=256, description="0: all cores")
@@ -67,7 +69,7 @@ class OdometryConfig(Settings):
         " turns",
     )
     imu_position_m: tuple[Metres, Metres, Metres] = Field(
-        (0.0, 0.0, 0.0), description="of the IMU in the LiDAR's recorded axes, beside imu_rotation_deg"
+        (0.0, 0.0, 0.0), description="of the IMU in the LiDAR's recorded axes"
     )
 
     @model_validator(mode="after")
@@ -118,7 +120,7 @@ class LossConfig(Settings):
 
     point_to_plane: bool = Field(True, description="distances of points from planes")
     plane_to_plane: bool = Field(True, description="differences of normals")
-    robust: bool = Field(True, description="outliers are gated and weigh less; false: as in the paper")
+    robust: bool = Field(True, description="gate and down-weight outliers; false: as in the paper")
 
     @model_validator(mode="after")
     def _something_is_minimised(self) -> Self:
@@ -139,7 +141,7 @@ class TrainingConfig(Settings):
         description="pseudo-labels of recordings: alignment of consecutive scans, or mapping without a network",
     )
     steps: int = Field(12_000, ge=1, le=10**9, description="of the optimizer")
-    batch: int = Field(16, ge=1, le=10**4, description="pairs a step, of each process")
+    batch: int = Field(16, ge=1, le=10**4, description="pairs per step and process")
     learning_rate: float = Field(1e-3, ge=1e-9, le=1.0, description="the highest, after the warm-up")
     warmup_steps: int = Field(300, ge=0, le=10**9, description="in which the learning rate rises")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="of weights, pairs and augmentation")
@@ -157,5 +159,5 @@ class SimulatedConfig(Settings):
 
     recordings: int = Field(0, ge=0, le=10**6, description="how many")
     scans: int = Field(60, ge=2, le=10**5, description="of each")
-    worlds: tuple[str, ...] | None = Field(None, description="of those recordings, only the ones in these; null: all")
-    sensors: tuple[str, ...] | None = Field(None, description="and only the ones of these; null: all")
+    worlds: tuple[str, ...] | None = Field(None, description="worlds of these recordings; null: all")
+    sensors: tuple[str, ...] | None = Field(None, description="their sensors; null: all")

@@ -279,7 +279,7 @@ def take_where(options: dict[str, Any]) -> "Where":
     """lidarslam config --list
     lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5"""
 )
-@click.option("--list", "listing", is_flag=True, help="List the configurations and benchmarks that come along.")
+@click.option("--list", "listing", is_flag=True, help="List the bundled configurations and benchmarks.")
 @config_options
 def config(listing: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
     """Print the resolved configuration as YAML."""

@@ -174,18 +174,20 @@ M = TypeVar("M", bound=BaseModel)
 class ViewerConfig(Settings):
     """Contents of the Rerun recording; no effect on the results."""
 
-    scan_points: int = Field(20_000, ge=1, le=10**7, description="points of a scan that are shown")
-    map_points: int = Field(200_000, ge=1, le=10**8, description="points of the map that are shown")
-    map_every: int = Field(20, ge=1, le=10**6, description="scans between two views of the growing map")
+    scan_points: int = Field(20_000, ge=1, le=10**7, description="points shown per scan")
+    map_points: int = Field(200_000, ge=1, le=10**8, description="points shown of the map")
+    map_every: int = Field(20, ge=1, le=10**6, description="scans between updates of the map")
 
 
 class CheckpointConfig(Settings):
     """Saving for --resume; no effect on the results."""
 
     interval_s: float = Field(
-        10.0, ge=0.0, le=1e6, description="least time between checkpoints; they take 2 % of it at most"
+        10.0, ge=0.0, le=1e6, description="least time between checkpoints, which take at most 2 % of it"
     )
-    every_scans: int | None = Field(None, ge=1, le=10**6, description="instead, scans between checkpoints")
+    every_scans: int | None = Field(
+        None, ge=1, le=10**6, description="scans between checkpoints, instead of interval_s"
+    )
 
 
 class Config(Settings):

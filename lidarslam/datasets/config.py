@@ -23,7 +23,7 @@ class ReaderConfig(Settings):
     frame_id: Name | None = Field(None, description="sensor's frame in a bag's topic; null: that of the first scans")
     imu_topic: Name | None = Field(None, description="IMU topic of a bag; null: the one nearest to the point clouds'")
     sequence: Name | None = Field(None, description="sequence of a data set's root, such as 04 of KITTI odometry")
-    rate_hz: float = Field(10.0, ge=0.1, le=1000.0, description="scans a second, for recordings without stamps")
+    rate_hz: float = Field(10.0, ge=0.1, le=1000.0, description="scans per second, for recordings without stamps")
     time_field: Name | None = Field(None, description="point field with the per-point time; null: found by its name")
     time_unit: TimeUnit = Field("auto", description="unit of the per-point time; auto: inferred from the values")
     time_reference: TimeReference = Field(
