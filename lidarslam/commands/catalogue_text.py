@@ -60,7 +60,7 @@ def find_on_disk(folders: Sequence[Path]) -> OnDisk:
 def _recordings(places: Iterable[Path], depth: int) -> Iterator[tuple[Path, str]]:
     """Recordings at and below some places, in no other recording, and their readers."""
     for place in map(Path.absolute, places):
-        if (reader := recognise(place)) is not None:
+        if (reader := recognise(place)) is not None and reader != "rosbag":  # bags may lie beside data sets
             yield place, reader
         elif depth and place.is_dir():
             with suppress(OSError):

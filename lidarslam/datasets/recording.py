@@ -32,6 +32,7 @@ _INSTALL = {
     "ouster.sdk": "pip install --no-deps ouster-sdk",
 }
 STORAGE_SUFFIXES = (".db3", ".mcap")  # of rosbag2
+ROSBAG1_SUFFIXES = (".bag", ".bag.active")  # .active: the recorder was killed
 _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
 # Of the points of KITTI, and of the .bin files of others.
 KITTI_FIELDS = ("x", "y", "z", "intensity")
@@ -432,12 +433,12 @@ def _last_number(name: str) -> int | None:
     return int(numbers[-1]) if numbers else None
 
 
-def storage_files(folder: Path) -> list[Path]:
-    """The databases and MCAP files of a folder, without hidden ones such as macOS's `._` files.
+def storage_files(folder: Path, suffixes: tuple[str, ...] = STORAGE_SUFFIXES) -> list[Path]:
+    """The databases and MCAP files of a folder, or other bags, without hidden ones such as macOS's `._` files.
 
     A recorder that was killed leaves them without their metadata.yaml.
     """
-    named = (entry for entry in folder.iterdir() if entry.suffix in STORAGE_SUFFIXES and entry.name[0] != ".")
+    named = (entry for entry in folder.iterdir() if entry.name.endswith(suffixes) and entry.name[0] != ".")
     return sorted(entry for entry in named if entry.is_file())
 
 

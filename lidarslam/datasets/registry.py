@@ -21,7 +21,7 @@ from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
-from lidarslam.datasets.recording import STORAGE_SUFFIXES, Recording, storage_files
+from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, STORAGE_SUFFIXES, Recording, storage_files
 
 logger = logging.getLogger(__name__)
 
@@ -46,9 +46,12 @@ class Reader(NamedTuple):
 
 
 def _is_rosbag(source: Path) -> bool:
-    if source.is_dir():
-        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or bool(storage_files(source))
-    return source.suffix in (".bag", *STORAGE_SUFFIXES) or source.name.endswith(".bag.active")
+    if not source.is_dir():
+        return source.name.endswith((*ROSBAG1_SUFFIXES, *STORAGE_SUFFIXES))
+    if (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or storage_files(source):
+        return True
+    parts = len(storage_files(source, ROSBAG1_SUFFIXES))  # a map may lie beside them, and a bag beside scans
+    return parts > 1 and parts >= sum(entry.suffix.lower() in SCAN_SUFFIXES for entry in source.iterdir())
 
 
 def _bag_of_folder(folder: Path) -> Path:
@@ -109,7 +112,7 @@ READERS: dict[str, Reader] = {
     ),
     "mulran": Reader(f"{_HERE}.published.mulran", "MulRan: a sequence with a folder Ouster", _has("Ouster/")),
     "nclt": Reader(f"{_HERE}.published.nclt", "NCLT: a session with a folder velodyne_sync", _has("velodyne_sync/")),
-    "rosbag": Reader(f"{_HERE}.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "rosbag": Reader(f"{_HERE}.ros.rosbag", "rosbag1 .bag; rosbag2 .db3 or .mcap; a folder of either", _is_rosbag),
     "packets": Reader(
         f"{_HERE}.packets.velodyne",
         ".pcap of a Velodyne, or of an Ouster with its metadata .json beside it; Ouster's .osf",

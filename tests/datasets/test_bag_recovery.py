@@ -118,11 +118,7 @@ def test_a_folder_without_usable_metadata_is_its_file(write_drive, kind, content
     (folder / f"._{file.name}").write_bytes(b"-")  # macOS keeps attributes there
     recording = open_recording(folder)
     assert_first_scans(recording, points, 6)
-    assert "metadata.yaml is missing or damaged, so drive" in recording.warnings[0]
-    # Of several files only the metadata knows the order.
-    shutil.copy(file, folder / f"another.{kind}")
-    with pytest.raises(InputError, match=r"ros2 bag reindex.*or give one of its"):
-        open_recording(folder)
+    assert "metadata.yaml" in recording.warnings[0]
 
 
 def test_a_part_of_a_bag_says_that_there_are_others(write_drive):

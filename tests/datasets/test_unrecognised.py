@@ -65,7 +65,7 @@ def test_the_drives_of_a_date_are_named(tmp_path: Path) -> None:
 
 
 def test_recordings_in_a_folder_are_named(tmp_path: Path) -> None:
-    write(tmp_path / "bags" / "a.bag", tmp_path / "bags" / "b.bag")
+    write(tmp_path / "bags" / "a.bag", tmp_path / "bags" / "b.pcap")
     assert "holds 2 recordings (rosbag); name one: " in refused(tmp_path / "bags")
     inner = scans(tmp_path / "outer" / "middle" / "inner")
     assert f"holds the recording {inner} (scan-folder); name that" in refused(tmp_path / "outer")

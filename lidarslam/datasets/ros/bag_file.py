@@ -28,7 +28,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.point_table import RawCloud
-from lidarslam.datasets.recording import Topic, storage_files
+from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 
 Recovered = tuple[str, str, int, bytes]
@@ -114,17 +114,22 @@ class BagFile:
         topics: with their numbers of messages.
         ros2: whether its messages are of ROS 2.
         damage: why it is read without its index or metadata; None when they are sound.
+        span_ns: time of recording of the first message, and one behind that of the last; without any, the end is 0.
+        notes: how it is read otherwise, one sentence each.
     """
+
+    notes: tuple[str, ...] = ()
 
     def __init__(self, path: Path) -> None:
         log = _left_in_log(path)
         if path.is_file() and not path.stat().st_size:
             raise InputError(log or f"{path}: is empty, 0 bytes; copy the bag again")
         self.path = path
-        self.ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
+        self.ros2 = not path.name.endswith(ROSBAG1_SUFFIXES)
         self._has_index = True
         self._messages_are_compressed = False
         self.damage: str | None = None
+        self.span_ns = (2**63 - 1, 0)
         try:
             counts = self._read_index()
         except InputError as error:
@@ -142,21 +147,16 @@ class BagFile:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                     raise ValueError("a topic without a name or type")  # a database may hold anything there
                 counts[connection.topic, connection.msgtype] += connection.msgcount
+            self.span_ns = (reader.start_time, reader.end_time)
         return counts
 
     def _read_without_index(self, error: InputError) -> Counter[tuple[str, str]]:
-        """Read without a folder's metadata, then without the file's index too; the error remains if both fail."""
-        if self.path.is_dir():
-            files = storage_files(self.path)
-            if len(files) != 1:  # the order of several is in the metadata alone
-                raise error
-            self.damage = f"{self.path}: its metadata.yaml is missing or damaged, so {files[0].name} was read by itself"
-            self.path = files[0]
-            with suppress(InputError):
-                return self._read_index()
+        """Read the messages one after another; the error remains if there is none."""
         counts, why = Counter[tuple[str, str]](), ""
         try:
-            counts.update(named[:2] for named in recover(self.path, self._suffix()))
+            for name, message_type, record_ns, _ in recover(self.path, self._suffix()):
+                counts[name, message_type] += 1
+                self.span_ns = (min(self.span_ns[0], record_ns), max(self.span_ns[1], record_ns + 1))
         except Exception as broken:  # perhaps not even the beginning can be read
             why = f": {_reason(broken)}"
         if not counts:
@@ -257,17 +257,17 @@ class BagFile:
         return self.path.suffix if self.ros2 else ".bag"
 
     def _remedy(self) -> str:
-        if self.path.is_dir():
+        if self.path.is_dir() and self.ros2:
             whole = min(self.path.glob("*.zstd"), default=None)
             if whole is not None:  # decompressed, it is a file that is read as far as possible
                 return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
-            files = storage_files(self.path)
-            such_as = f", such as {files[0]}" if files else ""
-            return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files{such_as}"
+            return f"try `ros2 bag reindex {self.path}`, or copy the bag again"
         command = _REPAIR.get(self._suffix())
         if command is None:
             return "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml"
-        return f"try `{command.format(self.path)}`, or copy the bag again"
+        return (
+            f"try `{command.format(self.path / '*.bag' if self.path.is_dir() else self.path)}`, or copy the bag again"
+        )
 
 
 def _left_in_log(path: Path) -> str | None:

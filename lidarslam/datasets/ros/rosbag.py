@@ -39,6 +39,7 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
+from lidarslam.datasets.ros.split_bag import open_bag
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _STRING_TYPE = "std_msgs/msg/String"
@@ -56,8 +57,8 @@ _NEVER_SET = "scans were left out: their stamps were never set"
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
-    """Open a rosbag1 `.bag`, a rosbag2 folder, or a single `.db3` or `.mcap`."""
-    bag = BagFile(source)
+    """Open a rosbag1 `.bag`, a rosbag2 folder, a single `.db3` or `.mcap`, or a folder of several of one recording."""
+    bag = open_bag(source)
     topic = choose_topic(source, bag.topics, config.topic)
     if topic.message_type in OUSTER_PACKET_TYPES:
         return OusterBag(source, config, bag, topic)
@@ -112,7 +113,7 @@ class BagRecording(CloudRecording):
 
     @cached_property
     def _notes(self) -> tuple[str, ...]:
-        return self._timing.notes
+        return (*self._bag.notes, *self._timing.notes)
 
     def _items(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
         return in_stamp_order(self._wanted(wanted, faults), self._stamp, faults)
