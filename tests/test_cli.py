@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from click.shell_completion import BashComplete
@@ -129,13 +130,14 @@ def test_merge_says_who_is_left_out(recording, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("joined", "lost", "stopped", "status"),
-    [(True, 0, (), 0), (True, 2, (), 3), (False, 2, (), 1), (True, 2, ("room: not begun",), 1)],
+    ("joined", "astray", "stopped", "status"),
+    [(True, False, (), 0), (True, True, (), 3), (False, True, (), 1), (True, True, ("room: not begun",), 1)],
 )
-def test_merge_exits_as_run_does(recording, tmp_path, monkeypatch, joined, lost, stopped, status):
-    entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
+def test_merge_exits_as_run_does(recording, tmp_path, monkeypatch, joined, astray, stopped, status):
+    entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, 0, joined or n == 1) for n in (1, 2))
     summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
-    outcome = MergeOutcome(summary, (None, None), stopped)
+    tracked = Mock(metrics=None, summary=Mock(went_astray=astray))
+    outcome = MergeOutcome(summary, (tracked, None), stopped)
     monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
     command = ("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder")
     assert lidarslam(*command).exit_code == status

@@ -245,13 +245,14 @@ def localise(
     """Find and track a recording in the map of an earlier run.
 
     The poses in DIR are in the frame of that map, which is not changed. Scans that are not sure to fit are lost, with
-    the reason; the exit status is 3 if there are any, and 1 if the recording was not found at all.
+    the reason; the exit status is 3 if there are any, or if more than a tenth of the scans cannot be read, and 1 if the
+    recording was not found at all.
     """
     with contextlib.ExitStack() as serve:
         with _loading(source.name) as progress:
             from lidarslam.localise import LocaliseRequest, execute, format_localisation, format_not_found
             from lidarslam.run.request import RunRequest
-            from lidarslam.storage.finished_run import source_name
+            from lidarslam.storage.finished_run import source_name, too_many_unreadable
 
             config = opt.take_config(options, source)
             out = out or opt.default_out("localised", source_name(source, config.reader.sequence))
@@ -267,7 +268,8 @@ def localise(
     if outcome.run.stopped is not None:
         note(f"stopped after {outcome.run.summary.scans} scans: {outcome.run.stopped}")
         ctx.exit(EXIT_MENDABLE)
-    if outcome.run.summary.lost_scans:
+    summary = outcome.run.summary
+    if summary.lost_scans or too_many_unreadable(summary.unreadable_scans, summary.scans):
         ctx.exit(EXIT_LOST)
 
 
@@ -313,7 +315,7 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
         note(f"{directory}: not joined to the others, left out of the common map")
     if outcome.stopped or outcome.apart:
         ctx.exit(EXIT_MENDABLE)
-    if outcome.summary.lost_scans or any(run is not None and run.summary.contradictions for run in outcome.runs):
+    if any(run is not None and run.summary.went_astray for run in outcome.runs):
         ctx.exit(EXIT_LOST)
 
 

@@ -24,19 +24,21 @@ class Faults:
 
     strict: bool = False  # a scan that cannot be read is an error
     left_out: int = 0  # number of scans that were left out
+    unreadable_scans: int = 0  # number of these that are damaged or missing
     _counts: dict[str, int] = field(default_factory=dict)
     _first: dict[str, str] = field(default_factory=dict)
 
-    def leave_out(self, kind: str, example: str, count: int = 1) -> None:
+    def leave_out(self, kind: str, example: str, count: int = 1, is_readable: bool = True) -> None:
         """Count scans that are left out; the kind completes a sentence that begins with their number."""
         self.left_out += count
+        self.unreadable_scans += 0 if is_readable else count
         self.note(kind, example, count)
 
     def unreadable(self, error: InputError) -> None:
         """Count one scan that is left out because it cannot be read; where it is strict, raise the error."""
         if self.strict:
             raise error
-        self.leave_out(_UNREADABLE, str(error))
+        self.leave_out(_UNREADABLE, str(error), is_readable=False)
 
     def note(self, kind: str, example: str, count: int = 1) -> None:
         """Count scans that are used in spite of a fault."""

@@ -155,9 +155,11 @@ def write_results(
     if drawn.cloud is not None and not len(drawn.cloud):
         log.warn("the map is empty: min_range_m and max_range_m of global_map leave no point")
     skipped = 0 if scans.stopped else scans.asked - len(log) - scans.faults.left_out
+    log.warn(f"{count(skipped, 'scan')} of those asked for missing" if skipped else None)
     contradictions = find_contradictions(scans.slides, log.trajectory.T_world_lidar)
     graph = None if closed is None else closed.summary
-    summary = summarise(log, written, skipped, graph, contradictions, tracked.elevation)
+    unreadable = scans.faults.unreadable_scans + skipped
+    summary = summarise(log, written, unreadable, graph, contradictions, tracked.elevation)
     directory.write_json(files.SUMMARY, summary.to_json())
     if failed is not None:
         raise OutputError(f"{failed}; the other results are there") from failed

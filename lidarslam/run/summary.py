@@ -23,7 +23,7 @@ from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.calibration import Elevation, time_scale, time_scale_warning
 from lidarslam.storage.directory import SCANS_CSV, SIGMAS
-from lidarslam.storage.finished_run import is_seen_through, is_unconstrained, where_astray
+from lidarslam.storage.finished_run import is_unconstrained, seen_through, too_many_unreadable, where_astray
 
 COLUMNS = (
     *("index", "stamp", "status", "points", "points_dropped", "points_used", "residual_m", "inlier_ratio"),
@@ -293,6 +293,7 @@ class RunSummary:
     # distance travelled along axes of the sensor that the scans did not, or hardly, constrain: it is a prediction
     unconstrained_m: float
     odometry_asked: int  # number of scans
+    unreadable_scans: int  # number of scans that were asked for and are damaged or missing
     graph: GraphSummary | None
     map: WrittenMap
     warnings: tuple[str, ...]
@@ -309,7 +310,7 @@ class RunSummary:
 
     @property
     def went_astray(self) -> bool:
-        """Whether there is a reason for exit status 3."""
+        """Whether the exit status is 3."""
         return where_astray(self.to_json()) is not None
 
     @property
@@ -335,7 +336,7 @@ class RunSummary:
 
 _NUMBERS = (
     *("scans", "length_m", "duration_s", "elapsed_s", "elapsed_ms_per_scan", "realtime_factor", "peak_rss_mb"),
-    *("lost_scans", "degraded_scans", "unconstrained_m", "odometry_asked"),
+    *("lost_scans", "degraded_scans", "unconstrained_m", "odometry_asked", "unreadable_scans"),
 )
 
 
@@ -352,12 +353,12 @@ def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings
 def summarise(
     log: ScanLog,
     written: WrittenMap,
-    skipped: int,
+    unreadable: int,
     graph: GraphSummary | None = None,
     contradictions: tuple[Contradiction, ...] = (),
     elevation: Elevation | None = None,
 ) -> RunSummary:
-    """Summarise a run, of which `skipped` scans are missing without a warning in the log."""
+    """Summarise a run, which lacks a number of unreadable scans."""
     trajectory, total_ms, stage_ms = log.trajectory, log.table["total_ms"], log.table["stage_ms"]
     stages = {"total": total_ms} | dict(zip(STAGES, stage_ms.T, strict=True))
     elapsed_s, unconstrained_m = float(total_ms.sum()) / 1e3, _unconstrained_m(log)
@@ -376,9 +377,10 @@ def summarise(
         degraded_scans=log.statuses.count(Status.DEGRADED),
         unconstrained_m=unconstrained_m,
         odometry_asked=int(log.table["odometry_asked"].sum()),
+        unreadable_scans=unreadable,
         graph=graph,
         map=written,
-        warnings=(*log.warnings, *_warnings(log, skipped, contradictions, written, unconstrained_m, scale)),
+        warnings=(*log.warnings, *_warnings(log, unreadable, contradictions, written, unconstrained_m, scale)),
         contradictions=contradictions,
         slowest=SlowestScan.of(stage_ms),
         elevation=elevation,
@@ -450,11 +452,11 @@ def _unconfirmed_start_m(log: ScanLog) -> float:
 
 
 def _warnings(
-    log: ScanLog, skipped: int, contradictions: Sequence[Contradiction], written: WrittenMap, unconstrained_m: float,
+    log: ScanLog, unreadable: int, contradictions: Sequence[Contradiction], written: WrittenMap, unconstrained_m: float,
     scale: tuple[float, int] | None,
 ) -> Iterator[str]:  # fmt: skip
-    if skipped:
-        yield f"{count(skipped, 'scan')} of those asked for missing"
+    if (lacking := too_many_unreadable(unreadable, len(log))) is not None:
+        yield f"{lacking}: the results lack a considerable part of the recording"
     steps = np.diff(log.stamps)
     usual_s = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > usual_s + max(_GAP_INTERVALS * usual_s, _SHORTEST_GAP_S))
@@ -485,12 +487,9 @@ def _warnings(
             f"the map contradicts itself between scans {clearest.first} and {clearest.last}: the scans fit one another"
             f" {abs(clearest.shift_m):.1f} m {direction} their poses, which indicates a slip of registration{more}"
         )
-    if is_seen_through(written.points, written.moved, length_m, log.trajectory.duration_s):
-        share = written.moved / (written.points + written.moved)
-        yield (
-            f"scans see through {100.0 * share:.0f} % of the points that others mapped,"
-            " which indicates a slip of registration, as with much range noise, or objects that move all around"
-        )
+    speed_mps = length_m / max(log.trajectory.duration_s, 1e-9)
+    if (through := seen_through(written.points, written.moved, speed_mps)) is not None:
+        yield f"{through}, which indicates a slip of registration, as with much range noise, or many moving objects"
 
 
 def peak_rss_mb() -> float:

@@ -197,15 +197,25 @@ def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
     return unconstrained_m > _MOST_UNCONSTRAINED * max(length_m, _SHORTEST_M)
 
 
-# Share of the mapped points that later or earlier scans see through: up to 15 % amid a crowd or beside traffic at right
-# poses, 23 % and more where scans with much range noise were registered to that noise. A sensor that stands amid
-# traffic sees through more.
+# Share of a recording's scans that may be unreadable.
+_MOST_UNREADABLE = 0.1
+# Share of the mapped points that other scans see through: up to 15 % amid a crowd or next to traffic at right poses,
+# 23 % and more where scans were registered to their own range noise. A sensor that stands in traffic has more.
 _MOST_MOVED, _STANDING_MPS = 0.2, 0.1
 
 
-def is_seen_through(map_points: int, moved: int, length_m: float, duration_s: float) -> bool:
-    """Whether scans of a moving sensor see through so much of the map that it is wrong."""
-    return map_points > 0 and moved > _MOST_MOVED * (map_points + moved) and length_m > _STANDING_MPS * duration_s
+def too_many_unreadable(unreadable: int, scans: int) -> str | None:
+    """The fault of a run that lacks much of its recording, given the numbers of scans that it lacks and has."""
+    if unreadable <= _MOST_UNREADABLE * (unreadable + scans):
+        return None
+    return f"{unreadable:,} of {unreadable + scans:,} scans could not be read"
+
+
+def seen_through(points: int, moved: int, speed_mps: float) -> str | None:
+    """The fault of a moving sensor's map if other scans see through many points, which were removed from the rest."""
+    if not points or moved <= _MOST_MOVED * (points + moved) or speed_mps < _STANDING_MPS:
+        return None
+    return f"scans see through {100.0 * moved / (points + moved):.0f} % of the points that others mapped"
 
 
 def where_astray(summary: Mapping[str, Any]) -> str | None:
@@ -217,9 +227,10 @@ def where_astray(summary: Mapping[str, Any]) -> str | None:
     unconstrained_m = summary.get("unconstrained_m", 0.0)
     if is_unconstrained(unconstrained_m, summary.get("length_m", 0.0)):
         return f"{unconstrained_m:.1f} m of its path are hardly constrained"
-    if is_seen_through(*(summary.get(key, 0) for key in ("map_points", "map_points_moved", "length_m", "duration_s"))):
-        return "scans see through much of its map"
-    return None
+    if (lacking := too_many_unreadable(summary.get("unreadable_scans", 0), summary.get("scans", 0))) is not None:
+        return lacking
+    speed_mps = summary.get("length_m", 0.0) / max(summary.get("duration_s", 0.0), 1e-9)
+    return seen_through(summary.get("map_points", 0), summary.get("map_points_moved", 0), speed_mps)
 
 
 def read_summary(path: Path) -> dict[str, Any]:

@@ -22,8 +22,9 @@ from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.datasets.ros.bag_message import POINT_CLOUD2_TYPE
 from lidarslam.datasets.ros.made_messages import header, point_cloud
 from lidarslam.storage.directory import UNFINISHED, About
+from lidarslam.storage.finished_run import where_astray
 
-from ..conftest import fuzzed, succeeds
+from ..conftest import fuzzed, lidarslam
 from .conftest import FAST, ends_well, summary_of
 
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")]
@@ -214,7 +215,7 @@ def test_no_fault_no_warning_whatever_the_clock(tmp_path, tables, first):
     assert (code, summary["scans"], summary["warnings"], said) == (0, 8, [], "")
 
 
-def test_scans_that_vanish_while_it_runs_are_counted(tmp_path, tables, monkeypatch):
+def test_scans_that_vanish_while_it_runs_are_counted_and_too_many_are_no_success(tmp_path, tables, monkeypatch):
     from lidarslam.datasets.folders import scan_folder
 
     folder = write_folder(tmp_path / "drive", tables)
@@ -233,9 +234,10 @@ def test_scans_that_vanish_while_it_runs_are_counted(tmp_path, tables, monkeypat
 
     monkeypatch.setattr(scan_folder, "table_reader", vanishing)
     out = tmp_path / "run"
-    succeeds("run", folder, "--out", out, *FAST)
+    assert lidarslam("run", folder, "--out", out, *FAST).exit_code == 3
     summary = summary_of(out)
-    assert (summary["scans"], left_out(summary)) == (6, 2)
+    assert (summary["scans"], left_out(summary), summary["unreadable_scans"]) == (6, 2, 2)
+    assert where_astray(summary) in " ".join(summary["warnings"])
 
 
 def test_links_that_lead_nowhere_or_in_a_circle_are_counted(tmp_path, tables):

@@ -52,7 +52,7 @@ def test_the_elapsed_time_per_scan_agrees_with_that_of_all_scans_where_most_gaps
     log = ScanLog()
     for stamp, total_ms in enumerate([0.0, 0.0, 0.0, 0.0, 400.0]):
         log.add(result(float(stamp), stage_ms={"odometry": 30.0, "refine": 50.0}), total_ms)
-    summary = summarise(log, WrittenMap(1, 0.1, 0), skipped=0)
+    summary = summarise(log, WrittenMap(1, 0.1, 0), unreadable=0)
     assert (summary.elapsed_s, summary.elapsed_ms_per_scan) == (0.4, 80.0)
     assert summary.latency_ms == Milliseconds(80.0, 80.0, 80.0)
     lines = list(format_times(summary))
@@ -91,7 +91,7 @@ def test_a_walking_speed_is_missing_where_nothing_is_known_of_the_motion():
     log = ScanLog()
     for scan in range(21):
         log.add(result(0.1 * scan, degenerate=AXES if scan in (1, 2) else ()))
-    summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
+    summary = summarise(log, WrittenMap(0, None, 0), unreadable=0)
     assert summary.to_json()["unconstrained_m"] == pytest.approx(0.3)
 
 
@@ -102,7 +102,7 @@ def test_motions_shorter_than_their_standard_deviation_may_be_noise(sigma_m, unc
     for scan in range(21):
         pose = exp([0.0, 0.0, 0.0, 0.1 * scan, 0.0, 0.0])
         log.add(result(0.1 * scan, T_world_lidar=pose, covariance=np.diag([1e-6] * 3 + [sigma_m**2, 1e-4, 1.0])))
-    summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
+    summary = summarise(log, WrittenMap(0, None, 0), unreadable=0)
     assert summary.to_json()["unconstrained_m"] == pytest.approx(unconstrained_m)
 
 
@@ -115,7 +115,7 @@ def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_su
         pose = exp([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]) @ exp([0.0, 0.0, 0.0, float(scan), 0.0, 0.0])
         degenerate = (direction, "y") if scan > 10 - open_scans else ("z",)
         log.add(result(0.1 * scan, T_world_lidar=pose, degenerate=degenerate))
-    summary = summarise(log, WrittenMap(0, None, 0), skipped=0)
+    summary = summarise(log, WrittenMap(0, None, 0), unreadable=0)
     assert summary.to_json()["unconstrained_m"] == pytest.approx(open_scans, abs=1e-9)
     assert summary.went_astray == unknown
     assert any("is uncertain by" in warning for warning in summary.warnings) == unknown
@@ -128,7 +128,7 @@ def test_the_length_is_unknown_where_the_first_motion_of_a_slow_recording_is_deg
     log = ScanLog()
     for scan in range(8):
         log.add(result(interval_s * scan, status=status if scan == 1 else Status.OK))
-    assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
+    assert summarise(log, WrittenMap(0, None, 0), unreadable=0).went_astray == unknown
 
 
 @pytest.mark.parametrize(("second_m", "unknown"), [(0.1, True), (1.7, False)])
@@ -136,7 +136,7 @@ def test_a_first_motion_counts_as_unknown_where_no_vehicle_accelerates_to_the_se
     log = ScanLog()
     for scan, x_m in enumerate(np.cumsum([0.0, 2.0, second_m, 0.1, 0.1, 0.1])):
         log.add(result(0.3 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])))
-    assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
+    assert summarise(log, WrittenMap(0, None, 0), unreadable=0).went_astray == unknown
 
 
 @pytest.mark.parametrize(("jump_m", "scans", "unknown"), [(0.4, 60, False), (2.4, 60, True), (0.0, 1, False)])
@@ -146,7 +146,15 @@ def test_jumps_of_the_pose_count_as_unknown(jump_m, scans, unknown):
     for scan in range(scans):
         x_m = 0.1 * scan + jump_m * (20 <= scan < 40)
         log.add(result(0.1 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])))
-    assert summarise(log, WrittenMap(0, None, 0), skipped=0).went_astray == unknown
+    assert summarise(log, WrittenMap(0, None, 0), unreadable=0).went_astray == unknown
+
+
+@pytest.mark.parametrize(("unreadable", "lacks"), [(2, False), (3, True)])
+def test_a_result_that_lacks_more_than_a_tenth_of_the_scans_is_no_success(unreadable, lacks):
+    log = ScanLog()
+    for scan in range(18):
+        log.add(result(0.1 * scan))
+    assert summarise(log, WrittenMap(0, None, 0), unreadable).went_astray == lacks
 
 
 def test_without_a_terminal_lines_say_how_far_a_run_is(monkeypatch, capsys):
@@ -199,6 +207,6 @@ def test_a_moving_sensor_that_sees_through_its_map_has_wrong_poses(moved, step_m
     log = ScanLog()
     for scan in range(20):
         log.add(result(0.1 * scan, T_world_lidar=exp([0.0, 0.0, 0.0, step_m * scan, 0.0, 0.0])))
-    summary = summarise(log, WrittenMap(100 - moved, 0.1, moved), skipped=0)
+    summary = summarise(log, WrittenMap(100 - moved, 0.1, moved), unreadable=0)
     assert summary.went_astray == wrong
     assert any("see through" in warning for warning in summary.warnings) == wrong

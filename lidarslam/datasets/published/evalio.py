@@ -228,7 +228,7 @@ class EvalioRecording(StoredRecording):
             except InputError as error:
                 if faults.strict or not given:
                     raise
-                faults.leave_out(_UNREADABLE, str(error), len(wanted) - given)
+                faults.leave_out(_UNREADABLE, str(error), len(wanted) - given, is_readable=False)
                 return
             if scan is not None:
                 given += 1

@@ -149,7 +149,8 @@ class BagRecording(CloudRecording):
             remedy = " reindex it, or give one of its .db3 or .mcap files instead of the folder"
             raise InputError(damages[0] if damages else lists + remedy)
         if missing := sum(index >= count for index in wanted):
-            faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", missing)
+            held = f"its index lists {len(self)} scans, it holds {count}"
+            faults.leave_out(_MISSING, held, missing, is_readable=False)
 
     def _sound_items(self) -> Iterator[BagMessage]:
         return (message for message in self._bag.messages(self._topic) if message.damage is None)
