@@ -19,6 +19,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.run.interruption import Interruptions
 from lidarslam.run.request import RunRequest, describe_run, written_request
 from lidarslam.run.summary import ScanLog
 from lidarslam.storage import directory as files
@@ -118,14 +119,14 @@ def _digest(path: Path) -> str:
 
 # Saving takes at most this share of the time.
 _SHARE = 0.02
-# The first is saved soon, so that a run that is interrupted early can be resumed, too.
+# The first is saved soon, so that a run that is killed early can be resumed, too.
 _FIRST_S = 1.0
 # The beginning of the sentence in the summary.
 _RESUMED = "the run was resumed "
 
 
 class Checkpoints:
-    """Saves the state of a run, and that of its odometry, log and graph, at intervals; a `pipeline.Checkpointer`."""
+    """Saves the states of a run, its odometry, log and graph at intervals and at Ctrl-C; a `pipeline.Checkpointer`."""
 
     def __init__(
         self,
@@ -135,6 +136,7 @@ class Checkpoints:
         log: ScanLog,
         graph: KeyframeGraph | None,
     ) -> None:
+        self.interruptions = Interruptions()  # of the run
         self._unfinished, self._config = unfinished, config
         self._odometry, self._log, self._graph = odometry, log, graph
         self._scans = 0  # since the last checkpoint
@@ -144,6 +146,9 @@ class Checkpoints:
     def is_due(self) -> bool:
         """Whether a checkpoint is due."""
         self._scans += 1
+        self.interruptions.takes_requests = True  # before the first scan there is nothing to save
+        if self.interruptions.is_requested:
+            return True
         if self._config.every_scans is not None:
             return self._scans >= self._config.every_scans
         self._asked = time.monotonic()
@@ -152,7 +157,7 @@ class Checkpoints:
         return self._asked - self._done >= wait_s
 
     def save(self, pipeline: Pipeline) -> None:
-        """Save the state of the idle pipeline, log and graph; a failure is a warning."""
+        """Save the state of the idle pipeline, log and graph; a failure is a warning; end an interrupted run."""
         try:
             state = {
                 "pipeline": pipeline.state(),
@@ -168,6 +173,9 @@ class Checkpoints:
         self._scans, self._done = 0, time.monotonic()
         # Waiting for the threads to become idle is part of the cost.
         self._cost_s = self._done - self._asked
+        if self.interruptions.is_requested:
+            self.interruptions.protect_results()
+            raise KeyboardInterrupt
 
     def begin(self, pipeline: Pipeline, scans: Iterator[Scan], is_recorded: bool) -> Iterator[Scan]:
         """Restore log, pipeline and odometry, and mark the run as running; the remaining scans of all that it takes."""

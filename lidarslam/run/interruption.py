@@ -75,11 +75,13 @@ def ended_like_interrupted() -> contextlib.AbstractContextManager[None]:
 class Interruptions:
     """Requests to end a run: the first ends the scans, by KeyboardInterrupt; then the results are written.
 
-    A context manager. Later requests are answered with a line; only an insistent user abandons the results.
+    A context manager. A second request does not wait where the run still saves its state. Later ones are answered with
+    a line; only an insistent user abandons the results.
     """
 
     def __init__(self) -> None:
-        self._is_writing = False
+        # Whether the run saves its state and ends by itself where `is_requested`, and whether it is.
+        self.takes_requests = self.is_requested = self._is_writing = False
         self._insisted, self._last_s = 0, -_APART_S
         self._handling = handling(self._handle, (interrupt, signal.default_int_handler))
 
@@ -97,8 +99,11 @@ class Interruptions:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if _is_postponed(number, frame):
             return
-        first, self._is_writing = not self._is_writing, True
         recent, self._last_s = time.monotonic() - self._last_s < _APART_S, time.monotonic()
+        if self.takes_requests and not self._is_writing and (recent or not self.is_requested):
+            self.is_requested = True
+            return
+        first, self._is_writing = not self._is_writing, True
         if first:
             signal.default_int_handler(number, frame)
         if recent:

@@ -295,6 +295,7 @@ def track(
     store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
+        checkpoints.interruptions = session.interruptions
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
     with suppress(InputError):  # raised again when the scans are read

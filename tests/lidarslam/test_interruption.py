@@ -6,16 +6,19 @@ import signal
 import time
 import weakref
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from click.testing import Result
 
+from lidarslam.core.errors import OutputError
 from lidarslam.core.trajectory import read_tum
 from lidarslam.run import interruption
+from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.interruption import Interruptions, ended_like_interrupted
-from lidarslam.run.summary import ScanLog
 
 from ..conftest import lidarslam
 from .conftest import FAST
@@ -57,14 +60,14 @@ def pressed_at(monkeypatch: pytest.MonkeyPatch, place: str, times: int) -> None:
 
 
 def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    add = ScanLog.add
+    is_due, asked = Checkpoints.is_due, count(1)
 
-    def pressing(self: ScanLog, *given: object) -> None:
-        add(self, *given)
-        if len(self) == number:
+    def pressing(self: Checkpoints) -> bool:
+        if next(asked) == number:
             press()
+        return is_due(self)
 
-    monkeypatch.setattr(ScanLog, "add", pressing)
+    monkeypatch.setattr(Checkpoints, "is_due", pressing)
 
 
 @pytest.mark.usefixtures("hasty")
@@ -100,19 +103,33 @@ def test_who_insists_abandons_the_results_and_can_resume(run, tmp_path, monkeypa
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 6
 
 
-@pytest.mark.parametrize(
-    ("scans", "options", "told"),
-    [
-        (4, ["--set", "checkpoints.every_scans=2"], "stopped after 4 scans: interrupted; continue with --resume"),
-        (1, [], "no checkpoint to continue from; --overwrite begins again"),
-    ],
-)
-def test_resuming_is_promised_where_there_is_a_checkpoint(run, monkeypatch, scans, options, told):
-    at_scan(monkeypatch, scans)
-    result = run(*options)
+def test_an_interrupted_run_goes_on_after_its_last_scan(run, monkeypatch):
+    with monkeypatch.context() as patch:
+        at_scan(patch, 3)
+        result = run()
     assert result.exit_code == 1
-    assert told in result.output
-    assert ("--resume" in result.output) == bool(options)
+    assert "stopped after 3 scans: interrupted; continue with --resume" in result.output
+    result = run("--resume")
+    assert result.exit_code == 0
+    assert "resumed once, after 3 scans" in result.output
+
+
+def test_resuming_is_not_promised_where_there_is_no_checkpoint(run, monkeypatch):
+    at_scan(monkeypatch, 3)
+    monkeypatch.setattr("lidarslam.run.checkpoints.write_state", Mock(side_effect=OutputError("no room")))
+    result = run()
+    assert result.exit_code == 1
+    assert "no checkpoint to continue from; --overwrite begins again" in result.output
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_second_request_does_not_wait_for_a_checkpoint():
+    with Interruptions() as interruptions:
+        interruptions.takes_requests = True
+        press()
+        assert interruptions.is_requested
+        with pytest.raises(KeyboardInterrupt):
+            press()
 
 
 def test_before_the_first_scan_nothing_is_kept(run, tmp_path, monkeypatch):
