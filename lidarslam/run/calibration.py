@@ -14,6 +14,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.text import command_line
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
@@ -82,6 +83,20 @@ def open_inertial(
         T_lidar_imu, lever_sigma_m = _found(poses, recording.name, samples), UNKNOWN_LEVER_M
     logger.info("comparing the IMU with the first scans")
     return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn), lever_sigma_m)
+
+
+def found_imu(inertial: "Inertial", recording: Recording) -> str | None:
+    """The settings that give an extrinsic calibration that was estimated; None where it was known."""
+    if inertial.is_mounting_known:
+        return None
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
+    T = inverse(recorded_axes(recording)[1]) @ inertial.T_lidar_imu
+    angles_deg, position_m = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True), T[:3, 3]
+    values = {"odometry.imu_rotation_deg": angles_deg, "odometry.imu_position_m": position_m}
+    settings = [f"{key}=[{','.join(f'{one:.2f}' for one in value)}]" for key, value in values.items()]
+    words = command_line(*(word for setting in settings for word in ("--set", setting)))
+    return f"the IMU's extrinsic calibration was estimated; give it to other runs by {words}"
 
 
 def _other_clock(samples: ImuSamples, recording: Recording) -> str | None:

@@ -37,7 +37,7 @@ from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
-from lidarslam.run.calibration import Elevation, imu_samples, open_inertial, prior_warning, with_elevations
+from lidarslam.run.calibration import Elevation, found_imu, imu_samples, open_inertial, prior_warning, with_elevations
 from lidarslam.run.checkpoints import Checkpoints, describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
@@ -307,7 +307,8 @@ def track(
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
     elevation = Elevation.found(recording, estimator)
-    log.warn(*(inertial.warnings if inertial is not None else ()))
+    if inertial is not None:
+        log.warn(*inertial.warnings, found_imu(inertial, recording))
     if isinstance(odometry, ExternalOdometry):
         log.warn(odometry.warning, prior_warning(log.odometry, log.trajectory))
     log.warn(None if elevation is None else elevation.warning)

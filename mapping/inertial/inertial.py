@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, adjoint, inverse, rotation_angle, skew
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, make_transform, rotation_angle, skew
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
@@ -55,6 +55,7 @@ class Inertial(Stateful):
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray, lever_sigma_m: float = KNOWN_LEVER_M) -> None:
         self._extrinsics, self._lever_sigma_m = T_lidar_imu, lever_sigma_m
+        self.is_mounting_known = lever_sigma_m < UNKNOWN_LEVER_M  # given; else its rotation was found
         self._integrate(samples)
         self._window = InertialWindow(self.gyroscope, T_lidar_imu[:3, 3], lever_sigma_m)
         self._predicted: Knot | None = None
@@ -100,9 +101,10 @@ class Inertial(Stateful):
         return warnings
 
     @property
-    def lever(self) -> FloatArray:
-        """(3,) position of the IMU in the LiDAR frame, as estimated."""
-        return self._extrinsics[:3, 3] if self._window.last is None else self._window.last.lever
+    def T_lidar_imu(self) -> FloatArray:
+        """(4, 4) extrinsic calibration, its position as estimated."""
+        lever = self._extrinsics[:3, 3] if self._window.last is None else self._window.last.lever
+        return make_transform(self._extrinsics[:3, :3], lever)
 
     def prior(self, scan: Scan, prior: Prior) -> Prior:
         """The odometry's prior of a scan, with the state that the IMU predicts."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lidarslam
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
 from lidarslam.core.trajectory import Trajectory, read_tum
@@ -108,10 +110,16 @@ def test_an_imu_needs_a_map(recording, tmp_path):
 
 
 @pytest.mark.long
-def test_the_mounting_is_found_where_the_recording_has_none(room, tmp_path):
+def test_the_mounting_is_found_where_the_recording_has_none_and_can_be_given_to_other_runs(room, tmp_path):
     source = record(tmp_path / "room", room, scans=115, mounting=False)
     succeeds(*run(source, tmp_path / "run"))
     assert rotation_error_deg(tmp_path / "run", source) < 0.2
+    (told,) = (warning for warning in summary_of(tmp_path / "run")["warnings"] if "--set" in warning)
+    given = shlex.split(told[told.index("--set") :])
+    odometry = load_config(None, given[1::2]).odometry
+    np.testing.assert_allclose(odometry.imu_rotation_deg, ANGLES_DEG, atol=1.0)
+    np.testing.assert_allclose(odometry.imu_position_m, MODEL.T_lidar_imu[:3, 3], atol=0.05)
+    assert "--set" not in succeeds(*run(source, tmp_path / "given", "--stop", "20", *given))
 
 
 @pytest.mark.long

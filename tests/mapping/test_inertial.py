@@ -282,7 +282,7 @@ def test_scaled_accelerations_and_an_unknown_lever_arm_are_recovered(rng):
     followed(inertial, 19.0, rng, shaken)
     assert "the IMU's accelerations are 1.25 times those of the LiDAR's positions" in inertial.warnings[-1]
     assert_predicted(inertial.prior(empty(19.4), Prior()).inertial, inverse(shaken(0.5)) @ shaken(19.4), 0.02)
-    np.testing.assert_allclose(inertial.lever, T_LIDAR_IMU[:3, 3], atol=0.01)
+    np.testing.assert_allclose(inertial.T_lidar_imu[:3, 3], T_LIDAR_IMU[:3, 3], atol=0.01)
 
 
 def test_the_velocity_of_a_sweep_in_a_curve():
