@@ -160,6 +160,13 @@ def test_a_configuration_is_found_by_its_name():
     assert lidarslam("config", "-c", "indoor").stdout == expected
 
 
+@pytest.mark.parametrize("name", [name for name in shipped_files(CONFIGS) if name.startswith("train_")])
+def test_the_configuration_of_a_training_is_printed_as_well(tmp_path, name):
+    file = tmp_path / "printed.yaml"
+    file.write_text(lidarslam("config", "--train", "-c", name, "--set", "training.batch=3").stdout)
+    assert load_train_config(file) == load_train_config(CONFIGS / f"{name}.yaml", ["training.batch=3"])
+
+
 def test_a_path_is_a_file_of_the_user(empty_folder):
     for name in ("indoor", "indoor.yaml", "mine"):
         (empty_folder / name).write_text("global_map: {voxel_size_m: 0.77}\n")

@@ -277,18 +277,22 @@ def take_where(options: dict[str, Any]) -> "Where":
 
 @command(
     """lidarslam config --list
-    lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5"""
+    lidarslam config -c indoor --set odometry.kiss_icp.voxel_size_m=0.5
+    lidarslam config --train -c train_fine_tune"""
 )
 @click.option("--list", "listing", is_flag=True, help="List the bundled configurations and benchmarks.")
+@click.option("--train", "is_training", is_flag=True, help="Print the configuration of lidarslam train.")
 @config_options
-def config(listing: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
+def config(listing: bool, is_training: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
     """Print the resolved configuration as YAML."""
     from lidarslam.config.settings import dump_yaml, load_config
+    from lidarslam.train.settings import load_train_config
 
     if listing:
         say("\n".join(_shipped()))
         return
-    click.echo(printable(dump_yaml(load_config(config_file, settings))), nl=False)
+    load = load_train_config if is_training else load_config
+    click.echo(printable(dump_yaml(load(config_file, settings))), nl=False)
 
 
 def _shipped() -> Iterator[str]:
