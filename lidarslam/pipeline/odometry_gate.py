@@ -33,13 +33,14 @@ _MOST_WAITING = 8
 class OdometryGate(Stateful):
     """Asks the learned odometry where it is needed; implements `Odometry`.
 
-    Each scan is decided by the poses of all scans but the latest that were given to `follow`, however fast they arrive,
-    so that results do not depend on timing.
+    Each scan is decided by the results that were given to `follow`, without the last one, for which registration would
+    have to wait, however fast they arrive, so that poses do not depend on timing.
     """
 
     _odometry: SkippingOdometry
     _ok: int  # ok scans in a row
     _error_cells: float  # of the last predictions, in cells of the local map: the largest, fading
+    _before: tuple[int, float]  # both before the last result
     _stamp: float | None  # of the last scan that was given to `estimate`
     _interval_s: float | None  # between the last two
     _T_world_last: Annotated[FloatArray, TRANSFORM] | None  # pose of the last ok scan, unless another one followed
@@ -49,7 +50,7 @@ class OdometryGate(Stateful):
     def __init__(self, odometry: SkippingOdometry) -> None:
         self._odometry = odometry
         self._waiting: deque[Callable[[], ScanEstimate]] = deque()
-        self._ok, self._error_cells = 0, 0.0
+        self._ok, self._error_cells, self._before = 0, 0.0, (0, 0.0)
         self._stamp = self._interval_s = self._T_world_last = self._velocity = None
         self._last_stamp = 0.0
 
@@ -67,7 +68,7 @@ class OdometryGate(Stateful):
 
     def wait(self) -> None:
         """Wait for the results that decide about the next scan, so that `estimate` is timed without the wait."""
-        while self._may_be_skipped() and self._waiting:
+        while self._may_be_skipped() and len(self._waiting) > 1:
             self._take()
 
     def follow(self, estimate: Callable[[], ScanEstimate]) -> None:
@@ -88,11 +89,12 @@ class OdometryGate(Stateful):
 
     def _may_be_skipped(self) -> bool:
         """Whether the next scan can do without, if all pending results are as good as possible."""
-        waiting = len(self._waiting)
-        return self._ok + waiting >= _LEAST_OK and self._error_cells * _FADING**waiting < _LARGEST_ERROR
+        waiting = max(1, len(self._waiting))
+        ok, error_cells = (self._ok, self._error_cells) if self._waiting else self._before
+        return ok + waiting >= _LEAST_OK and error_cells * _FADING**waiting < _LARGEST_ERROR
 
     def _take(self) -> None:
-        estimate = self._waiting.popleft()()
+        estimate, self._before = self._waiting.popleft()(), (self._ok, self._error_cells)
         if estimate.status is not Status.OK or not estimate.is_connected or not estimate.cell_m:
             self._ok, self._T_world_last, self._velocity = 0, None, None
             return
