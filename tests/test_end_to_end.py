@@ -215,27 +215,3 @@ def test_kitti_odometry_is_as_accurate_as_kiss_icps_own_pipeline(real_data, tmp_
     camera_poses = read_kitti_poses(tmp_path / "run" / "trajectory.kitti")
     truth = read_kitti_poses(source / "poses" / "04.txt")[: len(camera_poses)]
     assert np.linalg.norm(camera_poses[-1, :3, 3] - truth[-1, :3, 3]) < 0.5, "both in the camera frame"
-
-
-@pytest.mark.real_data
-def test_kitti_raw_is_deskewed_as_by_kiss_icp(real_data, tmp_path):
-    from kiss_icp.config import load_config as kiss_config
-    from kiss_icp.kiss_icp import KissICP
-
-    from lidarslam.datasets.registry import open_recording
-    from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
-
-    drive = real_data / "kitti_raw_0005" / "2011_09_26" / "2011_09_26_drive_0005_sync"
-    recording = open_recording(drive)
-    library, poses, ends = KissICP(kiss_config(None)), [], []
-    for scan in recording.scans():
-        azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
-        library.register_frame(scan.points, 0.5 * (1.0 - azimuth / np.pi))
-        poses.append(library.last_pose)
-        ends.append(scan.stamp + scan.time_offsets.max())
-    execute(RunRequest(drive, tmp_path / "run", load_config(None, KITTI)), quiet)
-    ours = read_tum(tmp_path / "run" / "trajectory.tum").select(slice(1, None))
-    # KISS-ICP's poses belong to the end of each sweep: compare at our stamps, from the second on.
-    theirs = Trajectory(ours.stamps, Trajectory(np.array(ends), np.array(poses)).at(ours.stamps))
-    errors = [evaluate_trajectory(each, recording.ground_truth).errors for each in (theirs, ours)]
-    assert abs(errors[0].ate_rmse_m - errors[1].ate_rmse_m) < 0.002

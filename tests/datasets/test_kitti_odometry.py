@@ -178,14 +178,3 @@ def test_a_damaged_calibration_is_an_error(sequence, line):
     (sequence / "calib.txt").write_text(line)
     with pytest.raises(InputError, match=r"calib\.txt"):
         _ = open_recording(sequence).ground_truth
-
-
-@pytest.mark.real_data
-def test_sequence_04_scans_are_those_of_kiss_icp(real_data):
-    kitti = pytest.importorskip("kiss_icp.datasets.kitti")
-    root = real_data / "kitti_odometry_04"
-    oracle = kitti.KITTIOdometryDataset(root, "04")
-    recording = open_recording(root)
-    points, _ = oracle[7]
-    np.testing.assert_allclose(next(recording.scans(7)).points, points, atol=1e-9)
-    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, oracle.gt_poses, atol=1e-4)

@@ -34,14 +34,20 @@ def assert_predicted(motion, *words: str) -> None:
     assert 0.05 < np.linalg.norm(motion.T_prev_curr[:3, 3]) < 0.11, "a prediction goes on moving, 0.8 m/s at 10 Hz"
 
 
-def test_poses_are_the_librarys_own(kiss, room_scans):
+@pytest.mark.parametrize("has_times", [False, True])
+def test_motions_are_the_librarys_own(kiss, room, drive, has_times):
+    """Of sweeps that are stamped at their last points, where the library's poses are from the third on."""
     config = load_config(None)
     config.data.max_range, config.mapping.voxel_size = 30.0, 0.2
-    library, expected, scans = KissICP(config), [], [Scan(scan.points, scan.stamp) for scan in room_scans[:10]]
-    for scan in scans:
-        library.register_frame(scan.points, np.empty(0))
+    library, expected, scans = KissICP(config), [], []
+    for number in range(1, 11):
+        sweep = room.sweep(drive, 0.1 * number, stamp_at=1.0)
+        times = sweep.time_offsets - sweep.time_offsets.max() if has_times else None
+        scans.append(Scan(sweep.points, sweep.stamp, times))
+        library.register_frame(sweep.points, times if has_times else np.empty(0))
         expected.append(library.last_pose)
-    np.testing.assert_allclose(drive_poses(kiss, scans), np.stack(expected), atol=1e-9)
+    found = np.stack([kiss.estimate(scan).T_prev_curr for scan in scans])
+    np.testing.assert_allclose(found[3:], inverse(np.stack(expected[2:-1])) @ np.stack(expected[3:]), atol=1e-9)
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
