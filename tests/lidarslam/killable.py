@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -43,7 +42,7 @@ def run(order):
             shutil.copytree(order["out"], os.path.join(order["keep_in"], str(count)))
             del busy.copying
         if count == order["kill_at"]:
-            os.kill(os.getpid(), order["signal"])
+            os.kill(os.getpid(), signal.SIGKILL)
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.addaudithook(see)
@@ -87,7 +86,6 @@ def serving(log: Path) -> Iterator[Callable[..., Ended]]:
         *arguments: object,
         out: Path,
         kill_at: int | None = None,
-        signal: int = signal.SIGKILL,
         keep_in: Path | None = None,
     ) -> Ended:
         order = {
@@ -95,7 +93,6 @@ def serving(log: Path) -> Iterator[Callable[..., Ended]]:
             "out": str(out),
             "log": str(log),
             "kill_at": kill_at,
-            "signal": int(signal),
             "keep_in": None if keep_in is None else str(keep_in),
         }
         count = Path(f"{log}.count")

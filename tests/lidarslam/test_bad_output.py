@@ -193,10 +193,14 @@ def test_links_are_replaced_and_never_written_through(tmp_path, small_recording,
     (finished_run / "unfinished").symlink_to(outside)
     for name in names:
         (finished_run / f".partial-{os.getpid()}-{name}").symlink_to(outside / name)
-    succeeds("run", small_recording, "--out", finished_run, *FAST, "--rerun", "save", "--pcd", "--overwrite")
+    formats = ("--rerun", "save", "--pcd", "--map-format", "laz", "--map-format", "pcd")
+    succeeds("run", small_recording, "--out", finished_run, *FAST, *formats, "--overwrite")
+    assert {path.name for path in finished_run.glob("map.*")} == {"map.ply", "map.pcd", "map.laz"}
     assert {(outside / name).read_text() for name in names} == {"precious"}
     assert not [name for name in names if (finished_run / name).is_symlink()]
     assert summary_of(finished_run)["scans"] == 6
+    succeeds("run", small_recording, "--out", finished_run, *FAST, "--overwrite")
+    assert {path.name for path in finished_run.glob("map.*")} == {"map.ply"}
 
 
 def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(tmp_path, small_recording, whole_run):

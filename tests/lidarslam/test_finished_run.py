@@ -59,7 +59,7 @@ def test_loops_are_those_that_were_closed(finished):
     np.testing.assert_array_equal(load_run(finished).loops, [[0, 2]])
     (finished / "summary.json").write_text(json.dumps({"pose_graph": None}))
     assert load_run(finished).loops.shape == (0, 2)
-    for damaged in ("{", "[]"):
+    for damaged in ("{", "[]", "[" * 100_000, '{"scans": 1e999}'):
         (finished / "summary.json").write_text(damaged)
         with pytest.raises(InputError, match="not a run's summary"):
             load_run(finished)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.trajectory import Trajectory, write_tum
-from lidarslam.storage.directory import MAPS, remove_run
+from lidarslam.storage.directory import remove_run
 from lidarslam.storage.finished_run import load_map
 
 from ..conftest import Drive, lidarslam, succeeds
@@ -105,7 +105,7 @@ def test_tiles_of_others_are_not_touched(small_recording, tmp_path):
 
 
 def test_a_merge_with_tiles(small_recording, tmp_path):
-    """The common map and that of each recording."""
+    """The common map and that of each recording; all of them can be shown."""
     sources = [shutil.copytree(small_recording, tmp_path / name) for name in ("one", "two")]
     out = tmp_path / "merged"
     result = lidarslam("merge", *sources, "--out", out, *FAST[1:], *BOUND)
@@ -114,6 +114,8 @@ def test_a_merge_with_tiles(small_recording, tmp_path):
         index, summary = (json.loads((folder / name).read_text()) for name in ("map/index.json", "summary.json"))
         assert sum(tile["points"] for tile in index["tiles"]) == summary["map_tiles"]["points"] > MOST
         assert 0 < summary["map_points"] <= MOST
+    succeeds("view", out / "01_one", out / "02_two", "--save", tmp_path / "both.rrd")
+    succeeds("view", out, "--picture", tmp_path / "map.png")
 
 
 def test_the_python_interface_writes_tiles(tmp_path, small_recording):
@@ -210,13 +212,3 @@ def test_rings_and_times_are_those_of_the_first_point(source, tmp_path, drive):
     expected = np.where(np.isin(number, WITHOUT), -1, number)
     np.testing.assert_array_equal(known.ring[sure], expected[sure])
     assert np.bincount(number).argmax() == 0
-
-
-@pytest.mark.long
-def test_further_formats(source, tmp_path):
-    pytest.importorskip("pye57")
-    out = tmp_path / "run"
-    run(source, out, *WAYS["true poses"], "--pcd", "--map-format", "laz", "--map-format", "e57", "--map-format", "pcd")
-    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png", *MAPS.values()}
-    run(source, out, *WAYS["true poses"], "--overwrite")
-    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png"}

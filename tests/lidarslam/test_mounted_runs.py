@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidarslam import Slam
 from lidarslam.assessment.inputs import truth_of_run
 from lidarslam.config.settings import load_config
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
@@ -120,21 +119,6 @@ def test_with_the_imu(recordings, tmp_path, method, turn):
     turned = run(recordings[turn], tmp_path / "turned", *odometry, *mounting)
     np.testing.assert_allclose(poses(turned), poses(expected), atol=1e-6)
     np.testing.assert_allclose(load_map(turned).points, load_map(expected).points, atol=1e-5)
-
-
-@pytest.mark.long
-def test_the_python_interface(recordings, simulation, upright):
-    settings = {
-        "odometry.method": "constant-velocity",
-        "mapping.keypoints": 800,
-        "global_map.voxel_size_m": 0.2,
-        "reader.mounting": "camera",
-    }
-    with Slam(settings) as slam:
-        for scan in simulation.scans():
-            slam.register_frame(scan.points @ TURNS["camera"].T, scan.time_offsets, scan.stamp)
-        T_world_lidar = slam.trajectory().T_world_lidar
-    np.testing.assert_allclose(T_world_lidar, poses(upright), atol=1e-6)
 
 
 @pytest.mark.long

@@ -17,8 +17,10 @@ from lidarslam.commands.runs import run
 from lidarslam.compare.plan import parse_methods
 from lidarslam.core import plugins
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.geometry import transform_points
 from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.registry import choose_reader
+from lidarslam.storage.finished_run import load_map
 
 from ..conftest import lidarslam, succeeds
 
@@ -87,13 +89,15 @@ def test_a_run_takes_odometry_mapping_and_metric(example, recording, tmp_path):
     assert any("the mapping cannot save its state" in warning for warning in warnings)
 
 
-def test_a_mapping_corrects_an_added_odometry(example, recording, tmp_path):
+def test_a_mapping_corrects_an_added_odometry(example, recording, tmp_path, room):
     out = tmp_path / "run"
     succeeds("run", recording, "--out", out, "--odometry", "still", "--no-report")
-    truth = read_tum(recording / "ground_truth.tum").positions[:5]
+    truth = read_tum(recording / "ground_truth.tum")
     moved = read_tum(out / "trajectory.tum").positions
-    far, expected = (np.linalg.norm(positions - positions[0], axis=1) for positions in (moved, truth))
+    far, expected = (np.linalg.norm(positions - positions[0], axis=1) for positions in (moved, truth.positions[:5]))
     np.testing.assert_allclose(far, expected, atol=0.02)
+    points = transform_points(truth.T_world_lidar[0], load_map(out).points)
+    assert np.percentile(room.distance_to_surface(points), 95) < 0.1
 
 
 def test_a_source_is_recognised(example, room_scans, tmp_path):

@@ -18,7 +18,7 @@ from lidarslam.config.settings import Config, load_config
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.trajectory import write_tum
-from lidarslam.datasets.mounting import correct_elevation
+from lidarslam.datasets.mounting import correct_elevation, transform_of
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.run import open_odometry
@@ -157,11 +157,13 @@ def test_a_fourth_column_is_the_intensity_of_the_map(slam, room_scans):
 
 
 def test_arrays_are_corrected_as_the_settings_of_the_reader_say(room_scans):
-    reader = {"time_scale": 0.1, "elevation_correction_deg": 2.0}
+    reader = {"time_scale": 0.1, "elevation_correction_deg": 2.0, "mounting": "upside-down"}
+    R_upright_recorded = transform_of("upside-down")[:3, :3]
     with Slam(SETTINGS) as plain, Slam(SETTINGS | {"reader": reader}) as corrects:
         for scan in room_scans[:4]:
             expected = plain.register_frame(scan)
-            found = corrects.register_frame(correct_elevation(scan.points, -2.0), 10.0 * scan.time_offsets, scan.stamp)
+            recorded = correct_elevation(scan.points @ R_upright_recorded, -2.0)
+            found = corrects.register_frame(recorded, 10.0 * scan.time_offsets, scan.stamp)
             np.testing.assert_allclose(found.T_world_lidar, expected.T_world_lidar, atol=1e-6)
         as_it_is = corrects.register_frame(room_scans[4])
         np.testing.assert_allclose(as_it_is.T_world_lidar, plain.register_frame(room_scans[4]).T_world_lidar, atol=1e-6)

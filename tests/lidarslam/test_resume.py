@@ -197,17 +197,6 @@ def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
     )
 
 
-@pytest.mark.long
-def test_a_run_that_is_stopped_can_be_resumed_as_well(expected, tmp_path):
-    """Ctrl-C comes just as a state is written; what there is can be looked at meanwhile."""
-    out = tmp_path / "run"
-    ended = expected.again(out, kill_at=expected.ended.events // 3, signal=signal.SIGINT)
-    assert ended.status == 1
-    assert "interrupted; continue with --resume" in ended.said
-    assert 0 < len(load_run(out).trajectory) < 12
-    assert "stopped after" not in expected.assert_finishes(out, "--resume").said
-
-
 @pytest.fixture(scope="module")
 def killed_once(expected: Whole, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("killed") / "run"

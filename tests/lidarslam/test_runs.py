@@ -141,14 +141,6 @@ def test_a_run_says_that_the_times_are_wrong(walk, tmp_path, scale, fault):
     assert all(f"times are {fault}" in text for text in warnings)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("mounting", ["auto", "upright", "left"])
-def test_the_scale_holds_for_any_mounting(walk, mounting):
-    configs = (ReaderConfig.model_validate({"mounting": mounting, "time_scale": scale}) for scale in (1.0, -0.5))
-    (recorded,), (scaled,) = (list(open_recording(walk, config).scans(stop=1)) for config in configs)
-    np.testing.assert_array_equal(scaled.time_offsets, -0.5 * recorded.time_offsets)
-
-
 @pytest.mark.parametrize(("T_lidar_body", "is_warned"), [
     (np.eye(4), False), (exp([0.0, 0.0, 0.0, 0.3, 0.0, 0.2]), False),
     (exp([0.0, 0.0, 0.5 * np.pi, 0.0, 0.0, 0.0]), True),
