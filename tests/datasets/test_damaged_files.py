@@ -4,7 +4,6 @@ Nothing else may come out of any reader: no other exception, no warning of NumPy
 """
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -121,40 +120,7 @@ def test_folder_of_damaged_scans(tmp_path, table, name, damage, place):
     assert check(tmp_path) >= SCANS - 1
 
 
-def check_damaged(source: Path, name: str, damage: Callable[[bytes, int], bytes]) -> int:
-    """Damage one file of a recording, read scans and truth, and mend the file again."""
-    whole = (source / name).read_bytes()
-    (source / name).write_bytes(damage(whole, len(whole)))
-    try:
-        count = check(source)
-        truth = open_recording(source).ground_truth
-        assert truth is None or np.isfinite(truth.T_world_lidar).all()
-    except InputError as error:
-        assert "\n" not in str(error)  # noqa: PT017
-    finally:
-        (source / name).write_bytes(whole)
-    return count
-
-
-@pytest.fixture
-def sequence(tmp_path, rng) -> Path:
-    write_sequence(tmp_path, rng)
-    return tmp_path / "sequences" / "04"
-
-
-@pytest.mark.parametrize("name", ["times.txt", "calib.txt", "../../poses/04.txt", "velodyne/000002.bin"])
-@fuzzed(12)
-@given(damage=damages())
-def test_damaged_kitti_sequence(sequence, name, damage):
-    count = check_damaged(sequence, name, damage)
-    assert count >= 5 or name == "times.txt"
-
-
-@pytest.fixture
-def drive(tmp_path, rng) -> Path:
-    return write_drive(tmp_path, rng)
-
-
+SEQUENCE_FILES = ("times.txt", "calib.txt", "../../poses/04.txt", "velodyne/000002.bin")
 RAW_FILES = (
     "velodyne_points/timestamps.txt",
     "velodyne_points/timestamps_start.txt",
@@ -165,11 +131,22 @@ RAW_FILES = (
 )
 
 
-@pytest.mark.parametrize("name", RAW_FILES)
+@pytest.mark.parametrize("name", [*SEQUENCE_FILES, *RAW_FILES])
 @fuzzed(12)
 @given(damage=damages())
-def test_damaged_kitti_raw_drive(drive, name, damage):
-    check_damaged(drive, name, damage)
+def test_damaged_drives_of_kitti(tmp_path_factory, rng, name, damage):
+    folder = tmp_path_factory.mktemp("kitti")
+    source = folder / "sequences" / "04" if name in SEQUENCE_FILES else write_drive(folder, rng)
+    if name in SEQUENCE_FILES:
+        write_sequence(folder, rng)
+    whole = (source / name).read_bytes()
+    (source / name).write_bytes(damage(whole, len(whole)))
+    assert check(source) >= 5 or name in ("times.txt", *RAW_FILES)
+    try:
+        truth = open_recording(source).ground_truth
+        assert truth is None or np.isfinite(truth.T_world_lidar).all()
+    except InputError as error:
+        assert "\n" not in str(error)  # noqa: PT017
 
 
 @pytest.fixture

@@ -224,14 +224,6 @@ def test_simulated_time_from_zero(ros2_kit, reference):
     assert recording.describe().point_time.reference == reference
 
 
-def test_empty_clouds_are_scans_without_points(ros2_kit, make_sweep):
-    sweep = make_sweep("ouster", STAMP_NS)
-    clouds = recorded(ros2_kit, [sweep, sweep])
-    clouds[0] = (clouds[0][0], ros2_kit.cloud(sweep.records[:0], STAMP_NS))
-    scans = list(open_recording(ros2_kit.write({"/points": clouds})).scans())
-    assert [len(scan) for scan in scans] == [0, 200]
-
-
 def test_truth_files_by_name(tmp_path):
     inner = tmp_path / "drive"
     inner.mkdir()

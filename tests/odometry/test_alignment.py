@@ -236,12 +236,6 @@ def corridor_walls() -> FloatArray:
     return information(np.eye(3)[axis], points)
 
 
-def test_a_corridor_is_open_along_it(corridor_walls):
-    found = alignment.find_degeneracy(corridor_walls, 4000, images())
-    assert found.names == ("x",)
-    np.testing.assert_allclose(np.abs(found.directions), [[0, 0, 0, 1, 0, 0]], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("share", "range_m", "count"), [(0.0005, 4.0, 1), (0.002, 4.0, 0), (0.004, 1.0, 1), (0.004, 5.0, 0)]
 )
