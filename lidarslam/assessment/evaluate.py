@@ -19,6 +19,7 @@ from lidarslam.assessment.inputs import (
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import written
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.point_files import Columns, write_ply
 from lidarslam.core.text import as_typed, command_line, joined
 from lidarslam.core.trajectory import Trajectory, read_transform
 from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult
@@ -47,16 +48,11 @@ from lidarslam.evaluation.trajectory.metrics import (
     evaluate_trajectory,
     metrics_json,
 )
-from lidarslam.simulation.writers import write_ply
+from lidarslam.mapping.global_map.point_cloud import COLOURS
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 
 _SUFFIXES = (".ply", ".rrd")
-_FIELDS = [
-    *((axis, "<f8") for axis in "xyz"),
-    *((colour, "|u1") for colour in ("red", "green", "blue")),
-    (DISTANCE_FIELD, "<f4"),
-]
 _DRAWN_POINTS = 200_000
 
 
@@ -313,12 +309,11 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, c
         save(show_errors(comparison, positions, clip_m), path)
         return
     errors = comparison.map_errors
-    columns = [*errors.points.T, *error_colours(errors.distances_m, clip_m).T, errors.distances_m]
-    vertices = np.empty(len(errors.points), _FIELDS)
-    for (name, _), column in zip(_FIELDS, columns, strict=True):
-        vertices[name] = column
+    columns: Columns = dict(zip("xyz", errors.points.T, strict=True))
+    columns |= zip(COLOURS, error_colours(errors.distances_m, clip_m).T, strict=True)
+    columns[DISTANCE_FIELD] = errors.distances_m.astype(np.float32)
     with written(path) as partial:
-        write_ply(partial, vertices)
+        write_ply(partial, columns)
 
 
 _LABEL = 18

@@ -13,6 +13,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write
+from lidarslam.core.point_files import write_ply
 from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import as_typed, command_line, count, joined, small_length
 from lidarslam.core.trajectory import Trajectory, write_tum
@@ -23,7 +24,7 @@ from lidarslam.simulation.reference_map import KeyArray, SeenSurfaces, sample_se
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import build_world, choose
-from lidarslam.simulation.writers import FORMATS, as_records, write_ply
+from lidarslam.simulation.writers import FORMATS
 
 
 @dataclass(frozen=True)
@@ -273,8 +274,8 @@ def record(request: RecordRequest, progress: Callable[[int, int], None] = lambda
         stamps = np.array([clock_s(stamp, chosen.clock_start_ns) for stamp in truth.stamps])
         write_tum(folder / GROUND_TRUTH, Trajectory(stamps, truth.T_world_lidar))
         true_map = sample_seen(world_mesh(simulation.world), seen, spacing_m)
-        columns = zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack(true_map).T, strict=True)
-        write_ply(folder / REFERENCE_MAP, as_records({name: ("<f4", values) for name, values in columns}))
+        columns = np.hstack(true_map).T.astype(np.float32)
+        write_ply(folder / REFERENCE_MAP, dict(zip(("x", "y", "z", "nx", "ny", "nz"), columns, strict=True)))
         summary = RecordingSummary(
             source=chosen.source_in(request.out),
             rate_hz=sensor.rate_hz,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.point_files import POINTS_AT_A_TIME, Columns, write_ply, write_table
 from lidarslam.core.scan import PointAttributes
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 # Nearest points that a normal is estimated from.
 _NORMAL_NEIGHBOURS = 20
-_POINTS_AT_A_TIME = 1_000_000
-_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 # Metres; 32 bits of it reach 200 km to either side.
 _LAZ_STEP_M = 1e-4
 _LAZ_FULL = 65535.0
@@ -100,17 +99,10 @@ def write_cloud(path: Path, cloud: PointCloud, brightest: float | None = None) -
         raise OutputError(f"{path.parent}: the {path.suffix} map cannot be written there ({reason})") from error
 
 
-def _write_ply(path: Path, cloud: PointCloud) -> None:
-    columns = _columns(cloud)
-    properties = "".join(f"property {_PLY_TYPES[values.dtype.str[1:]]} {name}\n" for name, values in columns.items())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n{properties}end_header\n"
-    _write_table(path, header, columns)
-
-
 def _write_pcd(path: Path, cloud: PointCloud) -> None:
     columns = {name.replace("n", "normal_", 1) if name in _NORMALS else name: v for name, v in _columns(cloud).items()}
     if cloud.attributes.rgb is not None:  # the Point Cloud Library packs colours into the bits of a float
-        red, green, blue = (columns.pop(name).astype(np.uint32) for name in _COLOURS)
+        red, green, blue = (columns.pop(name).astype(np.uint32) for name in COLOURS)
         columns["rgb"] = (red << 16 | green << 8 | blue).view(np.float32)
     types = [values.dtype for values in columns.values()]
     header = (
@@ -119,37 +111,24 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
         f"TYPE {' '.join(one.kind.upper() for one in types)}\nCOUNT {' '.join('1' for _ in types)}\n"
         f"WIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(cloud)}\nDATA binary\n"
     )
-    _write_table(path, header, columns)
+    write_table(path, header, columns)
 
 
 _MOST_ROUNDING_M = 1e-4
 _NORMALS = ("nx", "ny", "nz")
-_COLOURS = ("red", "green", "blue")
-_Columns = dict[str, NDArray[np.generic]]
+COLOURS = ("red", "green", "blue")
 
 
-def _columns(cloud: PointCloud) -> _Columns:
+def _columns(cloud: PointCloud) -> Columns:
     """The columns (N,) of a table of the points, by the names of PLY properties."""
     points: NDArray[np.floating] = cloud.points.astype(np.float32)
     if np.abs(points - cloud.points).max(initial=0.0) > _MOST_ROUNDING_M:  # survey coordinates, or kilometres
         points = cloud.points
-    columns: _Columns = dict(zip("xyz", points.T, strict=True))
+    columns: Columns = dict(zip("xyz", points.T, strict=True))
     columns |= zip(_NORMALS, cloud.normals.astype(np.float32).T, strict=True)
     for name, values in cloud.attributes.present():
-        columns |= zip(_COLOURS, values.T, strict=True) if name == "rgb" else [(name, values)]
+        columns |= zip(COLOURS, values.T, strict=True) if name == "rgb" else [(name, values)]
     return columns
-
-
-def _write_table(path: Path, header: str, columns: _Columns) -> None:
-    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    count = len(columns["x"])
-    with path.open("wb") as out:
-        out.write(header.encode("ascii"))
-        for first in range(0, count, _POINTS_AT_A_TIME):
-            table = np.empty(min(_POINTS_AT_A_TIME, count - first), dtype=dtype)
-            for name, values in columns.items():
-                table[name] = values[first : first + len(table)]
-            out.write(table.tobytes())
 
 
 def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None, brightest: float | None = None) -> None:
@@ -183,8 +162,8 @@ def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None, brightest: 
     if known.time is not None:
         columns["gps_time"] = known.time
     with laspy.open(path, mode="w", header=header, do_compress=True) as file:
-        for first in range(0, len(cloud), _POINTS_AT_A_TIME):
-            rows = slice(first, first + _POINTS_AT_A_TIME)
+        for first in range(0, len(cloud), POINTS_AT_A_TIME):
+            rows = slice(first, first + POINTS_AT_A_TIME)
             record = laspy.ScaleAwarePointRecord.zeros(len(cloud.points[rows]), header=header)
             for name, values in columns.items():
                 record[name] = values[rows]
@@ -212,7 +191,7 @@ def write_e57(path: Path, cloud: PointCloud) -> None:
 
 # With their exceptions where a file cannot be written; laspy, its compressor and libE57Format raise any.
 _WRITERS: dict[str, tuple[Callable[[Path, PointCloud], None], type[Exception]]] = {
-    ".ply": (_write_ply, OSError),
+    ".ply": (lambda path, cloud: write_ply(path, _columns(cloud)), OSError),
     ".pcd": (_write_pcd, OSError),
     ".laz": (write_laz, Exception),
     ".e57": (write_e57, Exception),
