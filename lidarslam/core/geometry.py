@@ -45,6 +45,15 @@ def skew(v: FloatArray) -> FloatArray:
     return K
 
 
+def rotation_z(yaw: ArrayLike) -> FloatArray:
+    """Rotations (..., 3, 3) about z by angles (...)."""
+    R = np.zeros((*np.shape(yaw), 3, 3))
+    R[..., 0, 0] = R[..., 1, 1] = np.cos(yaw)
+    R[..., 1, 0] = np.sin(yaw)
+    R[..., 0, 1], R[..., 2, 2] = -R[..., 1, 0], 1.0
+    return R
+
+
 def levelling(up: FloatArray) -> FloatArray:
     """The smallest rotation (3, 3) that turns a unit vector (3,) to z; half a turn about x if that points down."""
     if up[2] < -1.0 + 1e-9:

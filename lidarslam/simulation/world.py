@@ -8,7 +8,7 @@ from typing import TypeVar, cast
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, make_transform, rotation_z
 
 T = TypeVar("T")
 
@@ -90,11 +90,7 @@ class Mover:
         along = np.mod(self.start_m + self.speed_mps * times, ends[-1])
         leg = np.minimum(np.searchsorted(ends, along, side="right"), len(lengths) - 1)
         fraction = (along - (ends[leg] - lengths[leg])) / lengths[leg]
-        yaw = np.arctan2(steps[leg, 1], steps[leg, 0])
-        R = np.zeros((len(times), 3, 3))
-        R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
-        R[:, 1, 0] = np.sin(yaw)
-        R[:, 0, 1], R[:, 2, 2] = -R[:, 1, 0], 1.0
+        R = rotation_z(np.arctan2(steps[leg, 1], steps[leg, 0]))
         return make_transform(R, self.waypoints[leg] + fraction[:, None] * steps[leg])
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft2
 
-from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, rotation_z
 from lidarslam.mapping.loops.sparse_submap import PLANE, SparseSubmap
-from lidarslam.mapping.tracking.birds_eye_map import correlate, height_shift, yaw_rotation
+from lidarslam.mapping.tracking.birds_eye_map import correlate, height_shift
 
 _DIRECTIONS = 60  # over half a turn
 _BINS = 64
@@ -84,7 +84,7 @@ def align(
         prior = np.clip(1.0 - squared / (within_m + cell_m) ** 2, 0.0, None)
     score, turn, shift = -1.0, np.eye(3), [0.0, 0.0]
     for yaw in yaws:
-        R = yaw_rotation(yaw)
+        R = rotation_z(yaw)
         here = _image(source.structure @ R[:2, :2].T, radius_m, size)
         overlay = prior * correlate(spectrum, here, (size, size))
         peak = np.unravel_index(int(overlay.argmax()), overlay.shape)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from lidarslam.core.geometry import FloatArray, levelling, make_transform
+from lidarslam.core.geometry import FloatArray, levelling, make_transform, rotation_z
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.tracking.budget import Steps
 
@@ -73,7 +73,7 @@ class BirdsEyeMap:
         peaks = []
         for yaw in np.arange(_YAWS) * (2.0 * np.pi / _YAWS):
             yield
-            turn = yaw_rotation(yaw).T
+            turn = rotation_z(yaw).T
             image = _image(level @ turn, free @ turn[:2, :2], reach_m, self.cell_m)
             norm = float(np.linalg.norm(image))
             if norm == 0.0:
@@ -111,7 +111,7 @@ class BirdsEyeMap:
         away = self.points[:, :2] - xy
         around = self.points[np.einsum("ij,ij->i", away, away) < reach_m**2, 2]
         z = height_shift(around, level[:, 2], self.cell_m / _HEIGHT_BINS)
-        R = self.R_level_world.T @ yaw_rotation(yaw) @ self.R_level_world @ T_world_lidar[:3, :3]
+        R = self.R_level_world.T @ rotation_z(yaw) @ self.R_level_world @ T_world_lidar[:3, :3]
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
 
 
@@ -178,12 +178,6 @@ def _apart(
             if len(chosen) == most:
                 break
     return chosen
-
-
-def yaw_rotation(yaw: float) -> FloatArray:
-    """(3, 3) the rotation about z."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def correlate(spectrum: NDArray[Any], image: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, rotation_z
 from lidarslam.core.scan import Scan
 from lidarslam.simulation.mesh import Caster
 from lidarslam.simulation.motion import mount_pose
@@ -14,7 +14,6 @@ from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World, build_world
-from lidarslam.simulation.worlds.building import rotation_z
 
 EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 

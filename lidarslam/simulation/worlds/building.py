@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, rotation_z
 from lidarslam.simulation.world import Boxes, Cylinders
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -19,12 +19,6 @@ HAIR_M = 0.002  # by which neighbouring faces are offset from one plane
 Limits = tuple[float, float] | Sequence[float]  # lower and upper bound along an axis
 Vector = Sequence[float] | FloatArray
 Spans = Limits | Sequence[Limits] | FloatArray  # limits or several (N, 2)
-
-
-def rotation_z(yaw: float) -> FloatArray:
-    """(3, 3) rotation about the vertical, radians."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def around(middles: Vector, half: float) -> FloatArray:

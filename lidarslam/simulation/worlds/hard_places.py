@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, make_transform, rotation_z
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import building, interior, outdoor, paths
 from lidarslam.simulation.worlds.building import OUTER_WALL_M, Builder, Opening, Room
@@ -295,5 +295,5 @@ def _person(rng: np.random.Generator, line: FloatArray, speed_mps: float, start_
     """A pedestrian on a closed line (M, 2); one who stands looks anywhere."""
     part = Builder()
     yaw = 0.0 if speed_mps else rng.uniform(-np.pi, np.pi)
-    part.place(outdoor.pedestrian(rng), make_transform(building.rotation_z(yaw), np.zeros(3)))
+    part.place(outdoor.pedestrian(rng), make_transform(rotation_z(yaw), np.zeros(3)))
     return Mover(part.boxes, np.column_stack([line, np.zeros(len(line))]), speed_mps, start_m)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, make_transform, rotation_z
 from lidarslam.simulation.world import Grass, HeightField, Route
 from lidarslam.simulation.worlds import paths
-from lidarslam.simulation.worlds.building import Builder, heading, rotation_z, smooth_noise, starting
+from lidarslam.simulation.worlds.building import Builder, heading, smooth_noise, starting
 
 # Feet extend this far down, so that nothing hovers on a slope.
 SUNK_M = 0.3
