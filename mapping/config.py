@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from lidarslam.core.plugins import PlugPoint
-from lidarslam.core.settings import Settings, require_range_left
+from lidarslam.core.settings import RangeSettings, Settings
 
 MappingName = Literal["surfels", "loam", "off"]
 MAPPINGS = PlugPoint("mapping", get_args(MappingName))
@@ -34,7 +34,7 @@ class TrackingConfig(Settings):
         return self
 
 
-class MappingConfig(Settings):
+class MappingConfig(RangeSettings):
     """Scan-to-map registration."""
 
     method: Annotated[str, BeforeValidator(MAPPINGS.check)] = Field(
@@ -84,13 +84,8 @@ class MappingConfig(Settings):
         """YAML parses `off` as false."""
         return "off" if value is False else value
 
-    @model_validator(mode="after")
-    def _ranges_leave_points(self) -> Self:
-        require_range_left(self.min_range_m, self.max_range_m)
-        return self
 
-
-class GlobalMapConfig(Settings):
+class GlobalMapConfig(RangeSettings):
     """The merged map of a run."""
 
     voxel_size_m: float | None = Field(
@@ -117,11 +112,6 @@ class GlobalMapConfig(Settings):
         ("intensity", "rgb"),
         description="point attributes of the map, where scans have them: intensity, rgb, ring, time",
     )
-
-    @model_validator(mode="after")
-    def _ranges_leave_something(self) -> Self:
-        require_range_left(self.min_range_m, self.max_range_m)
-        return self
 
 
 class KeyframeConfig(Settings):

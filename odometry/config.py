@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.plugins import PlugPoint
-from lidarslam.core.settings import Settings, require_range_left
+from lidarslam.core.settings import RangeSettings, Settings
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
 ODOMETRIES = PlugPoint("odometry", get_args(OdometryName))
@@ -33,7 +33,7 @@ class LearnedConfig(Settings):
     )
 
 
-class KissConfig(Settings):
+class KissConfig(RangeSettings):
     """KISS-ICP; the defaults are its own."""
 
     max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="farther points are ignored")
@@ -47,11 +47,6 @@ class KissConfig(Settings):
     )
     deskew: bool = Field(True, description="compensate the sensor's motion within each scan")
     threads: int = Field(0, ge=0, le=256, description="0: all cores")
-
-    @model_validator(mode="after")
-    def _ranges_leave_something(self) -> Self:
-        require_range_left(self.min_range_m, self.max_range_m)
-        return self
 
 
 class OdometryConfig(Settings):

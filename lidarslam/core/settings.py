@@ -1,6 +1,8 @@
-"""The base of all settings that a configuration file holds, and a check of two settings against each other."""
+"""The bases of all settings that a configuration file holds."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Settings(BaseModel):
@@ -9,9 +11,12 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def require_range_left(min_range_m: float, max_range_m: float) -> None:
-    """The minimum range must be below the maximum."""
-    if min_range_m >= max_range_m:
-        raise ValueError(
-            f"min_range_m={min_range_m:g} must be less than max_range_m={max_range_m:g}, or no point is left"
-        )
+class RangeSettings(Settings):
+    """Settings of which `min_range_m` and `max_range_m` are two."""
+
+    @model_validator(mode="after")
+    def _ranges_leave_something(self) -> Self:
+        least, most = self.min_range_m, self.max_range_m  # type: ignore[attr-defined]
+        if least >= most:
+            raise ValueError(f"min_range_m={least:g} must be less than max_range_m={most:g}, or no point is left")
+        return self
