@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
-from lidarslam.evaluation.map.voxel_thinning import thin
+from lidarslam.core.thinning import first_per_cell
 
 GLOBAL = "global"
 
@@ -142,10 +142,10 @@ class _Clouds:
         if not len(map_points) or not len(reference_points):
             raise InputError("the map or its reference holds no point; nothing can be aligned")
         cell_m = _FINEST_CELL_M
-        mapped, reference = thin(map_points, cell_m), thin(reference_points, cell_m)
+        mapped, reference = first_per_cell(map_points, cell_m), first_per_cell(reference_points, cell_m)
         while max(len(mapped), len(reference)) > _MOST_POINTS:
             cell_m *= 1.3
-            mapped, reference = thin(mapped, cell_m), thin(reference, cell_m)
+            mapped, reference = first_per_cell(mapped, cell_m), first_per_cell(reference, cell_m)
         for cloud, name in ((mapped, "the map"), (reference, "its reference")):
             if len(cloud) < _FEWEST_POINTS:
                 few = f"{name} has points in {len(cloud)} cells of {cell_m:g} m"
@@ -259,10 +259,10 @@ def candidate_poses(source: FloatArray, target: FloatArray) -> list[FloatArray]:
 def _register(source: FloatArray, target: FloatArray, cell_m: float) -> FloatArray:
     import open3d as o3d
 
-    clouds = thin(source, cell_m), thin(target, cell_m)
+    clouds = first_per_cell(source, cell_m), first_per_cell(target, cell_m)
     while max(map(len, clouds)) > _MOST_FEATURES:
         cell_m *= 1.2
-        clouds = thin(source, cell_m), thin(target, cell_m)
+        clouds = first_per_cell(source, cell_m), first_per_cell(target, cell_m)
     registration, described = o3d.pipelines.registration, []
     for points in clouds:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.map.voxel_thinning import thin
+from lidarslam.core.thinning import first_per_cell
 
 DEFAULT_RADIUS_M = 0.3
 DEFAULT_SPACING_M = 0.05
@@ -56,7 +56,7 @@ def map_entropy(
     thinned first; of a large map an even sample of the points is taken, each with all its neighbours. None when no
     point has enough neighbours.
     """
-    thinned = thin(points, spacing_m)
+    thinned = first_per_cell(points, spacing_m)
     if len(thinned) < _FEWEST_NEIGHBOURS:
         return None
     import open3d as o3d

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import median_gap_m
-from lidarslam.evaluation.map.voxel_thinning import thin
+from lidarslam.core.thinning import first_per_cell
 
 F_SCORE_THRESHOLDS_M = (0.1, 0.2, 0.5)
 SUBT_TOLERANCES_M = (1.0,)
@@ -95,7 +95,7 @@ def compare_maps(
     `spacing_m`.
     """
     origin = reference_points.mean(axis=0) if len(reference_points) else np.zeros(3)
-    mapped, reference = thin(map_points - origin, spacing_m), thin(reference_points - origin, spacing_m)
+    mapped, reference = (first_per_cell(cloud - origin, spacing_m) for cloud in (map_points, reference_points))
     in_range = np.ones(len(reference), dtype=np.bool_)
     if positions is not None and np.isfinite(max_range_m):
         in_range = np.isfinite(_distances(reference, positions - origin, max_range_m))

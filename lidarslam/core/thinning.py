@@ -1,5 +1,6 @@
-"""Voxel downsampling by a spatial hash, after Teschner et al., "Optimized Spatial Hashing" (VMV 2003)."""
+"""Voxel downsampling by a spatial hash, after Teschner et al., "Optimized Spatial Hashing" (VMV 2003), or exactly."""
 
+import math
 import threading
 
 import numpy as np
@@ -13,6 +14,7 @@ _SLOTS = 1 << 20
 _PRIME_X, _PRIME_Y, _PRIME_Z = 73_856_093, 19_349_669, 83_492_791
 # Points farther away, in cells, share one cell: the range of the integers.
 _FARTHEST = float(1 << 31)
+_MOST_KEYS = 2**63 - 1
 # Number of elements that loops prefetch ahead.
 _PREFETCHED = 32
 
@@ -40,6 +42,25 @@ def central_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     slots = _slots_of(points, cell_m)
     sums = np.empty((len(points), 4), dtype=np.float32)
     return np.sort(kept[: _most_central(points, slots, _slot_values(), sums, kept)])
+
+
+def first_per_cell(points: FloatArray, cell_m: float) -> FloatArray:
+    """One of the points (N, 3) for every occupied cell, (M, 3), in the order of the cells.
+
+    It is the cell's first point, not the mean that Open3D gives, which would smooth the noise to be measured. Cells
+    are counted from the cloud's lowest corner.
+    """
+    if not len(points):
+        return points
+    cells = np.floor((points - points.min(axis=0)) / cell_m)
+    sizes = [int(size) + 1 for size in cells.max(axis=0)]
+    columns = list(cells.astype(np.int64).T) if max(sizes) < _MOST_KEYS else list(cells.T)
+    if math.prod(sizes) > _MOST_KEYS:  # a stray point far away: number the occupied rows of cells only
+        columns = [np.unique(column, return_inverse=True)[1] for column in columns]
+        sizes = [int(column.max()) + 1 for column in columns]
+    keys = (columns[0] * sizes[1] + columns[1]) * sizes[2] + columns[2]
+    _, first = np.unique(keys, return_index=True)
+    return points[first]
 
 
 def evenly(indices: NDArray[np.intp], most: int) -> NDArray[np.intp]:

@@ -10,8 +10,8 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+from lidarslam.core.thinning import first_per_cell
 from lidarslam.evaluation.map.alignment import align_map
-from lidarslam.evaluation.map.voxel_thinning import thin
 
 from ..mapping.shapes import on_boxes
 
@@ -65,7 +65,7 @@ def test_a_guess_is_refined_and_the_correction_told(building):
     found = align_map(seen, building, {"file": np.eye(4)})
     assert _error(found.T_reference_map, T_off, building) < 0.01
     assert found.moved_deg == pytest.approx(np.rad2deg(rotation_angle(T_off)), abs=0.02)
-    middle = np.median(thin(seen, 0.1), axis=0, keepdims=True)
+    middle = np.median(first_per_cell(seen, 0.1), axis=0, keepdims=True)
     assert found.moved_m == pytest.approx(_error(T_off, np.eye(4), middle), abs=0.01)
     assert found.refined
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.thinning import first_per_cell
 from lidarslam.evaluation.map.entropy import map_entropy
 from lidarslam.evaluation.map.metrics import compare_maps
-from lidarslam.evaluation.map.voxel_thinning import thin
 from lidarslam.evaluation.report.drawing import error_colours
 
 UTM = np.array([5e5, 5e6, 300.0])
@@ -91,7 +91,7 @@ def test_distances_belong_to_their_points(plane):
 
 def test_thinning_keeps_one_actual_point_a_cell(rng):
     points = rng.uniform(-3.0, 3.0, (5_000, 3))
-    thinned = thin(points, 0.5)
+    thinned = first_per_cell(points, 0.5)
     cells = {tuple(cell) for cell in np.floor((points - points.min(axis=0)) / 0.5).astype(int)}
     assert len(thinned) == len(cells)
     assert {tuple(p) for p in thinned} <= {tuple(p) for p in points}
