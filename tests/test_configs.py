@@ -10,17 +10,18 @@ from lidarslam.config.settings import (
     BENCHMARKS,
     CONFIGS,
     Config,
+    TrainConfig,
     YamlError,
     dump_yaml,
     headline,
     load_config,
+    load_train_config,
     parse_yaml,
     reader_settings,
     shipped_files,
 )
 from lidarslam.core.errors import ConfigError
 from lidarslam.mapping.config import MappingConfig, MappingName
-from lidarslam.train.settings import TrainConfig, load_train_config
 
 from .conftest import lidarslam
 

@@ -285,8 +285,7 @@ def take_where(options: dict[str, Any]) -> "Where":
 @config_options
 def config(listing: bool, is_training: bool, config_file: Path | None, settings: tuple[str, ...]) -> None:
     """Print the resolved configuration as YAML."""
-    from lidarslam.config.settings import dump_yaml, load_config
-    from lidarslam.train.settings import load_train_config
+    from lidarslam.config.settings import dump_yaml, load_config, load_train_config
 
     if listing:
         say("\n".join(_shipped()))

@@ -23,7 +23,7 @@ from lidarslam.core.settings import Settings
 from lidarslam.core.text import one_line
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
-from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.config import OdometryConfig, SimulatedConfig, TrainingConfig
 from lidarslam.storage.directory import RUN_SECTION
 
 # A configuration has a few kilobytes.
@@ -207,7 +207,23 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
 
     ConfigError where the file is not readable YAML, a key does not exist, or a value does not fit.
     """
-    return load_model(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
+    return _load(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
+
+
+class TrainConfig(Settings):
+    """Everything that determines the results of a training."""
+
+    training: TrainingConfig = TrainingConfig()
+    reader: ReaderConfig = ReaderConfig()
+    simulated: SimulatedConfig = SimulatedConfig()
+
+
+def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) -> TrainConfig:
+    """The defaults, changed by a YAML file and then by settings such as `training.batch=8`.
+
+    ConfigError where the file is not readable YAML, a key does not exist, or a value does not fit.
+    """
+    return _load(TrainConfig, path, settings, "training.batch=8")
 
 
 def make_config(given: Config | PathLike[str] | str | Mapping[str, Any] | None) -> Config:
@@ -222,7 +238,7 @@ def make_config(given: Config | PathLike[str] | str | Mapping[str, Any] | None) 
     return _validated(Config, tree, "settings")
 
 
-def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
+def _load(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
     """Any configuration: its defaults, changed by a YAML file and then by settings like the example.
 
     The section of a run's or training's config.yaml about its source is ignored.

@@ -16,7 +16,14 @@ import torch
 from torch import Generator, Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, read_yaml, reader_settings
+from lidarslam.config.settings import (
+    SOURCES_SECTION,
+    TrainConfig,
+    dump_yaml,
+    load_train_config,
+    read_yaml,
+    reader_settings,
+)
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer, remove_partial_files, require_no_link
 from lidarslam.core.tasks import SERIAL, Where
@@ -39,9 +46,16 @@ from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import data
 from lidarslam.train import directory as files
-from lidarslam.train.settings import LOSSES, TrainConfig, load_train_config
 
 DeviceName = Literal["auto", "cpu", "cuda"]
+# The settings that `--losses` stands for.
+_LOSSES = {
+    "both": ("training.geometric={}", "training.alignment_weight=0"),
+    "point-to-plane": ("training.geometric={plane_to_plane: false}", "training.alignment_weight=0"),
+    "plane-to-plane": ("training.geometric={point_to_plane: false}", "training.alignment_weight=0"),
+    "paper": ("training.geometric={robust: false}", "training.alignment_weight=0"),
+    "alignment": ("training.geometric=null", "training.alignment_weight=1"),
+}
 
 
 class Devices:
@@ -440,7 +454,7 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
         start_from = default_weights() if start_from == "shipped" else Path(start_from)
     named = {"training.steps": options["steps"], "training.network.name": options["network"]}
     settings = [
-        *(() if options["losses"] is None else LOSSES[options["losses"]]),
+        *(() if options["losses"] is None else _LOSSES[options["losses"]]),
         *options["settings"],
         *(f"{key}={value}" for key, value in named.items() if value is not None),
         *reader_settings(name=options["reader"], topic=options["topic"], sequence=options["sequence"]),

@@ -10,13 +10,12 @@ import pytest
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from lidarslam.config.settings import Config, bounds_of, bounds_text, load_config
+from lidarslam.config.settings import Config, TrainConfig, bounds_of, bounds_text, load_config
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import read_tum
 from lidarslam.datasets.folders.scan_files import read_ply
-from lidarslam.train.settings import TrainConfig
 
 from ..conftest import lidarslam, write_recording
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidarslam.config.settings import load_train_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import inverse, log, make_transform
 from lidarslam.core.scan import Scan
@@ -33,7 +34,6 @@ from lidarslam.simulation.record import RecordRequest, make_simulation
 from lidarslam.train import data as training_data
 from lidarslam.train.data import MapTeacher, Stretch, draw_weights, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
-from lidarslam.train.settings import load_train_config
 from lidarslam.train.train import TrainRequest, execute
 
 from ..conftest import lidarslam, succeeds
