@@ -138,15 +138,6 @@ GROUND_TRUTH = "ground truth"
 WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 """Statuses of a run that came to the recording's end; of any other, the figures are of a part."""
 
-_TIMES = (
-    "elapsed_ms_per_scan",
-    "latency_ms_median",
-    "latency_ms_p99",
-    "times_cover",
-    "ms_per_scan_median",
-    "ms_per_scan_p95",
-    "ms_per_scan_p99",
-)
 # Runs of lost scans with a shorter tracked gap between them are one interval.
 _MERGED_GAP_S = 1.0
 
@@ -207,7 +198,8 @@ class MethodResult:
             "status": self.status,
             "message": self.message,
             "metrics": metrics_json(self.metrics, self.map_metrics) if measured else None,
-            **{name: getattr(self, name) for name in _TIMES},
+            "times_cover": self.times_cover,
+            **{name: getattr(self, name) for name, quantity in QUANTITIES.items() if quantity.is_time},
             "stage_ms": dict(self.stage_ms),
             "scans": self.scans,
             "lost_scans": self.lost_scans,

@@ -271,21 +271,18 @@ def _leaving(measured: Measured, panels: Mapping[str, Sequence[FloatArray]], sig
     return "".join([*notes, " A double click shows all."] if notes else notes)
 
 
-def length_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
-    """Drift by segment length, KITTI's and the short one; None when no trajectory is long enough for either."""
-    short, kitti, _ = drift_series(sequence)
+def drift_figures(sequence: SequenceComparison, styles: Styles) -> list[Figure | None]:
+    """Drift by segment length, KITTI's and the short one, and KITTI's by the speed over the segment; None without."""
+    short, kitti, by_speed = drift_series(sequence)
     caption = (
         "Mean translation error in percent of the segment length and mean rotation error per 100 m (segments of 100 to"
         " 800 m, as the KITTI development kit computes it) or per 10 m (segments of 5 to 100 m)."
     )
-    return _drift_figure("Drift by segment length", caption, [kitti, short], "segment length [m]", short, styles)
-
-
-def speed_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
-    """KITTI's drift by the speed over the segment; None when no segment of 100 m exists."""
-    *_, by_speed = drift_series(sequence)
-    caption = "Mean errors over all segments of 100 to 800 m that were driven within 2 m/s of the speed."
-    return _drift_figure("Drift by speed", caption, [by_speed], "speed over the segment [m/s]", by_speed, styles)
+    speed_caption = "Mean errors over all segments of 100 to 800 m that were driven within 2 m/s of the speed."
+    return [
+        _drift_figure("Drift by segment length", caption, [kitti, short], "segment length [m]", short, styles),
+        _drift_figure("Drift by speed", speed_caption, [by_speed], "speed over the segment [m/s]", by_speed, styles),
+    ]
 
 
 def _drift_figure(

@@ -12,7 +12,7 @@ from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.consistency import ConsistencyCheck
-from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, voxel_size_for
+from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
@@ -101,11 +101,6 @@ class MapBuilder(Stateful):
         if self._config.leave_out_moved:
             self.views.add(points, number)
         return points, estimate.T_world_lidar, self.voxel_size_m, attributes
-
-    def add_submap(self, means: VoxelMeans, T_world_keyframe: FloatArray) -> None:
-        """Add a submap that is complete, at the pose (4, 4) of its keyframe as registered."""
-        if self.global_map is not None:
-            self.global_map.add_means(means, T_world_keyframe)
 
 
 class MapCorrection(Stateful):

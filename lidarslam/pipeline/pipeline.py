@@ -216,8 +216,8 @@ class Pipeline(Stateful):
 def _give(graph: KeyframeGraph, built: MapBuilder, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
     """Give the graph a scan, and the map a submap that is complete; the local map where loop closures change it."""
     submap = graph.add(scan)
-    if submap is not None:  # of the keyframe before the new one
-        built.add_submap(submap, graph.scan_poses[graph.keyframes[-2].scan])
+    if submap is not None and built.global_map is not None:  # of the keyframe before the new one
+        built.global_map.add_means(submap, graph.scan_poses[graph.keyframes[-2].scan])
     return None if cell_m is None else graph.redrawn_local_map(cell_m)
 
 
