@@ -5,15 +5,11 @@ seed, the prepared training data and the figures measured on them unchanged, and
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world
+from lidarslam.simulation.recorder import Simulation, simulation_of
 
 # Used in turn.
 MIXED_WORLDS = (
@@ -55,13 +51,10 @@ def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[
     for number in range(first, first + recordings):
         rng = np.random.default_rng([seed, number])
         chosen = _draw(rng, number)
-        sensor = find_sensor(chosen.sensor)
-        world_seed = _FIRST_SEED * (seed + 1) + number
-        world = build_world(chosen.world, world_seed)
-        motion = motion_along_route(chosen.carrier, world, world_seed, chosen.speed_mps)
-        start = int(rng.integers(max(1, int(motion.duration_s * sensor.rate_hz) - scans)))
-        T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
-        yield Simulation(world, sensor, motion, T_body_lidar, scans, world_seed, first=start)
+        parts = (chosen.world, chosen.sensor, chosen.carrier, chosen.mount)
+        made = simulation_of(*parts, scans, _FIRST_SEED * (seed + 1) + number, chosen.speed_mps)
+        start = int(rng.integers(max(1, int(made.motion.duration_s * made.sensor.rate_hz) - scans)))
+        yield replace(made, first=start)
 
 
 def ingredients_of(number: int, seed: int) -> Ingredients:

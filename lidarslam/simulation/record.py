@@ -18,12 +18,9 @@ from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import as_typed, command_line, count, joined, small_length
 from lidarslam.core.trajectory import Trajectory, write_tum
 from lidarslam.simulation.mesh import world_mesh
-from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_s
+from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_s, simulation_of
 from lidarslam.simulation.reference_map import KeyArray, SeenSurfaces, sample_seen
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.world import build_world, choose
+from lidarslam.simulation.world import choose
 from lidarslam.simulation.writers import FORMATS
 
 
@@ -206,10 +203,8 @@ _CHUNK = 10
 
 def make_simulation(request: RecordRequest) -> Simulation:
     """The simulation that was asked for."""
-    sensor, world = find_sensor(request.sensor), build_world(request.world, request.seed)
-    motion = motion_along_route(request.motion, world, request.seed, request.speed_mps)
-    T_body_lidar = mount_pose(request.mount, motion.sensor_height_m)
-    return Simulation(world, sensor, motion, T_body_lidar, request.scans, request.seed)
+    parts = (request.world, request.sensor, request.motion, request.mount)
+    return simulation_of(*parts, request.scans, request.seed, request.speed_mps)
 
 
 def make_scans(request: RecordRequest, simulation: Simulation, seen: SeenSurfaces) -> Iterator[SimulatedScan]:

@@ -34,7 +34,7 @@ def worlds(monkeypatch):
         boxes = Boxes(table[:, :3], table[:, 3:], np.tile(np.eye(3), (len(table), 1, 1)))
         return World(name, seed, Route(corners, 1.0, 1.0, 4.0, 3.0), boxes, height_fields=(floor,))
 
-    monkeypatch.setattr("lidarslam.simulation.record.build_world", build)
+    monkeypatch.setattr("lidarslam.simulation.recorder.build_world", build)
 
 
 def request(out, **changes):
