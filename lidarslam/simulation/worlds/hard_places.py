@@ -278,11 +278,7 @@ def draw_people(route: Route, rng: np.random.Generator) -> tuple[Mover, ...]:
         line = paths.offset_loop(loop, lane)
         people.append(_person(rng, line, SPEED_MPS, slot - _HEAD_START_M))
     for along in np.linspace(-6.0, 6.0, STANDING) + rng.uniform(-0.5, 0.5, STANDING):
-        where = (
-            loop[0]
-            + along * ahead
-            + rng.choice([-1.0, 1.0]) * rng.uniform(2.8, _CROWD_SIDE_M) * building.left_of(ahead)
-        )
+        where = loop[0] + along * ahead + outdoor.beside(rng, 2.8, _CROWD_SIDE_M) * building.left_of(ahead)
         people.append(_person(rng, where[None], 0.0, 0.0))
     for along in np.linspace(3.0, 0.4 * np.linalg.norm(loop[1] - loop[-1]), CROSSING):
         ends = loop[0] + along * ahead + np.outer(rng.permutation([-1.0, 1.0]), 3.0 * building.left_of(ahead))
