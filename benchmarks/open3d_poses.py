@@ -23,8 +23,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, means_points, vox
 from lidarslam.mapping.loops.birds_eye_view import BirdsEyeView, align, compare
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.loops.detection import KeyframeDatabase
-from lidarslam.mapping.loops.refinement import DenseSubmap, refine
-from lidarslam.mapping.loops.verification import register, verify
+from lidarslam.mapping.loops.verification import DenseSubmap, refine, register, verify
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeSelector, drift_covariance
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete

@@ -26,7 +26,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, GivenLoops, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
-from lidarslam.mapping.loops.refinement import DenseSubmap, refine
+from lidarslam.mapping.loops.verification import DenseSubmap, refine
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.keyframe_graph import (
     GraphScan,

@@ -7,11 +7,10 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, transform_points
 from lidarslam.mapping.config import LoopConfig
-from lidarslam.mapping.loops import refinement
+from lidarslam.mapping.loops import verification
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose, Track
-from lidarslam.mapping.loops.refinement import DenseSubmap
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap
-from lidarslam.mapping.loops.verification import SubmapCloud, evaluate, verify
+from lidarslam.mapping.loops.verification import DenseSubmap, SubmapCloud, evaluate, verify
 
 from .runs import assert_near, errors
 from .shapes import on_boxes
@@ -250,7 +249,7 @@ def refine(
     target: DenseSubmap, source: DenseSubmap, T: FloatArray, covariance: FloatArray, drift: FloatArray
 ) -> LoopClosure | None:
     closure = LoopClosure(0, 1, T, covariance, 0.9, 0.01, 0.9, False, 0, "")
-    return refinement.refine(target, source, closure, drift)
+    return verification.refine(target, source, closure, drift)
 
 
 def planes(rng: np.random.Generator, ends: bool) -> FloatArray:
