@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.thinning import first_per_cell
 
-DEFAULT_RADIUS_M = 0.3
-DEFAULT_SPACING_M = 0.05
+# Of a neighbourhood, and the edge of the cells that the map is thinned to: entropies are comparable with the same two.
+RADIUS_M, SPACING_M = 0.3, 0.05
 # Sampled neighbourhoods; the standard error of their mean is a hundredth.
 MOST_SAMPLES = 50_000
 
@@ -24,7 +24,7 @@ _QUICK_SAMPLES = 10_000
 _FEWEST_NEIGHBOURS = 5
 # Standard deviation added in every direction, as the entropy of a flawless plane is -inf.
 _RESOLUTION_M = 1e-3
-# Neighbourhoods held in memory at a time, of at most some 900 points each with the default radius and spacing.
+# Neighbourhoods held in memory at a time, of at most some 900 points each of this radius and spacing.
 _CHUNK = 4_000
 
 
@@ -32,23 +32,15 @@ _CHUNK = 4_000
 class MapEntropy:
     """Mean entropy of the neighbourhoods of a map's points; lower is crisper."""
 
-    mean: float  # in nats; comparable between maps of the same place, radius and spacing
-    radius_m: float  # of a neighbourhood
-    spacing_m: float  # edge of the cells that the map was thinned to
+    mean: float  # in nats; comparable between maps of the same place
     points: int  # number of neighbourhoods
 
     def to_json(self) -> dict[str, float | int]:
         """The entropy in metrics.json."""
-        sizes = {"radius_m": self.radius_m, "spacing_m": self.spacing_m, "points": self.points}
-        return {"mean_map_entropy": self.mean, **sizes}
+        return {"mean_map_entropy": self.mean, "radius_m": RADIUS_M, "spacing_m": SPACING_M, "points": self.points}
 
 
-def map_entropy(
-    points: FloatArray,
-    radius_m: float = DEFAULT_RADIUS_M,
-    spacing_m: float = DEFAULT_SPACING_M,
-    most_samples: int = MOST_SAMPLES,
-) -> MapEntropy | None:
+def map_entropy(points: FloatArray, most_samples: int = MOST_SAMPLES) -> MapEntropy | None:
     """The mean of `ln(det(2 pi e S)) / 2` over the map's points (N, 3), S the covariance of the points around each.
 
     Droeschel, Stückler, Behnke, "Local multi-resolution representation for 6D motion estimation and mapping with a
@@ -56,25 +48,23 @@ def map_entropy(
     thinned first; of a large map an even sample of the points is taken, each with all its neighbours. None when no
     point has enough neighbours.
     """
-    thinned = first_per_cell(points, spacing_m)
+    thinned = first_per_cell(points, SPACING_M)
     if len(thinned) < _FEWEST_NEIGHBOURS:
         return None
     import open3d as o3d
 
     thinned = thinned - thinned.mean(axis=0)
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(thinned))
-    search.fixed_radius_index(radius_m)
+    search.fixed_radius_index(RADIUS_M)
     sample = thinned[:: max(1, -(-len(thinned) // most_samples))]
     entropies = []
     for start in range(0, len(sample), _CHUNK):
         centres = sample[start : start + _CHUNK].copy()
-        found, _, ends = search.fixed_radius_search(o3d.core.Tensor.from_numpy(centres), radius_m, False)
+        found, _, ends = search.fixed_radius_search(o3d.core.Tensor.from_numpy(centres), RADIUS_M, False)
         counts = np.diff(ends.numpy())
         entropies.append(_entropies(centres, thinned[found.numpy()], counts)[counts >= _FEWEST_NEIGHBOURS])
     values = np.concatenate(entropies)
-    if not len(values):
-        return None
-    return MapEntropy(float(values.mean()), radius_m, spacing_m, len(values))
+    return MapEntropy(float(values.mean()), len(values)) if len(values) else None
 
 
 def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:

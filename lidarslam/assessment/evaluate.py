@@ -24,7 +24,7 @@ from lidarslam.core.text import as_typed, command_line, joined
 from lidarslam.core.trajectory import Trajectory, read_transform
 from lidarslam.evaluation.comparison.comparison import GROUND_TRUTH, MethodResult
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
-from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
+from lidarslam.evaluation.map.entropy import RADIUS_M, MapEntropy, map_entropy
 from lidarslam.evaluation.map.metrics import (
     DEFAULT_SPACING_M,
     F_SCORE_THRESHOLDS_M,
@@ -416,4 +416,4 @@ def _percentages(shares: Mapping[float, float | None]) -> str:
 
 def _entropy(entropy: MapEntropy, with_title: bool) -> Iterator[str]:
     yield from ("", "MAP") if with_title else ()
-    yield _row("mean map entropy", f"{entropy.mean:>10.3f}      within {entropy.radius_m:g} m; lower is crisper")
+    yield _row("mean map entropy", f"{entropy.mean:>10.3f}      within {RADIUS_M:g} m; lower is crisper")

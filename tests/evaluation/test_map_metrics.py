@@ -111,11 +111,12 @@ def _slab(rng: np.random.Generator, sigma_m: float) -> FloatArray:
     return points
 
 
-def test_the_entropy_of_a_known_neighbourhood(rng):
+def test_the_entropy_of_a_known_neighbourhood(rng, monkeypatch):
     """In a filled ball of radius r, every coordinate has the variance r^2 / 5."""
     points = rng.uniform(-1.0, 1.0, (60_000, 3))
     inner = points[np.linalg.norm(points, axis=1) < 0.9]
-    entropy = map_entropy(inner, radius_m=0.3, spacing_m=0.001, most_samples=2_000)
+    monkeypatch.setattr("lidarslam.evaluation.map.entropy.SPACING_M", 0.001)
+    entropy = map_entropy(inner, most_samples=2_000)
     # Some samples are at the border, where the neighbourhood is part of a ball and smaller.
     assert entropy.mean == pytest.approx(1.5 * np.log(2.0 * np.pi * np.e * 0.3**2 / 5.0), abs=0.3)
 

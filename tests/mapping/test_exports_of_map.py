@@ -7,7 +7,6 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from lidarslam.core import point_files
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.scan import PointAttributes
@@ -221,8 +220,7 @@ def cloud(rng: np.random.Generator) -> PointCloud:
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
 def test_open3d_and_this_program_read_every_attribute(tmp_path, cloud, name, monkeypatch):
-    monkeypatch.setattr(point_cloud, "POINTS_AT_A_TIME", 200)
-    monkeypatch.setattr(point_files, "POINTS_AT_A_TIME", 200)
+    monkeypatch.setattr("lidarslam.core.point_files.POINTS_AT_A_TIME", 200)
     write_cloud(tmp_path / name, cloud)
     read = o3d.t.io.read_point_cloud(str(tmp_path / name)).point
     np.testing.assert_array_equal(read.positions.numpy(), cloud.points)
