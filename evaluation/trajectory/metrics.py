@@ -259,9 +259,7 @@ def _computed(
     return {key: value if math.isfinite(value) else None for key, value in values.items()}
 
 
-def metrics_json(
-    trajectory: TrajectoryMetrics | None, map_metrics: Mapping[str, object] | None = None
-) -> dict[str, object]:
+def metrics_json(trajectory: TrajectoryMetrics | None, map_metrics: Mapping[str, object] | None) -> dict[str, object]:
     """The content of metrics.json: a trajectory's errors and a map's, None where there is no reference for it."""
     if trajectory is not None:
         return trajectory.to_json(map_metrics)

@@ -307,20 +307,17 @@ def check_video_file(path: Path) -> None:
 
 
 def turn_runs(
-    runs: Sequence[DrawnRun],
-    quantity: Quantity = "height",
-    count: Callable[[int, int], None] = lambda *_: None,
-    frames: int = _FRAMES,
+    runs: Sequence[DrawnRun], quantity: Quantity, count: Callable[[int, int], None]
 ) -> Iterator[NDArray[np.uint8]]:
     """Frames (height, width, 3) of one turn of runs in one world, all of one size and scale.
 
     `count` is called with the number of each drawn frame, from 1, and their total.
     """
     frame = fit_frame(runs, OBLIQUE, width=_WIDTH, quantity=quantity)
-    turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, frames, endpoint=False)
+    turns_deg = frame.view.turn_deg + np.linspace(0.0, 360.0, _FRAMES, endpoint=False)
     for number, view in enumerate(drawing.turning_views(*framed(runs), OBLIQUE, turns_deg.tolist(), _WIDTH), start=1):
         yield draw_runs(runs, replace(frame, view=view))
-        count(number, frames)
+        count(number, _FRAMES)
 
 
 def save_video(path: Path, frames: Iterable[NDArray[np.uint8]]) -> None:

@@ -293,9 +293,7 @@ class Entry:
     symbol: Callable[[ImageDraw.ImageDraw, float, float], None] | None = None
 
 
-def draw_path(
-    picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], wider: float = 1.0
-) -> None:
+def draw_path(picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], wider: float) -> None:
     """Draw a path through positions (N, 3) above everything, in the colours of its poses, widened by a factor."""
     pixels = view.project(positions)
     for first, last in _stretches(colours):

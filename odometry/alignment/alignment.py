@@ -218,9 +218,7 @@ def align_best(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Eff
     return other
 
 
-def try_instead(
-    best: Alignment, starts: Iterable[FloatArray], sweeps: SweepPair, effort: Effort = NORMAL
-) -> Alignment | None:
+def try_instead(best: Alignment, starts: Iterable[FloatArray], sweeps: SweepPair, effort: Effort) -> Alignment | None:
     """The alignment from the most promising of many motions (4, 4), if it explains clearly more than the best."""
     rough = max(_align_roughly(starts, sweeps), key=lambda one: one.explained)
     other = align(InitialEstimate(rough.T_prev_curr), sweeps, effort)

@@ -231,11 +231,12 @@ def test_the_path_is_coloured_by_its_error_and_grey_without_one():
         assert is_like(near(picture, np.array([x, 0.0, 0.0]), 0), colour), x
 
 
-def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path):
+def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path, monkeypatch):
     pole = np.array([[3.0, 1.0, 0.0]]) + np.column_stack([np.zeros((50, 2)), np.linspace(0.0, 2.0, 50)])
     run = DrawnRun("", cloud(np.concatenate([plane(0.0, count=50), pole])), line(0.0))
     counted: list[tuple[int, int]] = []
-    frames = list(turn_runs([run], count=lambda *numbers: counted.append(numbers), frames=4))
+    monkeypatch.setattr("lidarslam.viewer.picture._FRAMES", 4)
+    frames = list(turn_runs([run], "height", lambda *numbers: counted.append(numbers)))
     assert counted == [(number, 4) for number in range(1, 5)]
     assert len({frame.shape for frame in frames}) == 1
     assert len({frame.tobytes() for frame in frames}) == 4
