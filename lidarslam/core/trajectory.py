@@ -174,8 +174,11 @@ def chain(T_world_first: FloatArray, relative_motions: FloatArray) -> FloatArray
     return np.stack(poses)
 
 
-def parse_numbers(path: Path, columns: int) -> FloatArray:
-    """The (N, columns) numbers of a text file, commas as blanks; InputError where a line has others."""
+def parse_numbers(path: Path, columns: int, may_have_names: bool = False) -> FloatArray:
+    """The (N, columns) numbers of a text file, commas as blanks; InputError where a line has others.
+
+    With `may_have_names`, the first line may hold names of the columns.
+    """
     numbers = array("d")
     for number, line in enumerate(bounded_lines(path), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
@@ -187,6 +190,8 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
                 continue
         except ValueError:  # part of the line may have been taken, which no one reads any more
             pass
+        if may_have_names and not numbers and any(word[0].isalpha() for word in words):
+            continue
         got, hint = line.strip()[:60], _FORMATS.get(columns, "")
         raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(words)} words, {got!r}{hint}")
     return np.array(numbers, dtype=np.float64).reshape(-1, columns)

@@ -1,6 +1,5 @@
 """The samples of an IMU as recorded, made usable: in order, finite, in SI units."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
 from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.core.text import count
+from lidarslam.core.trajectory import parse_numbers
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
 _IN_G = (0.7, 1.5)  # as `GRAVITY_RANGE`, of accelerations in g
@@ -76,28 +76,16 @@ def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
 
 
 def read_imu_csv(path: Path) -> ImuSamples | None:
-    """The samples of a table; None of a table without any."""
-    lines = list(bounded_lines(path))
-    comments = [line for line in lines if line.startswith("#")]
-    rows = [line for line in lines if line.strip() and not line.startswith("#")]
-    if rows and any(character.isalpha() and character not in "eEnainf" for character in rows[0]):
-        rows = rows[1:]  # the names of the columns
-    table = np.empty((len(rows), len(COLUMNS)))
-    for number, row in enumerate(rows):
-        try:
-            table[number] = np.array(row.split(","), dtype=np.float64).reshape(len(COLUMNS))
-        except ValueError:
-            said = f"expected lines `stamp, wx, wy, wz, ax, ay, az`, got {row[:60]!r}"
-            raise InputError(f"{path}: {said}; mend it or move it away") from None
+    """The samples of a table, whose first line may name the columns; None of a table without any."""
+    table = parse_numbers(path, len(COLUMNS), may_have_names=True)
     stamps = table[:, 0]
     if len(stamps) and np.nanmedian(stamps) > _NANOSECONDS_FROM:
-        words = (row.split(",")[0].strip() for row in rows)  # exact where they are whole numbers
-        stamps = np.array([int(word) / 10**9 if word.isdecimal() else float(word) / 1e9 for word in words])
-    return usable_samples(stamps, table[:, 1:4], table[:, 4:], _extrinsic(path, comments))
+        stamps = stamps / 1e9
+    return usable_samples(stamps, table[:, 1:4], table[:, 4:], _extrinsic(path))
 
 
-def _extrinsic(path: Path, comments: Sequence[str]) -> FloatArray | None:
-    line = next((line for line in comments if EXTRINSIC in line), None)
+def _extrinsic(path: Path) -> FloatArray | None:
+    line = next((line for line in bounded_lines(path) if line.startswith("#") and EXTRINSIC in line), None)
     if line is None:
         return None
     try:

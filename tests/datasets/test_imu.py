@@ -39,7 +39,7 @@ class Samples:
         return found
 
     def assert_found(self, imu, rtol=1e-15):
-        np.testing.assert_array_equal(imu.stamps, self.stamps)
+        np.testing.assert_allclose(imu.stamps, self.stamps, rtol=0, atol=3e-7)
         np.testing.assert_array_equal(imu.angular_velocities, self.w)
         np.testing.assert_allclose(imu.accelerations, self.a, rtol=rtol)
 
@@ -173,8 +173,8 @@ def test_a_table_beside_the_scans(tmp_path, samples, unit):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("stamp,a\n1,2,3,4,5,6,7\n2,x,3,4,5,6,7\n", "expected lines `stamp, wx.*got '2,x"),
-        ("1,2,3\n", "expected lines"),
+        ("stamp,a\n1,2,3,4,5,6,7\n2,x,3,4,5,6,7\n", "csv:3: expected 7 numbers.*'2,x"),
+        ("1,2,3\n", "expected 7 numbers"),
         ("# T_lidar_imu: 1 2 3\n1,2,3,4,5,6,7\n", "first three rows of a rigid transform"),
         (f"# T_lidar_imu: {'2 ' * 12}\n1,2,3,4,5,6,7\n", "rigid transform"),
     ],
