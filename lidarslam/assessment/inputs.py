@@ -11,6 +11,7 @@ import numpy as np
 
 from lidarslam.config.settings import Config, load_config, read_yaml
 from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
@@ -44,14 +45,8 @@ def read_cloud(path: Path) -> FloatArray:
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise InputError(f"{path}: not a point cloud that can be read; it must end in {', '.join(_READERS)}")
-    try:
+    with reading(path, f"not a readable {path.suffix[1:].upper()} file", "copy it again or remove it"):
         points = read(path)
-    except InputError:
-        raise
-    except Exception as error:  # damaged files make laspy, its decompressors and libE57Format raise anything
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        kind = path.suffix[1:].upper()
-        raise InputError(f"{path}: not a readable {kind} file ({reason}); copy it again or remove it") from error
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise InputError(f"{path}: holds no point; choose another file")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.text import reason
 
 ONE_READER = threading.Lock()
 """To be held while arrays are read in another way than by `read_array`.
@@ -155,6 +156,17 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def reading(place: Path, fault: str, remedy: str) -> Iterator[None]:
+    """InputError of the fault for any error in the block: libraries meet damaged data with nearly anything."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{place}: {fault} ({reason(error)}); {remedy}") from error
 
 
 def read_array(file: IO[bytes]) -> NDArray[Any]:

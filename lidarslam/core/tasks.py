@@ -17,6 +17,7 @@ from importlib.metadata import version
 from typing import Any, TypeVar
 
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError, OutputError
+from lidarslam.core.text import reason
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -114,12 +115,10 @@ def _ray_tasks(where: Where) -> Iterator[Tasks]:
                 _require_answer(where.cluster or "")
                 ray.init(logging_level=logging.CRITICAL, **options)
         except Exception as error:  # Ray raises plain ones, too
-            reason = " ".join(str(error).split())
             if where.cluster is None:
-                raise ConfigError(f"--jobs {where.jobs}: Ray does not start: {reason}") from error
-            raise ConfigError(
-                f"--ray {where.cluster}: no cluster answers there; this machine has to be one of its nodes ({reason})"
-            ) from error
+                raise ConfigError(f"--jobs {where.jobs}: Ray does not start: {reason(error)}") from error
+            nowhere = "no cluster answers there; this machine has to be one of its nodes"
+            raise ConfigError(f"--ray {where.cluster}: {nowhere} ({reason(error)})") from error
         slots = int(ray.cluster_resources().get("CPU", 0))
         if not slots:
             raise ConfigError(f"--ray {where.cluster}: the cluster has no CPU; start nodes with ray start")

@@ -50,6 +50,11 @@ def command_line(*words: str) -> str:
     return " ".join(_ansi_quoted(word) if _STEERING.search(word) else shlex.quote(word) for word in words)
 
 
+def reason(error: Exception) -> str:
+    """What an error of a library says, in one line; its kind where it says nothing."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def count(number: int, noun: str) -> str:
     """A number with its noun: 1 scan, 2,000 scans."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"

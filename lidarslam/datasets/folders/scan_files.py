@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import read_array
+from lidarslam.core.files import read_array, reading
 from lidarslam.datasets.recording import KITTI_FIELDS
 
 # No sweep is larger; reading more would fill the memory.
@@ -201,14 +201,8 @@ def read_npy(path: Path) -> NDArray[np.void]:
 
     Four columns are x, y, z and intensity. Organised arrays are flattened.
     """
-    data = read_bytes(path)
-    try:
-        array = read_array(BytesIO(data))
-    except Exception as error:  # NumPy parses the header as Python, which fails in many ways
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(
-            f"{path}: cannot be read as .npy ({reason}); it is truncated or damaged: copy it again or remove it"
-        ) from None
+    with reading(path, "cannot be read as .npy", "it is truncated or damaged: copy it again or remove it"):
+        array = read_array(BytesIO(read_bytes(path)))
     if array.dtype.names:
         return cast("NDArray[np.void]", array.reshape(-1))
     if array.ndim < 2 or not 3 <= array.shape[-1] <= _WIDEST_ARRAY or array.dtype.kind not in "fiu":
@@ -238,10 +232,8 @@ def read_pcd(path: Path) -> NDArray[np.void]:
 
 
 def _read_described(path: Path, kind: str, read: Callable[[bytes], NDArray[np.void]]) -> NDArray[np.void]:
-    try:
+    with reading(path, f"not a readable {kind} file", "copy it again or remove it"):
         return read(read_bytes(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not a readable {kind} file: {error}; copy it again or remove it") from None
 
 
 def _ply_table(data: bytes) -> NDArray[np.void]:
@@ -340,10 +332,7 @@ def _pcd_row_type(names: list[str], sizes: list[str], kinds: list[str], counts: 
         # PCL calls every padding field `_`, and NumPy wants names to differ.
         unique = name if name not in names[:place] else f"{name}{place}"
         columns.append((unique, f"<{_KINDS[kind]}{size}", () if count == "1" else (int(count),)))
-    try:
-        return np.dtype(columns)
-    except TypeError as error:
-        raise ValueError(f"expected sizes of 1, 2, 4 or 8 bytes ({error})") from None
+    return np.dtype(columns)
 
 
 def _read_compressed(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
+from lidarslam.core.text import reason
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import OusterFile, find_metadata
@@ -73,7 +74,7 @@ def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> _StampedCloud:
 
 
 def _reason(path: Path, error: Exception) -> str:
-    said = " ".join(str(error).split()) or type(error).__name__
+    said = reason(error)
     if "tcpdump" in said or type(error).__name__ == "NeedData":
         return f"is no capture that can be read; a .pcapng is converted by `editcap -F pcap {path} {path.stem}.pcap`"
     return f"its packets cannot be decoded ({said}); record it again, or play it through the sensor's driver"

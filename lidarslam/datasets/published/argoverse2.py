@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
@@ -99,12 +100,9 @@ def _read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]
         from pyarrow import feather
     except ImportError as error:
         raise InputError(f"{path}: needs pyarrow; pip install 'lidarslam[datasets]'") from error
-    try:
+    with reading(path, "cannot be read", "download it again"):
         table = feather.read_table(path, columns=list(names))
         return {name: table.column(name).to_numpy() for name in names}
-    except Exception as error:  # of pyarrow, of many classes
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: cannot be read ({reason}); download it again") from error
 
 
 def _poses(path: Path, table: dict[str, NDArray[Any]]) -> FloatArray:

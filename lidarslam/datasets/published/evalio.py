@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray, inverse, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
@@ -152,11 +153,8 @@ class EvalioRecording(StoredRecording):
         from evalio.datasets import set_data_dir
 
         set_data_dir(self._source.parent.parent)
-        try:
+        with reading(self._source, f"evalio cannot read {what}", "download it again"):
             yield
-        except Exception as error:  # of whatever library reads the data set
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise InputError(f"{self._source}: evalio cannot read {what} ({reason}); download it again") from error
 
     @property
     def name(self) -> str:

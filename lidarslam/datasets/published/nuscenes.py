@@ -15,6 +15,7 @@ from pydantic import TypeAdapter
 from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.json_text import parse_json, read_json
 from lidarslam.core.text import stays_below
@@ -121,26 +122,25 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
 
 
 def _table(path: Path, shape: TypeAdapter[list[T]]) -> list[T]:
-    try:
+    with reading(path, "cannot be read", "download the tables again"):
         return read_json(path, shape)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
 
 
 def _select(
     path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], shape: TypeAdapter[T]
 ) -> Iterator[T]:
     """The records of a large table in which a pattern is found, if the match is wanted."""
-    try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-            if not text[-_TAIL:].rstrip().endswith(b"]"):
-                raise ValueError("its end is missing")
-            for match in pattern.finditer(text):
-                if wanted(match):
-                    start = text.rfind(b"{", max(0, match.start() - _LONGEST_RECORD), match.start())
-                    end = text.find(b"}", match.end(), match.end() + _LONGEST_RECORD) + 1
-                    if start < 0 or end == 0:
-                        raise ValueError(f"a record has no end within {_LONGEST_RECORD:,} bytes")
-                    yield parse_json(text[start:end], shape)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
+    with (
+        reading(path, "cannot be read", "download the tables again"),
+        path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text,
+    ):
+        if not text[-_TAIL:].rstrip().endswith(b"]"):
+            raise ValueError("its end is missing")
+        for match in pattern.finditer(text):
+            if wanted(match):
+                start = text.rfind(b"{", max(0, match.start() - _LONGEST_RECORD), match.start())
+                end = text.find(b"}", match.end(), match.end() + _LONGEST_RECORD) + 1
+                if start < 0 or end == 0:
+                    raise ValueError(f"a record has no end within {_LONGEST_RECORD:,} bytes")
+                yield parse_json(text[start:end], shape)

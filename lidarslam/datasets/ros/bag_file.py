@@ -27,6 +27,7 @@ from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, read_exact, 
 from rosbags.typesys.msg import normalize_msgtype
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.text import reason
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
@@ -52,10 +53,6 @@ MCAP_MAGIC, _ROSBAG1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
 _TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
 # By the table itself, because the pages of its index are at the end.
 _ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
@@ -158,7 +155,7 @@ class BagFile:
                 counts[name, message_type] += 1
                 self.span_ns = (min(self.span_ns[0], record_ns), max(self.span_ns[1], record_ns + 1))
         except Exception as broken:  # perhaps not even the beginning can be read
-            why = f": {_reason(broken)}"
+            why = f": {reason(broken)}"
         if not counts:
             raise error
         self._has_index = False
@@ -205,7 +202,7 @@ class BagFile:
             raw = unpacked_message(raw) if self._messages_are_compressed else raw
             header_ns, frame_id = read_header(raw, self.ros2)
         except Exception as error:  # of the decompressor too
-            damage = f"{self.path}: a message is damaged: {_reason(error)}"
+            damage = f"{self.path}: a message is damaged: {reason(error)}"
             return BagMessage(record_ns, 0, "", topic.message_type, b"", damage)
         return BagMessage(record_ns, header_ns, frame_id, topic.message_type, raw)
 
@@ -251,7 +248,7 @@ class BagFile:
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"{self.path}: {place} ({_reason(error)}); {self._remedy()}") from error
+            raise InputError(f"{self.path}: {place} ({reason(error)}); {self._remedy()}") from error
 
     def _suffix(self) -> str:
         return self.path.suffix if self.ros2 else ".bag"
@@ -317,7 +314,7 @@ def recover(path: Path, suffix: str) -> Iterator[Recovered]:
             try:
                 yield from records.read(file)
             except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
-                raise ValueError(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})") from error
+                raise ValueError(f"it breaks off at byte {at:,} of {size:,} ({reason(error)})") from error
 
 
 class _Rosbag1:
