@@ -2,11 +2,9 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
-from itertools import islice
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -15,19 +13,12 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.text import count, one_line
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.catalogue import CATALOGUE, DataSet
-from lidarslam.datasets.registry import recognise
+from lidarslam.datasets.registry import recordings_in
 
 OnDisk = Mapping[str, Sequence[Path]]
 """Recordings by the name of their data set."""
 
-_TRIED = {
-    "real files": "run on real files, parts of it",
-    "written sample": "run on samples written in its layout, not yet on real files",
-    "not yet": "not yet run",
-}
 _WIDTH = 100
-# Depth of the search for recordings, and the largest number of entries of a folder.
-_DEPTH, _MOST_ENTRIES = 3, 1000
 
 
 def choose(arguments: Sequence[str]) -> tuple[list[DataSet], list[Path]]:
@@ -51,21 +42,11 @@ def find_on_disk(folders: Sequence[Path]) -> OnDisk:
     """Recordings of known data sets in evalio's data folder and in these, down to three folders below."""
     readers = {one.reader: one.name for one in CATALOGUE if one.reader != "evalio"}
     found: dict[str, list[Path]] = defaultdict(list)
-    for path, reader in dict(_recordings([evalio.data_folder(), *folders], _DEPTH)).items():
+    places = map(Path.absolute, [evalio.data_folder(), *folders])
+    for path, reader in dict(recordings_in(places, but="rosbag")).items():  # bags may lie beside data sets
         if (name := path.parent.name if reader == "evalio" else readers.get(reader)) is not None:
             found[name].append(path)
     return found
-
-
-def _recordings(places: Iterable[Path], depth: int) -> Iterator[tuple[Path, str]]:
-    """Recordings at and below some places, in no other recording, and their readers."""
-    for place in map(Path.absolute, places):
-        if (reader := recognise(place)) is not None and reader != "rosbag":  # bags may lie beside data sets
-            yield place, reader
-        elif depth and place.is_dir():
-            with suppress(OSError):
-                entries = sorted(entry for entry in islice(place.iterdir(), _MOST_ENTRIES) if entry.is_dir())
-                yield from _recordings(entries, depth - 1)
 
 
 def list_data_sets(on_disk: OnDisk) -> str:
@@ -103,7 +84,7 @@ def _rows(one: DataSet, found: Sequence[Path]) -> Iterator[tuple[str, str]]:
         yield "reader", one.reader
         yield "download", "from its page, under its licence"
         yield "run", " ".join(["lidarslam run FOLDER", one.choose]).strip()
-    yield "tried", _TRIED[one.tried]
+    yield "tried", one.tried
     yield from (("on disk" if index == 0 else "", str(path)) for index, path in enumerate(found))
 
 

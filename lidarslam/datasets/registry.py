@@ -5,7 +5,7 @@ A reader's module is imported on use."""
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from difflib import get_close_matches
 from itertools import islice
@@ -17,6 +17,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.core.text import count, first_few
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.fetched import is_url
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
@@ -27,7 +28,6 @@ logger = logging.getLogger(__name__)
 
 # Depth of the search for recordings, and the largest number of entries of a folder.
 _DEPTH, _MOST_ENTRIES = 3, 1000
-_URL = re.compile(r"[a-z][a-z0-9+]+:/", re.IGNORECASE)
 # Of a run's config.yaml.
 _SOURCE = re.compile(r"^  source: (.+?)(?: +#.*)?$", re.MULTILINE)
 
@@ -210,7 +210,7 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
 
 def absent(source: Path) -> str:
     """Why a path does not exist, with similar names."""
-    if _URL.match(str(source)):
+    if is_url(source):
         return f"{source}: is an address; download the recording and name the file"
     if (missing_data_set := evalio.absent(source)) is not None:
         return missing_data_set
@@ -255,23 +255,26 @@ def _unrecognised(source: Path) -> str | None:
         reader = recognise(above)
         if reader in _LAYOUTS or (reader == "rosbag" and source.name == "metadata.yaml"):
             return f"{source}: lies in a recording ({reader}); name that: {above}"
-    if source.is_dir() and (found := _recordings_in(source)):
-        reader = recognise(found[0])
-        if len(found) == 1:
-            return f"{source}: holds the recording {found[0]} ({reader}); name that"
-        return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {first_few(found, 5)}"
+    if found := dict(recordings_in([source])):
+        (first, reader), *others = found.items()
+        if not others:
+            return f"{source}: holds the recording {first} ({reader}); name that"
+        return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {first_few([*found], 5)}"
     return None
 
 
-def _recordings_in(folder: Path) -> list[Path]:
-    level = [folder]
-    for _ in range(_DEPTH):
-        level = [entry for one in level for entry in _entries(one)][:_MOST_ENTRIES]
-        found = [entry for entry in level if result_of_program(entry) is None and recognise(entry) is not None]
-        if found:
-            return found
-        level = [entry for entry in level if entry.is_dir()]
-    return []
+def recordings_in(folders: Iterable[Path], but: str | None = None) -> Iterator[tuple[Path, str]]:
+    """Recordings in folders, down to three below and in no other recording, with their readers; none of one reader."""
+    level = list(folders)
+    for _ in range(_DEPTH + 1):
+        below: list[Path] = []
+        for entry in level[:_MOST_ENTRIES]:
+            reader = recognise(entry) if result_of_program(entry) is None else None
+            if reader is not None and reader != but:
+                yield entry, reader
+            elif entry.is_dir():
+                below += _entries(entry)
+        level = below
 
 
 def _entries(folder: Path) -> Iterator[Path]:
