@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import TRANSFORM, Saved, Shape, State, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, State, Stateful
 from lidarslam.core.tracking import AXES
 
 
@@ -47,7 +47,7 @@ class Odometry(Protocol):
     def state(self) -> State | None:
         """The state needed to resume; None where the method cannot save it, and has to be given the scans again."""
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: State) -> None:
         """Resume from a state, before the first scan."""
 
     def close(self) -> None:

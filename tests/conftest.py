@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, settings
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State, read_state, write_state
+from lidarslam.core.state import State, read_state, write_state
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
@@ -239,5 +239,5 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def through_disk(tmp_path: Path) -> Callable[[State], Saved]:
+def through_disk(tmp_path: Path) -> Callable[[State], State]:
     return lambda state: (write_state(tmp_path / "state.npz", state), read_state(tmp_path / "state.npz"))[1]

@@ -16,7 +16,6 @@ import tempfile
 import types
 import typing
 import weakref
-from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -48,32 +47,6 @@ class Shape:
 TRANSFORM = Shape(4, 4)
 
 
-class Saved:
-    """A tree read back from a file."""
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = values
-
-    def value(self, name: str) -> Any:
-        """The tree under a name; InputError where there is none."""
-        if name not in self._values:
-            raise self.refuse(f"{name} is missing")
-        return self._values[name]
-
-    def has(self, name: str) -> bool:
-        """Whether the value under a name is not None."""
-        return self.value(name) is not None
-
-    def part(self, name: str) -> "Saved":
-        """The branch under a name."""
-        return Saved(self.value(name))
-
-    @staticmethod
-    def refuse(reason: str) -> InputError:
-        """The error for a tree of another version of the program."""
-        return InputError(f"the checkpoint is not what this program saves ({reason}); begin again with --overwrite")
-
-
 @typing.runtime_checkable
 class Restorable(typing.Protocol):
     """Carries a state from scan to scan."""
@@ -81,7 +54,7 @@ class Restorable(typing.Protocol):
     def state(self) -> State | None:
         """The state it carries; None where it cannot be saved, nor a run resumed."""
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: State) -> None:
         """Resume from a state, before the first scan."""
 
 
@@ -97,12 +70,12 @@ class Stateful:
         """The values of all declared attributes; arrays are not copied."""
         return {name: encode(getattr(self, name)) for name in _hints(type(self))}
 
-    def restore(self, saved: Saved) -> None:
-        """Take over a state; InputError where it lacks an attribute, or an array does not fit its hint."""
+    def restore(self, saved: State) -> None:
+        """Take over a state; InputError where an array does not fit its hint."""
         for name, kind in _hints(type(self)).items():
-            present, tree = getattr(self, name, None), saved.value(name)
+            present, tree = getattr(self, name, None), saved[name]
             if tree is not None and isinstance(present, Restorable):
-                present.restore(saved.part(name))
+                present.restore(tree)
             else:
                 setattr(self, name, decode(kind, tree))
         self._after_restore()
@@ -167,11 +140,10 @@ def _made(kind: Any, tree: Any) -> Any:
         if inspect.isabstract(kind):  # the subclass with these attributes
             kind = next(one for one in kind.__subclasses__() if set(_hints(one)) == set(tree))
         made = kind.__new__(kind)
-        made.restore(Saved(tree))
+        made.restore(tree)
         return made
     if dataclasses.is_dataclass(kind):
-        saved = Saved(tree)
-        return kind(**{name: decode(hint, saved.value(name)) for name, hint in _hints(kind).items()})  # type: ignore[operator]
+        return kind(**{name: decode(hint, tree[name]) for name, hint in _hints(kind).items()})  # type: ignore[operator]
     return kind[tree] if issubclass(kind, Enum) else kind(tree)
 
 
@@ -181,7 +153,10 @@ def _array(dtype: Any, shape: Shape | None, tree: Any, of_list: bool = False) ->
     lengths = tree.shape[1:] if of_list else tree.shape
     if not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted) or not (shape is None or shape.fits(lengths)):
         expected = getattr(wanted, "__name__", wanted)
-        raise Saved.refuse(f"expected an array of {expected}, got {tree.dtype} {tree.shape}")
+        raise InputError(
+            f"the checkpoint is not what this program saves (expected an array of {expected}, got {tree.dtype}"
+            f" {tree.shape}); begin again with --overwrite"
+        )
     return tree if tree.flags.writeable and tree.flags.c_contiguous else tree.copy()
 
 
@@ -197,8 +172,7 @@ def _list(kind: Any, tree: Any) -> list[Any]:
         is_rows = typing.get_origin(bare) is np.ndarray
         return list(_array(typing.get_args(bare)[1], shape, tree, of_list=True)) if is_rows else tree.tolist()
     if isinstance(tree, dict):
-        saved = Saved(tree)
-        columns = [_list(hint, saved.value(name)) for name, hint in _hints(bare).items()]
+        columns = [_list(hint, tree[name]) for name, hint in _hints(bare).items()]
         return [bare(*row) for row in zip(*columns, strict=True)]
     return [decode(kind, one) for one in tree]
 
@@ -234,11 +208,12 @@ def write_state(path: Path, state: State) -> None:
         np.savez(out, allow_pickle=False, **members)
 
 
-def read_state(path: Path) -> Saved:
+def read_state(path: Path) -> State:
     """Read a file of `write_state`, never a pickle; InputError where there is no such file, or it is damaged."""
     try:
         with ONE_READER, np.load(path, allow_pickle=False) as file:
-            return Saved(_with_arrays(json.loads(file[_TREE].tobytes()), file))
+            tree: State = _with_arrays(json.loads(file[_TREE].tobytes()), file)
+            return tree
     except Exception as error:  # of nearly any kind
         raise InputError(f"{path}: is damaged ({error}); begin again with --overwrite") from error
 
@@ -282,7 +257,7 @@ class BlockFile(Stateful):
             os.fsync(self._file.fileno())
         return super().state()
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: State) -> None:
         """Resume from a state; InputError where the file is too short."""
         super().restore(saved)
         self._opened()

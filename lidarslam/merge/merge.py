@@ -110,7 +110,7 @@ def earlier_parts(out: Path) -> set[str]:
 
 def read_part(run: Path) -> TrackedScans:
     """The scans that the task of a recording left; those of all recordings need not fit into memory."""
-    return decode(TrackedScans, read_state(CheckpointFiles(run).tracked).value("part"))  # type: ignore[no-any-return]
+    return decode(TrackedScans, read_state(CheckpointFiles(run).tracked)["part"])  # type: ignore[no-any-return]
 
 
 # A process whose node was lost may run for some more seconds.
@@ -190,7 +190,7 @@ def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:
         graph = begin_graph(config, file=unfinished.files.submaps)
     graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=unfinished.files.submaps)
     if unfinished.saved is not None:
-        graph.restore(unfinished.saved.part("graph"))
+        graph.restore(unfinished.saved["graph"])
     return graph
 
 
@@ -494,5 +494,5 @@ def _add(graph: "SlamGraph", part: Part) -> None:
     own, config = CheckpointFiles(part.request.out), part.request.config.pose_graph.keyframes
     with closing(KeyframeGraph(config, file=own.submaps if part.scans else None)) as tracked:
         if part.scans:
-            tracked.restore(read_state(own.tracked).part("graph"))
+            tracked.restore(read_state(own.tracked)["graph"])
         graph.add_recording(tracked)

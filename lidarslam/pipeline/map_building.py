@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
-from lidarslam.core.state import Saved, State, Stateful
+from lidarslam.core.state import State, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
@@ -49,9 +49,9 @@ class MapBuilder(Stateful):
         self.views = Views()
         self.slides = ConsistencyCheck()
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: State) -> None:
         """Resume from a state; InputError where it is damaged, or the file of the tiles is."""
-        self.global_map = self._new_map(1.0) if saved.has("global_map") else None
+        self.global_map = self._new_map(1.0) if saved["global_map"] is not None else None
         super().restore(saved)
 
     def _new_map(self, voxel_size_m: float) -> GlobalMap:

@@ -13,7 +13,7 @@ import numpy as np
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, write_state
+from lidarslam.core.state import State, write_state
 from lidarslam.core.text import count
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
@@ -73,18 +73,18 @@ def abandoned(out: Path) -> str:
     return "interrupted; nothing was kept"
 
 
-def scans_left(scans: Iterator[Scan], held: Scan, odometry: Odometry, saved: Saved) -> Iterator[Scan]:
+def scans_left(scans: Iterator[Scan], held: Scan, odometry: Odometry, saved: State) -> Iterator[Scan]:
     """The scans after the one that was read last, `held`; the odometry is restored.
 
     The scans before are read again, so that their faults are counted again. An odometry without a state of its own is
     run over them again. InputError where the scan that was read last is not in the recording, or differs.
     """
-    if saved.has("odometry"):
-        odometry.restore(saved.part("odometry"))
+    if saved["odometry"] is not None:
+        odometry.restore(saved["odometry"])
     else:
         logger.warning("the odometry is run again over the scans before %.6f s", held.stamp)
     for scan in scans:
-        if not saved.has("odometry") and scan.stamp <= held.stamp:
+        if saved["odometry"] is None and scan.stamp <= held.stamp:
             odometry.estimate(scan)
         if scan.stamp == held.stamp and np.array_equal(scan.points, held.points):
             return scans
@@ -181,8 +181,8 @@ class Checkpoints:
         """Restore log, pipeline and odometry, and mark the run as running; the remaining scans of all that it takes."""
         saved, self._unfinished.saved = self._unfinished.saved, None  # its arrays are in use now
         if saved is not None:
-            self._log.restore(saved.part("log"))
-            pipeline.restore(saved.part("pipeline"))
+            self._log.restore(saved["log"])
+            pipeline.restore(saved["pipeline"])
             assert pipeline.held is not None  # while a checkpoint is written, the next scan waits
             scans = scans_left(scans, pipeline.held.scan, self._odometry, saved)
         self._unfinished.begin(len(self._log))

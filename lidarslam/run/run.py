@@ -145,7 +145,7 @@ class RunSession(Generic[R]):
         if self.graph is not None:
             self.opened.callback(self.graph.close)
             if self.unfinished is not None and self.unfinished.saved is not None:
-                self.graph.restore(self.unfinished.saved.part("graph"))
+                self.graph.restore(self.unfinished.saved["graph"])
 
     def show(self, name: str, page: WebPage | None) -> None:
         """Open the viewer; a Rerun recording that cannot be written is a warning."""

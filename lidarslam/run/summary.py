@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
-from lidarslam.core.state import Saved, State, Stateful
+from lidarslam.core.state import State, Stateful
 from lidarslam.core.text import count
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.core.trajectory import Trajectory
@@ -153,10 +153,10 @@ class ScanLog(Stateful):
         """See `Stateful`."""
         return super().state() | {"rows": self.table}
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: State) -> None:
         """See `Stateful`."""
         super().restore(saved)
-        self._rows = bytearray(saved.value("rows").tobytes())
+        self._rows = bytearray(saved["rows"].tobytes())
 
 
 @dataclass(frozen=True)

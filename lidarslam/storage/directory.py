@@ -24,7 +24,7 @@ from lidarslam.core.files import (
     written,
 )
 from lidarslam.core.json_text import read_json
-from lidarslam.core.state import Saved, read_state
+from lidarslam.core.state import State, read_state
 from lidarslam.core.text import first_few
 
 _TILE = re.compile(r"-?\d+_-?\d+\.laz")
@@ -114,11 +114,6 @@ class RunDirectory:
     def has_earlier(self) -> bool:
         """Whether files of an earlier run remain that have not been replaced."""
         return bool(self._stale - {ABOUT})
-
-    @property
-    def is_mixed(self) -> bool:
-        """Whether some of an earlier run's files have been replaced, and some have not."""
-        return bool(self._written) and self.has_earlier
 
     @contextlib.contextmanager
     def replacing(self, name: str) -> Iterator[Path]:
@@ -330,7 +325,7 @@ class Unfinished:
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
         self.files = CheckpointFiles(run)
-        self.saved: Saved | None = None  # the state to resume from, None to begin
+        self.saved: State | None = None  # the state to resume from, None to begin
         self._keeps_earlier = False  # whether the whole results of an earlier run are there
 
     @classmethod
@@ -362,7 +357,8 @@ class Unfinished:
         try:
             yield unfinished
         except BaseException:
-            if not was_there and not unfinished.is_resumable and not directory.is_mixed:
+            is_mixed = directory._written and directory.has_earlier
+            if not (was_there or unfinished.is_resumable or is_mixed):
                 unfinished.files.remove()
             raise
 

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.core.errors import LidarSlamError
+from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import State
 from lidarslam.odometry.config import KissConfig
 from lidarslam.odometry.interface import Motion
 
@@ -107,9 +107,9 @@ class KissOdometry:
         """None: the library does not expose its state."""
         return None
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: State) -> None:  # noqa: ARG002
         """There is no state to resume from; always an InputError."""
-        raise saved.refuse("KISS-ICP has no state")
+        raise InputError("KISS-ICP has no state to resume from; begin again with --overwrite")
 
     def close(self) -> None:
         """End the child process."""

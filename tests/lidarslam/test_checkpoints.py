@@ -15,7 +15,7 @@ import pytest
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State, read_state
+from lidarslam.core.state import State, read_state
 from lidarslam.odometry.interface import ConstantVelocity
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run import checkpoints
@@ -63,7 +63,7 @@ def test_saving_takes_two_percent_of_the_time_at_most(unfinished, monkeypatch, c
     pipeline.now += 0.02
     assert kept.is_due()
     kept.save(cast(Pipeline, pipeline))
-    assert read_state(unfinished.files.state).part("log").value("messages") == []
+    assert read_state(unfinished.files.state)["log"]["messages"] == []
     pipeline.now += pause_s - 0.01
     assert not kept.is_due()
     pipeline.now += 0.02
@@ -95,18 +95,18 @@ STAMPS = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 @pytest.mark.parametrize("done", [0, 4])
 def test_a_run_goes_on_after_the_scan_that_was_read_last(done):
-    for saved in (Saved({"odometry": {}}), Saved({"odometry": None})):
+    for saved in ({"odometry": {}}, {"odometry": None}):
         odometry = Mock()
         left = scans_left(map(scan_at, STAMPS), scan_at(STAMPS[done]), odometry, saved)
         assert [scan.stamp for scan in left] == STAMPS[done + 1 :]
         heard = [call.args[0].stamp for call in odometry.estimate.call_args_list]
-        assert heard == ([] if saved.has("odometry") else STAMPS[: done + 1])
+        assert heard == ([] if saved["odometry"] is not None else STAMPS[: done + 1])
 
 
 @pytest.mark.parametrize("held", [Scan(np.full((1, 3), 3.5), 2.0), Scan(np.full((1, 3), 3.0), 2.1)])
 def test_another_scan_than_the_one_that_was_read_is_noticed(held):
     with pytest.raises(InputError, match="the recording has changed"):
-        scans_left(map(scan_at, STAMPS), held, Mock(), Saved({"odometry": {}}))
+        scans_left(map(scan_at, STAMPS), held, Mock(), {"odometry": {}})
 
 
 def refuse_as_unfinished(path: Path) -> None:

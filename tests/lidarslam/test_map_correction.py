@@ -11,7 +11,7 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
@@ -58,10 +58,10 @@ class Graph:
 class Keeper:
     """Keeps the state once, after so many scans, and the scans that the graph had by then."""
 
-    def __init__(self, at: int, graph: Graph, through_disk: Callable[[State], Saved]) -> None:
+    def __init__(self, at: int, graph: Graph, through_disk: Callable[[State], State]) -> None:
         self._at, self._graph, self._through_disk = at, graph, through_disk
         self._asked = 0
-        self.saved: Saved | None = None
+        self.saved: State | None = None
         self.scans: list[GraphScan] = []
 
     def is_due(self) -> bool:

@@ -11,7 +11,6 @@ import pytest
 from lidarslam.compare import comparison as described
 from lidarslam.compare.comparison import versions
 from lidarslam.core.geometry import exp
-from lidarslam.core.state import Saved
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.pipeline.estimates import STAGES, ScanEstimate
 from lidarslam.run.progress import show_progress
@@ -80,7 +79,7 @@ def test_a_warning_is_kept_once_and_a_correction_leaves_the_odometry(log):
 
 def test_a_restored_log_goes_on_alike(log):
     restored = ScanLog()
-    restored.restore(Saved(log.state()))
+    restored.restore(log.state())
     for one in (log, restored):
         one.add(result(3.0))
     assert restored.format_csv() == log.format_csv()

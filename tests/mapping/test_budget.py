@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from simulated_faults import Faulty, carried_off, covered, index_back
 
-from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.tracking import scan_matcher
@@ -148,6 +147,6 @@ def test_a_search_that_was_under_way_begins_anew_after_a_resumption(carried, clo
         pass
     number = len(clock.taken_ms) + 1
     resumed = Mapper(config, clock=clock)
-    resumed.restore(Saved(deepcopy(mapper.state())))
+    resumed.restore(deepcopy(mapper.state()))
     mapped = list(results(resumed, carried, clock, number))
     assert [one.status for one in mapped[-5:]] == [Status.OK] * 5

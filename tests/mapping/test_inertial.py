@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity
@@ -140,7 +140,7 @@ def state_after_8_s() -> State:
 def walked(state_after_8_s: State) -> Inertial:
     """It, with the samples of the rest of the walk."""
     inertial = Inertial(samples(walk, 20.0), T_LIDAR_IMU)
-    inertial.restore(Saved(state_after_8_s))
+    inertial.restore(state_after_8_s)
     return inertial
 
 

@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.interface import Odometry
@@ -17,7 +17,7 @@ from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.methods.learned import LearnedOdometry
 from lidarslam.odometry.registry import make_odometry
 
-ThroughDisk = Callable[[State], Saved]
+ThroughDisk = Callable[[State], State]
 EMPTY, GARBAGE = 3, 5
 
 
@@ -64,7 +64,7 @@ def test_a_given_trajectory_goes_on(scans, room_truth, through_disk):
 def test_constant_velocity_and_kiss_have_their_say():
     constant = make_odometry(OdometryConfig(method="constant-velocity"))
     assert constant.state() == {}
-    constant.restore(Saved({}))
+    constant.restore({})
     motion = constant.estimate(scan_at(0.0))
     np.testing.assert_array_equal(motion.T_prev_curr, np.eye(4))
     assert (motion.points_used, motion.failure is None) == (0, False)
@@ -72,7 +72,7 @@ def test_constant_velocity_and_kiss_have_their_say():
     try:
         assert kiss.state() is None
         with pytest.raises(InputError, match="KISS-ICP has no state"):
-            kiss.restore(Saved({}))
+            kiss.restore({})
     finally:
         kiss.close()
 
