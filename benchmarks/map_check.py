@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.trajectory import Trajectory, chain, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, chain, read_tum
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.run.summary import RunSummary
@@ -84,7 +84,7 @@ def main() -> None:
             trajectory = read_tum(good)
             for number, (name, distort) in enumerate(DISTORTIONS.items()):
                 prior = Path(folder) / f"{number}.tum"
-                write_tum(prior, Trajectory(trajectory.stamps, distort(trajectory.T_world_lidar)))
+                Trajectory(trajectory.stamps, distort(trajectory.T_world_lidar)).save(prior)
                 settings: dict[str, object] = {"odometry": {"method": "external"}, "mapping": {"method": "off"}}
                 summary = run(Path(source), Path(folder) / str(number), settings, prior)
                 print(row(Path(source).name, name, summary), flush=True)

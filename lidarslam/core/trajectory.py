@@ -255,8 +255,3 @@ def format_kitti(poses: FloatArray) -> str:
     out = StringIO()
     np.savetxt(out, poses[:, :3].reshape(-1, 12), fmt="%.9e")
     return out.getvalue()
-
-
-def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file."""
-    path.write_text(format_tum(trajectory), encoding="utf-8")

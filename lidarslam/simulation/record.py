@@ -16,7 +16,7 @@ from lidarslam.core.files import cannot_write
 from lidarslam.core.point_files import write_ply
 from lidarslam.core.tasks import SERIAL, Where, open_tasks
 from lidarslam.core.text import as_typed, command_line, count, joined, small_length
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.mesh import world_mesh
 from lidarslam.simulation.recorder import Rig, SimulatedScan, Simulation, clock_s, simulation_of
 from lidarslam.simulation.reference_map import KeyArray, SeenSurfaces, sample_seen
@@ -267,7 +267,7 @@ def record(request: RecordRequest, progress: Callable[[int, int], None] = lambda
         chosen.write(folder, scans(), Rig(sensor.driver, sensor.period_s, simulation.T_world_lidar_at, imu))
         truth = simulation.ground_truth
         stamps = np.array([clock_s(stamp, chosen.clock_start_ns) for stamp in truth.stamps])
-        write_tum(folder / GROUND_TRUTH, Trajectory(stamps, truth.T_world_lidar))
+        Trajectory(stamps, truth.T_world_lidar).save(folder / GROUND_TRUTH)
         true_map = sample_seen(world_mesh(simulation.world), seen, spacing_m)
         columns = np.hstack(true_map).T.astype(np.float32)
         write_ply(folder / REFERENCE_MAP, dict(zip(("x", "y", "z", "nx", "ny", "nz"), columns, strict=True)))

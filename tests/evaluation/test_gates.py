@@ -8,7 +8,7 @@ import pytest
 from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.gates import (
     FIGURES,
@@ -30,7 +30,7 @@ def run(tmp_path: Path) -> Path:
     """A run of 120 m whose every other pose is 3 cm aside, and on which two scans were lost."""
     stamps = 0.1 * np.arange(240)
     T = exp(np.multiply.outer(stamps, [0.0, 0.0, 0.02, 5.0, 0.0, 0.0]))
-    write_tum(tmp_path / "truth.tum", Trajectory(stamps, T))
+    Trajectory(stamps, T).save(tmp_path / "truth.tum")
     T = T.copy()
     T[::2, 1, 3] += 0.06
     folder = write_run(tmp_path / "run", Trajectory(stamps, T), source="nowhere")

@@ -17,7 +17,7 @@ from lidarslam.compare.comparison import CompareOutcome, compare, format_compari
 from lidarslam.compare.method_run import Ending, Limits, supervise
 from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 
 from ..conftest import lidarslam, succeeds, write_recording
 from .conftest import Told
@@ -166,7 +166,7 @@ def test_a_method_can_be_the_reference_and_has_no_errors_itself(finished, record
 
 def test_a_file_can_be_the_reference(finished, recording, told, tmp_path, room_truth):
     late = tmp_path / "late.tum"
-    write_tum(late, Trajectory(room_truth.stamps + 100.0, room_truth.T_world_lidar))
+    Trajectory(room_truth.stamps + 100.0, room_truth.T_world_lidar).save(late)
     assert _against(f"{recording}/ground_truth.tum", finished, recording, told).methods[1].metrics is not None
     prior = _against(str(late), finished, recording, told).methods[1]
     assert prior.metrics is None

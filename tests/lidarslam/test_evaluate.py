@@ -10,7 +10,7 @@ import pytest
 from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
-from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform, write_tum
+from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.mapping.global_map.point_cloud import PointCloud, write_cloud
 
@@ -38,7 +38,7 @@ def recording(tmp_path: Path, surfaces: FloatArray) -> Path:
     folder.mkdir()
     for number in range(2):
         np.save(folder / f"scan_{number}.npy", np.ones((100, 3)))
-    write_tum(folder / "ground_truth.tum", Trajectory(STAMPS, T_TRUTH_RUN @ T))
+    Trajectory(STAMPS, T_TRUTH_RUN @ T).save(folder / "ground_truth.tum")
     write_cloud(folder / "map.ply", PointCloud(surfaces, np.zeros_like(surfaces)))
     (folder / "README.md").write_text("Made by `lidarslam simulate` (version 0)")
     return folder
@@ -120,7 +120,7 @@ def test_nothing_to_compare_with(run, recording):
 
 @pytest.mark.parametrize("name", ["truth.tum", "truth.kitti", "folder", "run"])
 def test_references_of_every_kind(run, recording, tmp_path, name):
-    write_tum(tmp_path / "truth.tum", Trajectory(STAMPS, T))
+    Trajectory(STAMPS, T).save(tmp_path / "truth.tum")
     (tmp_path / "truth.kitti").write_text(format_kitti(T))
     reference = {"folder": recording, "run": run}.get(name, tmp_path / name)
     evaluation = evaluate(EvaluateRequest(run, reference=reference, out=tmp_path / "figures.json"))

@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.exports.source import read_run_scans
@@ -51,7 +51,7 @@ def run(tmp_path: Path, landmarks: FloatArray) -> Path:
     cloud = PointCloud(landmarks, np.zeros((500, 3)))
     folder = write_run(tmp_path / "run", Trajectory(stamps, T), cloud, **about)
     drift = exp(np.multiply.outer(np.arange(SCANS), [0.0, 0.0, 0.01, 0.02, 0.0, 0.0]))
-    write_tum(folder / "odometry.tum", Trajectory(stamps, T @ drift))
+    Trajectory(stamps, T @ drift).save(folder / "odometry.tum")
     names = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
     rows = [["ok", *map(str, SIGMAS)]] * (SCANS - 1) + [["lost", *[""] * 6]]
     (folder / "scans.csv").write_text("\n".join(",".join(row) for row in [["status", *names], *rows]) + "\n")

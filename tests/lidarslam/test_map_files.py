@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.storage.directory import remove_run
 from lidarslam.storage.finished_run import load_map
 
@@ -171,7 +171,7 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive) ->
             table["rgb"] = rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
         np.save(folder / f"{index:06d}.npy", table)
     np.savetxt(folder / "timestamps.txt", EPOCH + stamps, fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", Trajectory(EPOCH + stamps, drive(stamps)))
+    Trajectory(EPOCH + stamps, drive(stamps)).save(folder / "ground_truth.tum")
     return folder
 
 

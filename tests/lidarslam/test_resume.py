@@ -15,7 +15,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.trajectory import Trajectory, write_tum
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.scan_files import read_ply
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 from lidarslam.storage.finished_run import load_run
@@ -82,7 +82,7 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
             table["x"] = np.nan
         np.save(folder / f"{index:06d}.npy", table)
     np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", Trajectory(stamps, there_and_back(stamps)))
+    Trajectory(stamps, there_and_back(stamps)).save(folder / "ground_truth.tum")
     model = replace(MEMS_IMU, T_lidar_imu=np.eye(4))
     imu = sample_imu(model, there_and_back, 0.0, 0.1 * SCANS + 0.2, seed=1)
     rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])

@@ -16,7 +16,7 @@ from lidarslam.compare.method_run import Ending, Limits, judge
 from lidarslam.config.settings import read_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory import Trajectory, chain, read_tum, write_tum
+from lidarslam.core.trajectory import Trajectory, chain, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.registry import open_recording
@@ -235,7 +235,7 @@ def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str)
     motions = truth.relative_motions()
     motions[:, :3, 3] *= scale
     prior = out.parent / f"{scale}.tum"
-    write_tum(prior, Trajectory(truth.stamps, chain(np.eye(4), motions)))
+    Trajectory(truth.stamps, chain(np.eye(4), motions)).save(prior)
     result = lidarslam("run", recording, "--out", out, "--prior", prior, "--no-mapping", *more)
     return result, summary_of(out)
 
