@@ -5,12 +5,11 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from threading import RLock
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +26,7 @@ from lidarslam.datasets.intake import look_at
 from lidarslam.datasets.mounting import corrected, transform_of
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
-from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
+from lidarslam.pipeline.estimates import ScanEstimate
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline, map_error
 from lidarslam.run.calibration import make_imu_stream
@@ -38,17 +37,6 @@ from lidarslam.run.summary import ScanLog
 from lidarslam.storage.directory import RunDirectory
 
 logger = logging.getLogger(__name__)
-
-A = TypeVar("A", bound=FloatArray | None)
-
-
-def _read_only(array: A) -> A:
-    """A copy that the caller cannot change: the next scan's estimate begins with the original."""
-    if array is None:
-        return array
-    copy = array.copy()
-    copy.flags.writeable = False
-    return copy
 
 
 class Slam:
@@ -118,13 +106,7 @@ class Slam:
             except BaseException as error:  # also Ctrl-C leaves the stages in different states
                 self._failure = error
                 raise
-            return replace(
-                estimate,
-                T_world_lidar=_read_only(estimate.T_world_lidar),
-                T_odom_lidar=_read_only(estimate.T_odom_lidar),
-                covariance=_read_only(estimate.covariance),
-                motion=SweepMotion(_read_only(estimate.motion.before), _read_only(estimate.motion.after)),
-            )
+            return copy.deepcopy(estimate)  # the next scan's estimate begins with the original
 
     def register_imu(self, stamp: float, gyroscope: ArrayLike, acceleration: ArrayLike) -> None:
         """Take the next sample of the IMU; with `odometry.method` `learned+imu` or `imu`.
