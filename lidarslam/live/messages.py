@@ -145,13 +145,6 @@ class CloudDecoder:
 Publish = Callable[[bytes], None]
 
 
-def serialize_transform(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_child: FloatArray) -> bytes:
-    """A tf2_msgs/TFMessage with one transform, the pose (4, 4) of the child."""
-    store = typestore(ros2=True)
-    message = made.transforms(store, (made.header(store, stamp_ns, frame_id), child_frame_id, T_frame_child))
-    return serialize(message, ros2=True)
-
-
 class PosePublisher:
     """Publishes the pose of a body that carries the LiDAR, relative to the pose of the body at the first scan.
 
@@ -179,4 +172,4 @@ class PosePublisher:
         message = made.odometry(store, header, self._body_frame, T, covariance, velocity)
         self._odometry(serialize(message, ros2=True))
         if self._transforms is not None:
-            self._transforms(serialize_transform(stamp_ns, self._fixed_frame, self._body_frame, T))
+            self._transforms(serialize(made.transforms(store, (header, self._body_frame, T)), ros2=True))

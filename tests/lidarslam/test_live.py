@@ -25,9 +25,9 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.mounting import correct_elevation
 from lidarslam.datasets.ros.bag_imu import Edges, add_edges, chain
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
-from lidarslam.datasets.ros.made_messages import header, point_cloud
+from lidarslam.datasets.ros.made_messages import header, point_cloud, transforms
 from lidarslam.live.live import bounded
-from lidarslam.live.messages import CloudDecoder, PosePublisher, serialize_transform
+from lidarslam.live.messages import CloudDecoder, PosePublisher
 from lidarslam.live.receiving import IncomingQueue, LiveStatistics, PublishedTopic, Received, count_missing, find_topic
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import ScanEstimate, SweepMotion
@@ -145,7 +145,7 @@ def test_interrupted_it_writes_what_came(bag, tmp_path, domain, started):
     out, T_base_lidar = tmp_path / "live", make_transform(np.diag([-1.0, -1.0, 1.0]), [1.0, 0.0, 2.0])
     node = DdsNode(domain)
     static = node.publisher("/tf_static", TRANSFORMS_TYPE, is_kept=True)
-    static(serialize_transform(0, "base_link", "velodyne", T_base_lidar))
+    static(transform("base_link", "velodyne", T_base_lidar))
     odometry = node.subscribe(PublishedTopic("/lidarslam/odometry", "nav_msgs/msg/Odometry", True))
     options = ["--domain", domain, "--topic", "points", "--base-frame", "base_link", "-o", out]
     lidarslam = started(*LIDARSLAM, "live", *options, "--odometry", "constant-velocity", "--rerun", "save")
@@ -167,6 +167,10 @@ def test_interrupted_it_writes_what_came(bag, tmp_path, domain, started):
 
 
 NOW = 1_700_000_000 * 10**9  # of publication
+
+
+def transform(parent: str, child: str, T: np.ndarray) -> bytes:
+    return bytes(STORE.serialize_cdr(transforms(STORE, (header(STORE, 0, parent), child, T)), TRANSFORMS_TYPE))
 
 
 def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8) -> bytes:
@@ -356,7 +360,7 @@ def test_static_transforms_are_chained_in_both_directions():
     a, b = exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])), exp(np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0]))
     edges: Edges = {}
     for parent, child, T in (("/base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", a)):
-        add_edges(edges, serialize_transform(0, parent, child, T), ros2=True)
+        add_edges(edges, transform(parent, child, T), ros2=True)
     add_edges(edges, b"damaged", ros2=True)
     np.testing.assert_allclose(chain(edges, "base_link", "os_lidar"), a @ a @ inverse(b), atol=1e-12)
     assert chain(edges, "base_link", "camera") is None
