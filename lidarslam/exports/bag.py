@@ -17,7 +17,6 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import serialize, typestore
-from lidarslam.datasets.ros.made_messages import write_chunk_checksums
 from lidarslam.exports.source import RunScans
 from lidarslam.storage.finished_run import load_map
 
@@ -47,8 +46,6 @@ def export_bag(
             with _writer(place, out.suffix) as writer:
                 topics = RosTopics(writer)
                 _write(topics, run, lidar_frame, with_clouds, count)
-            for written in place.glob("*.mcap"):
-                write_chunk_checksums(written)
             made = place / f"{place.name}{out.suffix}" if out.suffix in (".mcap", ".db3") else place
             made.replace(out)
     except (OSError, sqlite3.Error) as error:

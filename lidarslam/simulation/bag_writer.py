@@ -111,8 +111,6 @@ def write_bag(
                 bag.write(*message)
     except sqlite3.Error as error:
         raise OutputError(f"{bag.path}: cannot be written ({error}); is the disk full?") from error
-    if kind == "mcap":
-        made.write_chunk_checksums(folder / f"{folder.name}.mcap")
 
 
 Messages = Iterator[tuple[Any, int, bytes]]  # connection, time of recording in nanoseconds, bytes; in order of time

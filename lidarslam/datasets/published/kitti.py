@@ -337,9 +337,9 @@ class Kitti360Recording(BinRecording):
         to_lidar, to_pose = folder / "calib_cam_to_velo.txt", folder / "calib_cam_to_pose.txt"
         if not (to_lidar.is_file() and to_pose.is_file()):
             return None
-        T_pose_cam, T_lidar_cam = read_calibration(to_pose).get("image_00"), parse_numbers(to_lidar, 12)
-        if T_pose_cam is None or len(T_pose_cam) != 12 or len(T_lidar_cam) != 1:
-            raise InputError(f"{folder}: expected 12 numbers in {to_lidar.name} and at `image_00:` in {to_pose.name}")
+        T_pose_cam, T_lidar_cam = read_entry(to_pose, 12, "image_00"), parse_numbers(to_lidar, 12)
+        if len(T_lidar_cam) != 1:
+            raise InputError(f"{to_lidar}: expected one line of 12 numbers")
         return poses_of_rows(T_pose_cam) @ inverse(poses_of_rows(T_lidar_cam[0]))
 
     def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:  # noqa: ARG002
@@ -353,24 +353,16 @@ class Kitti360Recording(BinRecording):
         return note, "There is no calibration folder beside data_3d_raw, so the poses cannot be used as ground truth."
 
 
-def read_calibration(path: Path) -> dict[str, FloatArray]:
-    """The arrays of a calibration file by name; lines without numbers, such as the date, are left out."""
-    arrays = {}
+def read_entry(path: Path, count: int, *names: str) -> FloatArray:
+    """The numbers of the line of a calibration file that has one of the names."""
     for line in bounded_lines(path):
         name, _, values = line.partition(":")
-        try:
-            arrays[name.strip()] = np.array([float(word) for word in values.split()])
-        except ValueError:
-            continue
-    return arrays
-
-
-def _entry(path: Path, arrays: dict[str, FloatArray], name: str, count: int) -> FloatArray:
-    values = arrays.get(name)
-    if values is None or len(values) != count or not np.isfinite(values).all():
-        got = "no such line" if values is None else f"{len(values)} numbers"
-        raise InputError(f"{path}: expected a line `{name}:` with {count} numbers, got {got}")
-    return values
+        if name.strip() in names:
+            with suppress(ValueError):
+                numbers = np.array(values.split(), dtype=np.float64)
+                if len(numbers) == count and np.isfinite(numbers).all():
+                    return numbers
+    raise InputError(f"{path}: expected a line `{names[0]}:` with {count} numbers; copy the file again")
 
 
 def _rigid(path: Path, R: FloatArray, t: FloatArray) -> FloatArray:
@@ -382,18 +374,15 @@ def _rigid(path: Path, R: FloatArray, t: FloatArray) -> FloatArray:
 
 def read_tr(path: Path) -> FloatArray:
     """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr` or `Tr_velo_to_cam`."""
-    arrays = read_calibration(path)
-    name = "Tr_velo_to_cam" if "Tr" not in arrays and "Tr_velo_to_cam" in arrays else "Tr"
-    rows = _entry(path, arrays, name, 12).reshape(3, 4)
+    rows = read_entry(path, 12, "Tr", "Tr_velo_to_cam").reshape(3, 4)
     return _rigid(path, rows[:, :3], rows[:, 3])
 
 
 def read_raw_calibration(path: Path) -> FloatArray:
     """The transform (4, 4) of a raw calibration file: T_B_A of calib_A_to_B.txt, T_rect_cam of calib_cam_to_cam.txt."""
-    arrays = read_calibration(path)
     if path.name == "calib_cam_to_cam.txt":
-        return _rigid(path, _entry(path, arrays, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
-    return _rigid(path, _entry(path, arrays, "R", 9).reshape(3, 3), _entry(path, arrays, "T", 3))
+        return _rigid(path, read_entry(path, 9, "R_rect_00").reshape(3, 3), np.zeros(3))
+    return _rigid(path, read_entry(path, 9, "R").reshape(3, 3), read_entry(path, 3, "T"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,6 @@
 """Messages of ROS 1 and ROS 2, made of poses and points; the store of types decides which ROS it is."""
 
-import struct
-from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,19 +97,3 @@ def point_cloud(store: Typestore, cloud_header: Any, records: NDArray[np.void]) 
 def _quaternion(store: Typestore, T: FloatArray) -> Any:
     quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
     return store.types["geometry_msgs/msg/Quaternion"](*quaternion.tolist())
-
-
-def write_chunk_checksums(path: Path) -> None:
-    """Give the uncompressed chunks of an MCAP file (mcap.dev/spec) their CRC-32, which rosbags 0.11 leaves out."""
-    with path.open("r+b") as file:
-        file.seek(8)  # magic
-        while len(record := file.read(9)) == 9:
-            opcode, size = struct.unpack("<BQ", record)
-            begin = file.tell()
-            if opcode == 0x06:
-                # Start, end, size, checksum, an empty name of a compression, size again.
-                header = file.read(40)
-                checksum = crc32(file.read(size - len(header)))
-                file.seek(begin + 24)
-                file.write(struct.pack("<I", checksum))
-            file.seek(begin + size)
