@@ -6,6 +6,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Collection, Iterable, Sequence
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from lidarslam.core.errors import ConfigError
@@ -23,7 +24,9 @@ _TAIL = 400
 # Bytes; file systems allow 255, and a number, a time or a suffix may follow.
 _LONGEST_NAME = 120
 _SEPARATORS = re.compile(r"[/\\]+")
-_NAME_REMEDY = "name it with letters, digits, '-', '_', '.' or '+', without a dot at the beginning"
+_NAME_REMEDY = (
+    "name it with letters, digits, '-', '_', '.' or '+', without a dot at the beginning, and unlike the report's files"
+)
 
 
 def one_line(text: str, longest: int = _LONGEST) -> str:
@@ -64,6 +67,11 @@ def first_few(names: Sequence[object], most: int) -> str:
     """The first few of some names, and how many more there are: a, b and 3 more."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return f"{', '.join(map(str, names[:most]))}{more}"
+
+
+def in_common(first: Sequence[str], second: Sequence[str]) -> int:
+    """How many elements two sequences have in common at their beginnings."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(first, second, strict=False)))
 
 
 def scan_span(first: int, last: int) -> str:
@@ -114,18 +122,8 @@ def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
 
     Else a ConfigError, which says `what` has this name; `reserved` are names of other files in the same folder.
     """
-    is_long = len(name.encode(errors="replace")) > _LONGEST_NAME
-    faults = {
-        "is empty": not name.strip(),
-        "has a separator": _SEPARATORS.search(name) is not None,
-        "begins with a dot": name.startswith("."),
-        "has a control character, or is too long": is_long or one_line(name) != name,
-        "is that of another file there": name in reserved,
-    }
-    for fault in (fault for fault, is_there in faults.items() if is_there):
-        raise ConfigError(
-            f"{what} {name[:_LONGEST_NAME]!r}: cannot be the name of a folder, as it {fault}; {_NAME_REMEDY}"
-        )
+    if safe_name(name) != name or name in reserved:
+        raise ConfigError(f"{what} {name[:_LONGEST_NAME]!r}: cannot be the name of a folder; {_NAME_REMEDY}")
     return name
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +10,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
+from lidarslam.core.text import in_common
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.point_table import PointField
@@ -27,14 +27,10 @@ _VALID = 1  # of a column's status
 def find_metadata(source: Path) -> Path | None:
     """The metadata of an Ouster next to a recording: the file whose name begins most like it, or the only one."""
     folder = source.absolute().parent
-    found = {path: _in_common(path.stem, source.stem) for path in folder.glob("*.json") if _is_metadata(path)}
+    found = {path: in_common(path.stem, source.stem) for path in folder.glob("*.json") if _is_metadata(path)}
     best = max(sorted(found), key=lambda path: found[path], default=None)
     is_alone = len(list(folder.glob(f"*{source.suffix}"))) == 1
     return best if best is not None and (found[best] or is_alone) else None
-
-
-def _in_common(name: str, other: str) -> int:
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(name, other, strict=False)))
 
 
 def _is_metadata(path: Path) -> bool:

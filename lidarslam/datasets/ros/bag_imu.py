@@ -1,10 +1,8 @@
 """The IMU of a bag: its topic, its messages sensor_msgs/Imu, and its extrinsic from /tf_static."""
 
 import re
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
-from itertools import islice, takewhile
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -12,13 +10,12 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.text import count
+from lidarslam.core.text import count, in_common
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.recording import ImuSummary, Topic
+from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import (
     TRANSFORMS_TYPE,
-    BagMessage,
     StampSource,
     behind_header,
     deserialize,
@@ -30,8 +27,6 @@ _TOPIC = "tf_static"
 Edges = dict[str, dict[str, FloatArray]]
 """T_from_to (4, 4) by the names of both frames, in both directions."""
 IMU_TYPE = "sensor_msgs/msg/Imu"
-# Enough for the median of a rate.
-_SAMPLES_LOOKED_AT = 200
 # Behind the header, in float64: orientation 4, its covariance 9, angular velocity 3, covariance 9, acceleration 3, 9.
 _NUMBERS = 37
 ANGULAR_VELOCITY, ACCELERATION = slice(13, 16), slice(25, 28)
@@ -80,50 +75,32 @@ def _matrix(transform: Any) -> FloatArray:
     return T
 
 
-class BagImu:
-    """The IMU recorded with the point clouds of a bag: the wanted topic, else that nearest to the clouds'."""
-
-    def __init__(self, bag: BagFile, clouds: str, lidar_frame: str, stamps: StampSource, wanted: str | None) -> None:
-        self._bag = bag
-        self._lidar_frame, self._stamps = lidar_frame, stamps  # of the clouds
-        self._topic = _choose(bag, clouds, lidar_frame, wanted)
-
-    def samples(self) -> ImuSamples | None:
-        """All samples, by one pass over their topic; None of a bag without any."""
-        return None if self._topic is None else self._decoded(self._bag.messages(self._topic))
-
-    def summary(self) -> ImuSummary | None:
-        """The description, by the first samples; their number is in the index."""
-        if self._topic is None:
-            return None
-        first = self._decoded(islice(self._bag.messages(self._topic), _SAMPLES_LOOKED_AT))
-        if first is None:
-            return None
-        return replace(ImuSummary.of(self._topic.name, first), samples=self._topic.messages)
-
-    def _decoded(self, messages: Iterator[BagMessage]) -> ImuSamples | None:
-        found = [(m, None if m.damage is not None else imu_numbers(m.raw, self._bag.ros2)) for m in messages]
-        sound = [message for message, numbers in found if numbers is not None]
-        if not sound:
-            return None
-        source = find_stamp_source(sound) if self._stamps.from_header else self._stamps
-        stamps = np.array([source.stamp(message) for message in sound])
-        stamps[stamps <= source.before_first] = np.nan
-        T_lidar_imu, notes = self._extrinsic(sound[0].frame_id)
-        if damaged := len(found) - len(sound):
-            notes = (*notes, f"{count(damaged, 'damaged IMU message')} left out.")
-        table = np.stack([numbers for _, numbers in found if numbers is not None])
-        return usable_samples(stamps, table[:, ANGULAR_VELOCITY], table[:, ACCELERATION], T_lidar_imu, notes)
-
-    def _extrinsic(self, frame_id: str) -> tuple[FloatArray | None, tuple[str, ...]]:
-        lidar = self._lidar_frame
-        if frame_id.lstrip("/") == lidar.lstrip("/"):
-            note = f"LiDAR and IMU share the frame {lidar!r}, so the IMU is taken to have the LiDAR's axes and place."
-            return np.eye(4), (note,)
-        return static_transform(self._bag, lidar, frame_id), ()
+def read_imu(
+    bag: BagFile, topic: Topic, lidar_frame: str, stamps: StampSource, most: int | None = None
+) -> ImuSamples | None:
+    """The samples of a topic, or the first of them; None where there are none. Frame and stamps are of the clouds."""
+    messages = islice(bag.messages(topic), most)
+    found = [(m, None if m.damage is not None else imu_numbers(m.raw, bag.ros2)) for m in messages]
+    sound = [message for message, numbers in found if numbers is not None]
+    if not sound:
+        return None
+    source = find_stamp_source(sound) if stamps.from_header else stamps
+    times = np.array([source.stamp(message) for message in sound])
+    times[times <= source.before_first] = np.nan
+    notes: tuple[str, ...] = ()
+    if sound[0].frame_id.lstrip("/") == lidar_frame.lstrip("/"):
+        T_lidar_imu: FloatArray | None = np.eye(4)
+        said = f"LiDAR and IMU share the frame {lidar_frame!r}"
+        notes = (f"{said}, so the IMU is taken to have the LiDAR's axes and place.",)
+    else:
+        T_lidar_imu = static_transform(bag, lidar_frame, sound[0].frame_id)
+    if damaged := len(found) - len(sound):
+        notes = (*notes, f"{count(damaged, 'damaged IMU message')} left out.")
+    table = np.stack([numbers for _, numbers in found if numbers is not None])
+    return usable_samples(times, table[:, ANGULAR_VELOCITY], table[:, ACCELERATION], T_lidar_imu, notes)
 
 
-def _choose(bag: BagFile, clouds: str, lidar_frame: str, wanted: str | None) -> Topic | None:
+def choose_imu(bag: BagFile, clouds: str, lidar_frame: str, wanted: str | None) -> Topic | None:
     """The wanted topic, or of several the nearest by the names of topic and frame, of these the fastest."""
     imus = [topic for topic in bag.topics if topic.message_type == IMU_TYPE and topic.messages]
     if wanted is not None:
@@ -145,8 +122,7 @@ def _choose(bag: BagFile, clouds: str, lidar_frame: str, wanted: str | None) -> 
 
 
 def _shared(first: str, second: str, separator: str = "/") -> int:
-    parts = (re.split(separator, name.lstrip("/")) for name in (first, second))
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
+    return in_common(*(re.split(separator, name.lstrip("/")) for name in (first, second)))
 
 
 def imu_numbers(raw: bytes, ros2: bool) -> FloatArray | None:

@@ -3,6 +3,7 @@
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -28,7 +29,7 @@ from lidarslam.datasets.recording import (
     truth_beside,
 )
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.ros.bag_imu import BagImu
+from lidarslam.datasets.ros.bag_imu import choose_imu, read_imu
 from lidarslam.datasets.ros.bag_message import (
     CLOUD_TYPES,
     CUSTOM_MESSAGE_TYPES,
@@ -49,6 +50,8 @@ _NEGLIGIBLE = 0.05
 # Number of pairs of messages that are compared at their seams, spread over this many of the first.
 _PAIRS, _LOOKED_AT = 40, 600
 _FRAMES_LOOKED_AT, _STAMPS_LOOKED_AT = 10, 20
+# Enough for the median of the IMU's rate.
+_SAMPLES_LOOKED_AT = 200
 
 _DAMAGED = "damaged places in the bag were met, where reading its file stopped"
 _MISSING = "scans are missing that the index lists"
@@ -94,14 +97,19 @@ class BagRecording(CloudRecording):
     @cached_property
     def imu(self) -> ImuSamples | None:
         """The samples of the IMU topic nearest to the clouds', unless another is asked for."""
-        return self._imu.samples()
+        topic = self._imu_topic
+        return None if topic is None else read_imu(self._bag, topic, self._frame_id, self._stamps)
 
     @cached_property
-    def _imu(self) -> BagImu:
-        return BagImu(self._bag, self._topic.name, self._frame_id, self._stamps, self._config.imu_topic)
+    def _imu_topic(self) -> Topic | None:
+        return choose_imu(self._bag, self._topic.name, self._frame_id, self._config.imu_topic)
 
     def _imu_summary(self) -> ImuSummary | None:
-        return self._imu.summary()
+        """By the first samples; their number is in the index."""
+        if (topic := self._imu_topic) is None:
+            return None
+        first = read_imu(self._bag, topic, self._frame_id, self._stamps, _SAMPLES_LOOKED_AT)
+        return None if first is None else replace(ImuSummary.of(topic.name, first), samples=topic.messages)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
