@@ -253,26 +253,10 @@ def _load(model: type[M], path: Path | None, settings: Sequence[str], example: s
 
 
 def _validated(model: type[M], tree: dict[str, Any], origin: str) -> M:
-    if (key := _switched_number(model, tree)) is not None:
-        raise ConfigError(f"configuration ({origin}): {key}: expected a number, not true or false")
     try:
         return model.model_validate(tree)
     except ValidationError as error:
         raise ConfigError(_explain(error, model, origin)) from None
-
-
-def _switched_number(model: type[BaseModel], tree: Mapping[str, Any]) -> str | None:
-    """The first number that is given as true or false, which Pydantic takes for 1 and 0; None without any."""
-    for key, field in model.model_fields.items():
-        value, kinds, section = tree.get(key), {field.annotation, *get_args(field.annotation)}, _section_of(field)
-        if section is not None and isinstance(value, Mapping):
-            if (within := _switched_number(section, value)) is not None:
-                return f"{key}.{within}"
-        elif isinstance(value, bool):
-            plain = {getattr(kind, "__origin__", kind) for kind in kinds}  # of Annotated
-            if plain & {int, float} and bool not in plain:
-                return key
-    return None
 
 
 def reader_settings(**options: str | None) -> list[str]:

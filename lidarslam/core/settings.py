@@ -1,14 +1,24 @@
 """The bases of all settings that a configuration file holds."""
 
-from typing import Self
+from typing import Any, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 
 class Settings(BaseModel):
     """Settings: values do not change, unknown keys are refused, and numbers are finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _a_switch_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, bool):  # which Pydantic takes for 1 or 0
+            kind = cls.model_fields[info.field_name or ""].annotation
+            kinds = {getattr(one, "__origin__", one) for one in (kind, *get_args(kind))}  # of Annotated
+            if kinds & {int, float} and bool not in kinds:
+                raise ValueError("expected a number, not true or false")
+        return value
 
 
 class RangeSettings(Settings):
