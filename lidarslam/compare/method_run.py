@@ -6,7 +6,6 @@ exit status is that of `lidarslam run`.
 """
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
@@ -143,7 +142,6 @@ _ROOT = Path(__file__).resolve().parents[2]
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
 _LONGEST_MESSAGE = 300
 _STOPPED, _LOST = 1, 3  # exit statuses
-_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 
 
 @dataclass(frozen=True)
@@ -214,9 +212,6 @@ def run_method(
 
 def clear(folder: Path) -> None:
     """Make a method's directory, or remove the files of a run of an earlier comparison."""
-    for one in (folder.parent, folder):
-        if one.is_symlink():  # its target is not of this comparison
-            one.unlink()
     if (folder / LOG).is_file():
         files.remove_files(folder)
         (folder / PROCESS).unlink(missing_ok=True)
@@ -286,8 +281,6 @@ def main() -> int:
     """Run; the exit status."""
     folder, text = sys.argv[1:]
     os.chdir(folder)
-    with contextlib.suppress(OSError, AttributeError):  # end with the supervisor, however that ends (Linux)
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # its Ctrl-C is ours; processes of Ray block it
     with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as out:
         os.dup2(2, 1)

@@ -80,17 +80,14 @@ def _new_measurements(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
     """The scans without repeated ones: the noise of two measurements is never the same."""
     last: Scan | None = None
     for scan in scans:
-        if last is not None and len(scan) > _FEW_POINTS and _is_repeated(scan.points, last.points):
+        is_like_last = last is not None and len(scan) > _FEW_POINTS and np.array_equal(scan.points, last.points)
+        if is_like_last and not _is_one_place(scan.points):
             faults.leave_out(_REPEATED, f"at {scan.stamp:.9f}")
             continue
         if last is not None and scan.stamp - last.stamp < _LEAST_INTERVAL_S:
             faults.note(_TOO_FAST, f"{1e6 * (scan.stamp - last.stamp):.3g} microseconds at {scan.stamp:.9f}")
         last = scan
         yield scan
-
-
-def _is_repeated(points: FloatArray, before: FloatArray) -> bool:
-    return np.array_equal(points, before) and not _is_one_place(points)
 
 
 def _is_one_place(points: FloatArray) -> bool:
