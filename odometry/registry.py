@@ -1,11 +1,11 @@
 """The odometry methods by name, a method's module being imported when it is chosen, and the bundled network."""
 
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import cast
 
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.plugins import require_library
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import ODOMETRIES, LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import ConstantVelocity, Odometry
@@ -42,14 +42,9 @@ def require_train_extra(purpose: str) -> None:
 
     ConfigError where one is missing.
     """
+    small = "PyTorch's CPU build, installed first, is much smaller: https://pytorch.org/get-started/locally"
     for name in _LIBRARIES:
-        try:
-            import_module(name)
-        except ModuleNotFoundError as error:
-            raise ConfigError(
-                f"{error.name} is not installed, which {purpose} needs; pip install 'lidarslam[train]'"
-                " (PyTorch's CPU build, installed first, is much smaller: https://pytorch.org/get-started/locally)"
-            ) from error
+        require_library(name, f"{purpose} needs", f"pip install 'lidarslam[train]' ({small})")
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:

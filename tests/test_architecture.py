@@ -71,7 +71,7 @@ CONFINED = {
     "pyproj": ("lidarslam.exports.geo",),
     "ray": ("lidarslam.core.tasks",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.bag_writer", "lidarslam.exports.*", "lidarslam.live.*"),
-    "cyclonedds": ("lidarslam.live.dds",),
+    "cyclonedds": ("lidarslam.live.dds", "lidarslam.live.live"),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES = 500
@@ -154,7 +154,7 @@ def _absolute(statement: ast.ImportFrom, module: Module) -> str:
 
 def _is_import_call(call: ast.Call) -> bool:
     function = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-    if function not in ("import_module", "__import__") or not call.args:
+    if function not in ("import_module", "__import__", "require_library") or not call.args:
         return False
     return isinstance(call.args[0], ast.Constant) and isinstance(call.args[0].value, str)
 

@@ -241,7 +241,8 @@ def evaluate_map(
     positions = transform_points(alignment.T_reference_map, positions)
     aligned = transform_points(alignment.T_reference_map, points)
     comparison = compare_maps(aligned, reference.points, positions, max_range_m, options.spacing_m)
-    return MapEvaluation(reference.label, alignment, comparison, map_entropy(points), positions, max_range_m)
+    label = f"{reference.path}{'' if reference.truth is None else ', the exact map of the simulation'}"
+    return MapEvaluation(label, alignment, comparison, map_entropy(points), positions, max_range_m)
 
 
 def _along_trajectory(
@@ -338,8 +339,9 @@ def _lines(evaluation: Evaluation) -> Iterator[str]:
         yield from _trajectory(evaluation.metrics)
     if evaluation.map is not None:
         yield from _map(evaluation.map)
-    if evaluation.entropy is not None:
-        yield from _entropy(evaluation.entropy, with_title=evaluation.map is None)
+    if (entropy := evaluation.entropy) is not None:
+        yield from ("", "MAP") if evaluation.map is None else ()
+        yield _row("mean map entropy", f"{entropy.mean:>10.3f}      within {RADIUS_M:g} m; lower is crisper")
     yield from [""] if evaluation.notes else []
     yield from (f"note: {note}" for note in evaluation.notes)
     if evaluation.written:
@@ -412,8 +414,3 @@ def _map(compared: MapEvaluation) -> Iterator[str]:
 def _percentages(shares: Mapping[float, float | None]) -> str:
     texts = (f"{'-' if share is None else f'{share:.1f}'} % at {m:g} m" for m, share in shares.items())
     return "  " + ", ".join(f"{text:>10}" for text in texts)
-
-
-def _entropy(entropy: MapEntropy, with_title: bool) -> Iterator[str]:
-    yield from ("", "MAP") if with_title else ()
-    yield _row("mean map entropy", f"{entropy.mean:>10.3f}      within {RADIUS_M:g} m; lower is crisper")

@@ -11,8 +11,9 @@ import numpy as np
 
 from lidarslam.config.settings import Config, load_config, read_yaml
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.files import reading
+from lidarslam.core.files import bounded_lines, reading
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.plugins import require_library
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
@@ -88,11 +89,7 @@ def _require_chunks(path: Path) -> None:
 
 
 def _read_e57(path: Path) -> FloatArray:
-    try:
-        import pye57
-    except ImportError as error:
-        raise InputError(f"{path}: E57 files need pye57; type: pip install pye57") from error
-    file = pye57.E57(str(path))
+    file = require_library("pye57", "E57 files need", "pip install 'lidarslam[e57]'").E57(str(path))
     try:
         scans = [file.read_scan(number, ignore_missing_fields=True) for number in range(file.scan_count)]
     finally:
@@ -201,14 +198,8 @@ def truth_of_run(run: Path) -> Trajectory | None:
 
 
 def _read_poses(path: Path) -> Poses:
-    try:
-        with path.open(encoding="utf-8-sig") as lines:
-            rows = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
-            columns = next((len(words) for words in rows if words), 0)
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: neither a TUM nor a KITTI trajectory; it is not text. Name a run directory or a trajectory file"
-        ) from error
+    rows = (line.split("#", 1)[0].replace(",", " ").split() for line in bounded_lines(path))
+    columns = next((len(words) for words in rows if words), 0)
     if columns == _KITTI_COLUMNS:
         return Poses(str(path), Trajectory.from_kitti(path), has_stamps=False)
     return Poses(str(path), read_tum(path))
@@ -243,11 +234,6 @@ class ReferenceMap:
     path: Path  # of its file
     points: FloatArray  # (N, 3) in its own frame
     truth: Trajectory | None = None  # the true trajectory in that frame; None when none is known
-
-    @property
-    def label(self) -> str:
-        """For messages."""
-        return f"{self.path}{'' if self.truth is None else ', the exact map of the simulation'}"
 
 
 def load_reference_map(path: Path) -> ReferenceMap:

@@ -14,7 +14,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.errors import InputError, LidarSlamError, OutputError
 from lidarslam.core.text import reason
 
 ONE_READER = threading.Lock()
@@ -163,7 +163,7 @@ def reading(place: Path, fault: str, remedy: str) -> Iterator[None]:
     """InputError of the fault for any error in the block: libraries meet damaged data with nearly anything."""
     try:
         yield
-    except InputError:
+    except LidarSlamError:
         raise
     except Exception as error:
         raise InputError(f"{place}: {fault} ({reason(error)}); {remedy}") from error

@@ -1,10 +1,11 @@
-"""Plug points: entry points of other packages in the groups `lidarslam.odometry`, `lidarslam.mapping` etc."""
+"""Plug points: entry points of other packages in the groups `lidarslam.odometry` etc.; libraries of the extras."""
 
 import logging
 import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
 from lidarslam.core.errors import ConfigError
@@ -92,6 +93,15 @@ def usable(point: PlugPoint, kind: Any) -> Mapping[str, Any]:
         except ConfigError as error:
             logger.warning("%s", error)
     return found
+
+
+def require_library(library: str, purpose: str, install: str) -> Any:
+    """A library that not every installation has; ConfigError with the command that installs it where it is missing."""
+    try:
+        return import_module(library)
+    except ModuleNotFoundError as error:
+        missing = (error.name or library).partition(".")[0]
+        raise ConfigError(f"{missing} is not installed, which {purpose}; {install}") from error
 
 
 def _package(entry: "EntryPoint") -> str:

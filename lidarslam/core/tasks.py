@@ -17,6 +17,7 @@ from importlib.metadata import version
 from typing import Any, TypeVar
 
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError, OutputError
+from lidarslam.core.plugins import require_library
 from lidarslam.core.text import reason
 
 T = TypeVar("T")
@@ -87,12 +88,7 @@ def open_tasks(where: Where) -> contextlib.AbstractContextManager[Tasks]:
     """The executor of the tasks, for the duration of the context; ConfigError where Ray or the cluster is not there."""
     if where.is_serial:
         return contextlib.nullcontext(Tasks())
-    try:
-        import ray  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"{error.name} is not installed, which --jobs and --ray need; pip install 'lidarslam[ray]'"
-        ) from error
+    require_library("ray", "--jobs and --ray need", "pip install 'lidarslam[ray]'")
     return _ray_tasks(where)
 
 

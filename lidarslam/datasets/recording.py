@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.plugins import require_library
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.core.text import first_few
 from lidarslam.core.trajectory import Trajectory, read_tum
@@ -25,12 +25,6 @@ from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, lea
 
 logger = logging.getLogger(__name__)
 
-# The commands to install libraries. ouster-sdk is no extra: it requires a version of rosbags that this program cannot
-# use, and does not need it for the functions used here.
-_INSTALL = {
-    "velodyne_decoder": "pip install 'lidarslam[velodyne]'",
-    "ouster.sdk": "pip install --no-deps ouster-sdk",
-}
 STORAGE_SUFFIXES = (".db3", ".mcap")  # of rosbag2
 ROSBAG1_SUFFIXES = (".bag", ".bag.active")  # .active: the recorder was killed
 _TRUTH_NAMES = ("ground_truth.tum", "groundtruth.tum", "ground_truth.txt", "groundtruth.txt")
@@ -351,10 +345,10 @@ class PacketRecording(StoredRecording):
 
     reader = "packets"
     imu_name = "the sensor's own"
-    library: tuple[str, str]  # that decodes the packets, and whose packets
+    library: tuple[str, str, str]  # that decodes the packets, as of `require_library`
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
-        require(*self.library)
+        require_library(*self.library)
         super().__init__(source, config)
         self._truth_path = truth_beside(source, self.name)
 
@@ -377,15 +371,6 @@ class PacketRecording(StoredRecording):
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
         return self._extent[1]
-
-
-def require(library: str, purpose: str) -> None:
-    """Check that a library is installed; the message names the purpose."""
-    try:
-        import_module(library)
-    except ModuleNotFoundError as error:
-        name = library.partition(".")[0] if error.name and library.startswith(error.name) else error.name
-        raise ConfigError(f"{name} is not installed, which {purpose} need; {_INSTALL[library]}") from error
 
 
 def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:

@@ -4,16 +4,16 @@ import json
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import InputError
 from lidarslam.core.files import make_directory, written
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plugins import require_library
 from lidarslam.core.trajectory import Trajectory, format_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.mounting import recorded_axes
@@ -63,10 +63,7 @@ class Utm:
 
 def utm_around(geodetic: FloatArray) -> Utm:
     """The zone of most positions (N, 3): latitude and longitude in degrees, height."""
-    try:
-        pyproj: Any = import_module("pyproj")
-    except ModuleNotFoundError as error:
-        raise ConfigError("georeferenced output needs pyproj; pip install 'lidarslam[geo]'") from error
+    pyproj = require_library("pyproj", "georeferenced output needs", "pip install 'lidarslam[geo]'")
     latitude_deg, longitude_deg = np.median(geodetic[:, :2], axis=0).tolist()
     zone = int((longitude_deg + 180.0) // 6.0) % 60 + 1
     epsg = (_NORTH if latitude_deg >= 0.0 else _SOUTH) + zone

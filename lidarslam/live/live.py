@@ -13,8 +13,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lidarslam.config.settings import Config
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.plugins import require_library
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
@@ -203,10 +204,9 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     `show` is called with a short text on the progress, every second while scans arrive; the page is of `rerun="web"`.
     """
     require_possible(request)
-    try:
-        from lidarslam.live.dds import open_node
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
+    require_library("cyclonedds", "live needs", "pip install 'lidarslam[live]'")
+    from lidarslam.live.dds import open_node
+
     node = open_node(request.domain)
     request = replace(request, config=bounded(request.config))
     config, faults = request.config, Faults()

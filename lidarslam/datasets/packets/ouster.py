@@ -43,7 +43,8 @@ def _is_metadata(path: Path) -> bool:
 class OusterRecording(PacketRecording):
     """The sweeps of one sensor, stamped at their first column by the sensor's clock, in the sensor's frame."""
 
-    library = "ouster.sdk", "packets of an Ouster"
+    # It is no extra: it requires a version of rosbags that this program cannot use, and does not need it here.
+    library = "ouster.sdk", "packets of an Ouster need", "pip install --no-deps ouster-sdk"
     point_time = PointTimeModel("timestamp", "ns", "relative")
 
     @cached_property

@@ -26,7 +26,7 @@ _StampedCloud = tuple[float, NDArray[np.void]]
 class VelodyneCapture(PacketRecording):
     """The sweeps of a .pcap file, stamped by the host at their first packet."""
 
-    library = "velodyne_decoder", "packets of a Velodyne"
+    library = "velodyne_decoder", "packets of a Velodyne need", "pip install 'lidarslam[velodyne]'"
     point_time = PointTimeModel("time", "s", "relative")
 
     def _items(self, wanted: range, faults: Faults) -> Iterator[_StampedCloud]:  # noqa: ARG002

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.plugins import require_library
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
@@ -96,10 +97,7 @@ open_recording = Argoverse2Recording
 
 
 def _read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    try:
-        from pyarrow import feather
-    except ImportError as error:
-        raise InputError(f"{path}: needs pyarrow; pip install 'lidarslam[datasets]'") from error
+    feather = require_library("pyarrow.feather", "Argoverse 2 needs", "pip install 'lidarslam[datasets]'")
     with reading(path, "cannot be read", "download it again"):
         table = feather.read_table(path, columns=list(names))
         return {name: table.column(name).to_numpy() for name in names}

@@ -13,10 +13,12 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.plugins import require_library
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import OusterRecording, find_metadata, frames_of_packets, packets_of, read_sensor
+from lidarslam.datasets.packets.velodyne import VelodyneCapture
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import (
     CloudRecording,
@@ -24,7 +26,6 @@ from lidarslam.datasets.recording import (
     Recording,
     SeveralTopicsError,
     Topic,
-    require,
     storage_files,
     truth_beside,
 )
@@ -66,7 +67,7 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     if topic.message_type in OUSTER_PACKET_TYPES:
         return OusterBag(source, config, bag, topic)
     if topic.message_type == VELODYNE_SCAN_TYPE:
-        require("velodyne_decoder", "packets of a Velodyne")
+        require_library(*VelodyneCapture.library)
     return BagRecording(source, config, bag, topic)
 
 
