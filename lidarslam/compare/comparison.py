@@ -18,7 +18,9 @@ from lidarslam.assessment.evaluate import evaluate_map
 from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
 from lidarslam.compare import method_run
 from lidarslam.compare.method_run import Limits, MethodRun
+from lidarslam.compare.peers.interface import MAX_RANGE_M
 from lidarslam.compare.plan import (
+    BY_SCENE,
     CompareRequest,
     PlannedRecording,
     fill_request,
@@ -26,7 +28,6 @@ from lidarslam.compare.plan import (
     make_plan,
     make_recordings,
     require_data,
-    scene_note,
 )
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer
@@ -197,28 +198,23 @@ class _Turns:
 
     def measured(self, planned: PlannedRecording) -> SequenceComparison:
         """All methods on one recording, with their errors."""
-        results = []
-        for run in planned.runs:
-            if run.request.out in self._done:
-                results.append(self._done[run.request.out])
-                continue
-            known = self._without_process(planned, run)
-            results.append(known or self._run(planned, run))
-            reused = known is not None and known.status in WHOLE
-            self.narrator.tell(format_result(planned.name, results[-1], reused))
+        results = [self._done.get(run.request.out) or self._take(planned, run) for run in planned.runs]
         try:
             return measure(planned, results, with_maps=not self.interrupted)
         except KeyboardInterrupt:  # comparing maps takes time
             self.interrupted = True
             return measure(planned, results, with_maps=False)
 
-    def _run(self, planned: PlannedRecording, run: MethodRun) -> MethodResult:
-        result = MethodResult(run.name, "not run", _INTERRUPTED)
+    def _take(self, planned: PlannedRecording, run: MethodRun) -> MethodResult:
+        known = self._without_process(planned, run)
+        result = known or MethodResult(run.name, "not run", _INTERRUPTED)
         try:
-            with self.narrator.counting(f"{planned.name} {run.name}") as counter:
-                result, self.interrupted = method_run.run_method(run, self.request.limits, counter, self.command)
+            if known is None:
+                with self.narrator.counting(f"{planned.name} {run.name}") as counter:
+                    result, self.interrupted = method_run.run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
+        self.narrator.tell(format_result(planned.name, result, known is not None and known.status in WHOLE))
         return result
 
 
@@ -262,7 +258,10 @@ def _packed(folder: Path) -> bytes:
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
     """The results on one recording, one per method, with the errors of trajectories and, if asked for, of maps."""
-    notes = [] if planned.range_m is None else [scene_note(planned.range_m)]
+    notes = []
+    if planned.range_m is not None:
+        by_scene = f"maximum range {planned.range_m:g} m instead of {MAX_RANGE_M:g} m"
+        notes.append(f"@{BY_SCENE}: {by_scene}, and voxels in proportion, by the ranges of the first scans")
     reference = _find_reference(planned, results, notes)
     measured = [_measure_trajectory(result, reference) for result in results]
     if with_maps:

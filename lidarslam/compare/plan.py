@@ -144,14 +144,6 @@ def scene_range_m(recording: Recording, chosen: range) -> float:
     return round(float(np.clip(_TIMES * np.percentile(found, _PERCENT), _SHORTEST_M, MAX_RANGE_M)), 1)
 
 
-def scene_note(range_m: float) -> str:
-    """A sentence on the meaning of the name on this recording."""
-    return (
-        f"@{BY_SCENE}: maximum range {range_m:g} m instead of {MAX_RANGE_M:g} m, and voxels in proportion, by the"
-        " ranges of the first scans"
-    )
-
-
 class Simulated(Settings):
     """A recording that is simulated when it is not there; names as in `lidarslam simulate`."""
 

@@ -53,11 +53,6 @@ class Peer:
     needs_imu: bool = False
     has_voxels: bool = True  # whether it has settings that follow the size of the scene
 
-    @property
-    def version(self) -> str:
-        """Package and version, such as `evalio 0.6.1`."""
-        return f"{self.package} {version(self.package)}"
-
     def require(self, has_imu: Callable[[], bool]) -> None:
         """Refuse where it cannot run."""
         if importlib.util.find_spec(self.library) is None:
@@ -85,7 +80,6 @@ def peer_named(name: str) -> Peer:
     return PEERS.get(name) or cast(Peer, ALL_PEERS.load(name, Peer))
 
 
-PEER_KEY = "peer"
 # Fewer points do not fix six degrees of freedom, and some libraries abort on a handful.
 _MIN_POINTS = 10
 # Poses are extrapolated to stamps up to this far outside their instants: the longest sweep.
@@ -102,7 +96,7 @@ class Estimate(NamedTuple):
 def describe_peer(request: RunRequest, peer: Peer, range_m: float | None) -> dict[str, object]:
     """The section of config.yaml that describes the run."""
     by_scene = {} if range_m is None else {"max_range_m": range_m}
-    return {**describe_run(request), PEER_KEY: peer.version, **by_scene}
+    return {**describe_run(request), "peer": f"{peer.package} {version(peer.package)}", **by_scene}
 
 
 def execute_peer(

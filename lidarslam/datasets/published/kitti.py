@@ -139,14 +139,12 @@ class KittiOdometryRecording(BinRecording):
         elif self._pose_file is not None:
             with suppress(InputError):  # damaged, an error of `ground_truth`
                 poses = len(read_kitti_poses(self._pose_file))
-        up_to = f"for the scans up to number {last}"
-        if 0 < lines <= last:
-            yield f"times.txt has only {lines} lines {up_to}; the missing stamps continue at its rate."
-        if 0 < poses <= last:
-            yield f"{self._pose_file} has only {poses} poses {up_to}."
         counts = ((lines, f"times.txt has {lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
-        if more := [said for number, said in counts if number > last + 1]:
-            yield f"{' and '.join(more)} {up_to}; those beyond are not used."
+        if others := [said for number, said in counts if number not in (0, last + 1)]:
+            yield (
+                f"{' and '.join(others)} for the scans up to number {last}; missing stamps continue at the rate of the"
+                " others, and what is beyond is not used."
+            )
 
 
 class OxtsPoses(NamedTuple):
