@@ -176,8 +176,6 @@ def oxts_poses(rows: FloatArray) -> FloatArray:
 def open_raw(source: Path, config: ReaderConfig) -> Recording:
     """Open a `..._sync` drive folder."""
     data = source / "velodyne_points" / "data"
-    if not data.is_dir():
-        raise InputError(f"{source}: expected a drive folder with velodyne_points/data in it, found none")
     if any(data.glob("*.txt")) and not any(data.glob("*.bin")):
         raise InputError(
             f"{source}: holds scans as text, as the unsynchronised ..._extract drives do; expected .bin scans:"
