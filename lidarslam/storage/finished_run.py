@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.json_text import ANY_OBJECT, read_json
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.text import safe_name
+from lidarslam.core.text import require_name, safe_name
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.folders.scan_files import read_pcd, read_ply
@@ -265,8 +265,10 @@ def run_directories(path: Path) -> list[Path]:
         if sequences is not None:
             names = ", ".join(str(path / sequence["sequence"]) for sequence in sequences)
             raise InputError(f"{path}: compares several recordings, in worlds of their own; name one of {names}")
-        runs = [Path(method["run"]) for method in content["methods"].values() if method["run"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        places = [method["run"] for method in content["methods"].values() if method["run"]]
+        # A recording's name and a method's: a comparison names no runs elsewhere.
+        runs = [Path(*(require_name(part, "run") for part in place.split("/"))) for place in places]
+    except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
         raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
     if not runs:
         raise InputError(f"{path}: none of its methods came to a result")
