@@ -212,6 +212,9 @@ def run_method(
 
 def clear(folder: Path) -> None:
     """Make a method's directory, or remove the files of a run of an earlier comparison."""
+    for one in (folder.parent, folder):
+        if one.is_symlink():  # its target is not of this comparison
+            one.unlink()
     if (folder / LOG).is_file():
         files.remove_files(folder)
         (folder / PROCESS).unlink(missing_ok=True)
