@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.core.geometry import transform_points
 from lidarslam.simulation.motion import mount_pose
-from lidarslam.simulation.recorder import bloom, measure, range_sigma, ranges_in_grass
+from lidarslam.simulation.noise import bloom, measure, range_sigma, ranges_in_grass
 from lidarslam.simulation.reference_map import reference_map
 from lidarslam.simulation.sensors import RangeModel, find_sensor
 from lidarslam.simulation.world import Grass, HeightField
