@@ -35,6 +35,9 @@ _FEWEST_NEIGHBOURS = 5
 # thickness that noise explains.
 _THINNEST_SHARE, _LINE_SHARE = 0.02, 0.05
 _NOISE_M, _NOISE_OF_RANGE = 0.02, 0.005
+# Least cosine between normal and beam: a few points of one stroke of a laser, with their range noise, make a plane that
+# contains the beams, and moves with the sensor.
+_LEAST_COSINE = 0.1
 # Surfels face along a direction within this cosine. Fewer have no evidence; more take time without any gain.
 _FACING = 0.6
 _FEWEST_FACING, _MOST_FACING = 10, 800
@@ -54,14 +57,11 @@ _NEAR = 20
 # A closer pair has no direction of travel: x and y of the LiDAR are tested.
 _LEAST_WAY_M = 0.2
 # A pair contradicts its relative pose when the pose has less than this share of the peak's votes within the tolerance,
-# and so many fewer; a peak of fewer votes may be chance, or a vehicle. In the sparse scans of a Mid-360, chance makes
-# pairs of peaks with 6 to 7 votes more than the pose.
+# and so many fewer; a peak of fewer votes may be chance, or a vehicle.
 LEAST_VOTES, LARGEST_SHARE, _LEAST_FEWER = 8.0, 0.5, 7.0
 _TOLERANCE_BINS = 1
 # Least contradicting pairs of a stretch. A single one counts where it has so many votes and another confirms it, or, in
-# runs of fewer tested pairs, where it has more or the pose has less than a share of them. In the sparse scans of a
-# Mid-360, chance makes one of 8.1 to 10 votes, with a tenth or more of them at the pose, and of 9.9 to 12.1, with a
-# quarter; slips leave next to none.
+# runs of fewer tested pairs, where it has more or the pose has less than a share of them; slips leave next to none.
 _LEAST_PAIRS, _FEW_PAIRS, _LEAST_VOTES_OF_ONE = 2, 4, 10.0
 _MANY_VOTES_OF_ONE, _LARGEST_SHARE_OF_ONE = 14.0, 0.1
 
@@ -83,9 +83,11 @@ class Surfels:
         means, normals, variances = np.empty((3, len(pixels), 3))
         counts = np.empty(len(pixels), dtype=np.int64)
         write_planes(points, image, pixels, means, normals, variances, counts)
-        normals[np.einsum("ij,ij->i", normals, means) > 0.0] *= -1.0
-        noise_m = _NOISE_M + _NOISE_OF_RANGE * np.linalg.norm(means, axis=1)
+        along, ranges = np.einsum("ij,ij->i", normals, means), np.linalg.norm(means, axis=1)
+        normals[along > 0.0] *= -1.0
+        noise_m = _NOISE_M + _NOISE_OF_RANGE * ranges
         flat = (variances[:, 0] < _THINNEST_SHARE * variances[:, 1]) & (variances[:, 0] < noise_m**2)
+        flat &= np.abs(along) > _LEAST_COSINE * ranges
         flat &= (variances[:, 1] > _LINE_SHARE * variances[:, 2]) & (counts >= _FEWEST_NEIGHBOURS)
         return cls(means[flat], normals[flat], 2.0 * np.sqrt(variances[flat, 2]))
 

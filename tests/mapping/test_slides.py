@@ -68,6 +68,13 @@ def test_normals_are_those_of_the_walls(room):
     assert np.quantile(-surfels.normals[on_wall, 0] * np.sign(surfels.points[on_wall, 0]), 0.1) > 0.99
 
 
+def test_planes_that_contain_the_beams_are_no_surfels(rng):
+    angles, ranges = rng.uniform(0.0, 2.0, 9000), rng.uniform(4.0, 4.6, 9000)
+    fan = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), rng.normal(0.0, 0.003, 9000)], axis=1)
+    assert not len(consistency.Surfels.of(fan).points)
+    assert len(consistency.Surfels.of(fan - [0.0, 0.0, 1.5]).points) > 50
+
+
 @pytest.mark.parametrize("shift_m", [0.0, -1.3, 20.0])
 def test_the_profile_peaks_at_the_shift(scans, shift_m):
     first, second = consistency.Surfels.of(scans[0]), consistency.Surfels.of(scans[10])
