@@ -145,7 +145,7 @@ def _write(
     directory.write_text(files.SCANS_CSV, log.format_csv())
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
     log.warnings.extend(tracked.scans.faults.warnings())
-    summary = summarise(log, WrittenMap(0, None, 0), 0)
+    summary = summarise(log, WrittenMap(0, None, 0), tracked.scans.faults.unreadable_scans)
     directory.write_json(files.SUMMARY, summary.to_json() | section)
     return LocaliseOutcome(RunOutcome(summary, None, tracked.scans.stopped), found)
 

@@ -219,10 +219,7 @@ class TrainConfig(Settings):
 
 
 def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) -> TrainConfig:
-    """The defaults, changed by a YAML file and then by settings such as `training.batch=8`.
-
-    ConfigError where the file is not readable YAML, a key does not exist, or a value does not fit.
-    """
+    """The configuration of a training, with settings such as `training.batch=8`; otherwise as `load_config`."""
     return _load(TrainConfig, path, settings, "training.batch=8")
 
 

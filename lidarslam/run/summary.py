@@ -487,8 +487,7 @@ def _warnings(
             f"the map contradicts itself between scans {clearest.first} and {clearest.last}: the scans fit one another"
             f" {abs(clearest.shift_m):.1f} m {direction} their poses, which indicates a slip of registration{more}"
         )
-    speed_mps = length_m / max(log.trajectory.duration_s, 1e-9)
-    if (through := seen_through(written.points, written.moved, speed_mps)) is not None:
+    if (through := seen_through(written.points, written.moved, length_m, log.trajectory.duration_s)) is not None:
         yield f"{through}, which indicates a slip of registration, as with much range noise, or many moving objects"
 
 

@@ -211,9 +211,9 @@ def too_many_unreadable(unreadable: int, scans: int) -> str | None:
     return f"{unreadable:,} of {unreadable + scans:,} scans could not be read"
 
 
-def seen_through(points: int, moved: int, speed_mps: float) -> str | None:
+def seen_through(points: int, moved: int, length_m: float, duration_s: float) -> str | None:
     """The fault of a moving sensor's map if other scans see through many points, which were removed from the rest."""
-    if not points or moved <= _MOST_MOVED * (points + moved) or speed_mps < _STANDING_MPS:
+    if not points or moved <= _MOST_MOVED * (points + moved) or length_m <= _STANDING_MPS * duration_s:
         return None
     return f"scans see through {100.0 * moved / (points + moved):.0f} % of the points that others mapped"
 
@@ -229,8 +229,7 @@ def where_astray(summary: Mapping[str, Any]) -> str | None:
         return f"{unconstrained_m:.1f} m of its path are hardly constrained"
     if (lacking := too_many_unreadable(summary.get("unreadable_scans", 0), summary.get("scans", 0))) is not None:
         return lacking
-    speed_mps = summary.get("length_m", 0.0) / max(summary.get("duration_s", 0.0), 1e-9)
-    return seen_through(summary.get("map_points", 0), summary.get("map_points_moved", 0), speed_mps)
+    return seen_through(*(summary.get(key, 0) for key in ("map_points", "map_points_moved", "length_m", "duration_s")))
 
 
 def read_summary(path: Path) -> dict[str, Any]:
