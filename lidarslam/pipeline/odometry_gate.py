@@ -33,8 +33,8 @@ _MOST_WAITING = 8
 class OdometryGate(Stateful):
     """Asks the learned odometry where it is needed; implements `Odometry`.
 
-    Each scan is decided by the results that were given to `follow`, without the last one, for which registration would
-    have to wait, however fast they arrive, so that poses do not depend on timing.
+    The decision for a scan uses all results that were given to `follow` but the last, whether or not that has arrived:
+    registration does not wait, and poses do not depend on timing.
     """
 
     _odometry: SkippingOdometry

@@ -86,7 +86,7 @@ def open_inertial(
 
 
 def found_imu(inertial: "Inertial", recording: Recording) -> str | None:
-    """The settings that give an extrinsic calibration that was estimated; None where it was known."""
+    """A message with the settings for an extrinsic calibration that was estimated; None where it was given."""
     if inertial.is_mounting_known:
         return None
     from scipy.spatial.transform import Rotation  # takes a while to load

@@ -205,14 +205,14 @@ _MOST_MOVED, _STANDING_MPS = 0.2, 0.1
 
 
 def too_many_unreadable(unreadable: int, scans: int) -> str | None:
-    """The fault of a run that lacks much of its recording, given the numbers of scans that it lacks and has."""
+    """The fault of a run if much of its recording is unreadable, given the numbers of unreadable and of used scans."""
     if unreadable <= _MOST_UNREADABLE * (unreadable + scans):
         return None
     return f"{unreadable:,} of {unreadable + scans:,} scans could not be read"
 
 
 def seen_through(points: int, moved: int, length_m: float, duration_s: float) -> str | None:
-    """The fault of a moving sensor's map if other scans see through many points, which were removed from the rest."""
+    """The fault of a moving sensor's map if scans see through many of the mapped points, which were then removed."""
     if not points or moved <= _MOST_MOVED * (points + moved) or length_m <= _STANDING_MPS * duration_s:
         return None
     return f"scans see through {100.0 * moved / (points + moved):.0f} % of the points that others mapped"
