@@ -33,6 +33,11 @@ class ReaderConfig(Settings):
     time_scale: float = Field(
         1.0, ge=-2.0, le=2.0, description="factor on the per-point times, counted from the scan's stamp"
     )
+    sweep_s: Annotated[float, Field(ge=0.0, le=10.0)] | Literal["auto"] = Field(
+        "auto",
+        description="duration of a sweep, to which shorter scans are joined; auto: at most 0.1, as long as consecutive"
+        " scans see other directions",
+    )
     mounting: Mounting = Field(
         "auto",
         description="where the recorded z axis points: upright, upside-down, left, right, forward, backward, camera, or"

@@ -300,7 +300,7 @@ class CloudRecording(StoredRecording):
         raise NotImplementedError
 
     @cached_property
-    def _period_s(self) -> float | None:
+    def period_s(self) -> float | None:
         """Seconds between scans; None for a single one."""
         raise NotImplementedError
 
@@ -314,7 +314,7 @@ class CloudRecording(StoredRecording):
         if self._config.time_reference == "none":
             return LearnedTime()
         unit, reference, defined_unit = self._defined_time
-        period_s = self._period_s if self._has_stamps else None
+        period_s = self.period_s if self._has_stamps else None
         return learn_point_time(self._readable(self._sound_items()), unit, reference, period_s, defined_unit)
 
     def _readable(self, items: Iterable[Any]) -> Iterator[tuple[RawCloud, float | None]]:
@@ -326,7 +326,7 @@ class CloudRecording(StoredRecording):
     @cached_property
     def _timing(self) -> PointTiming:
         runs = ((cloud for cloud, _ in self._readable(run)) for run in self._runs())
-        return point_timing(self._learned, runs, self._period_s, self._config.time_reference)
+        return point_timing(self._learned, runs, self.period_s, self._config.time_reference)
 
     @cached_property
     def _point_time(self) -> PointTimeModel | None:

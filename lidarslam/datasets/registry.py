@@ -22,7 +22,14 @@ from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
-from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, STORAGE_SUFFIXES, Recording, storage_files
+from lidarslam.datasets.recording import (
+    ROSBAG1_SUFFIXES,
+    STORAGE_SUFFIXES,
+    CloudRecording,
+    Recording,
+    storage_files,
+)
+from lidarslam.datasets.sweeps import JoinedRecording
 
 logger = logging.getLogger(__name__)
 
@@ -192,7 +199,7 @@ def _reader(name: str) -> Reader:
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
-    """Open a recording, in upright axes, elevations corrected; scans are read later, one at a time."""
+    """Open a recording of whole sweeps, in upright axes, elevations corrected; they are read later, one at a time."""
     config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
     reader = _reader(name)
@@ -201,11 +208,13 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
     opens = resolve_name(reader.module if ":" in reader.module else f"{reader.module}:open_recording")
-    recording = cast(Recording, opens(source, config))
+    recording, time_scale = cast(Recording, opens(source, config)), config.time_scale
+    if isinstance(recording, CloudRecording):
+        recording, time_scale = JoinedRecording(recording, config.sweep_s, time_scale), 1.0
     raised_deg = config.raised_deg(reader.elevation_deg)
-    if config.mounting == "upright" and not raised_deg and config.time_scale == 1.0:
+    if config.mounting == "upright" and not raised_deg and time_scale == 1.0:
         return recording
-    return MountedRecording(recording, config.mounting, raised_deg, config.time_scale)
+    return MountedRecording(recording, config.mounting, raised_deg, time_scale)
 
 
 def absent(source: Path) -> str:

@@ -14,6 +14,7 @@ from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header, serialize, typestore
+from lidarslam.datasets.sweeps import SweepJoiner
 from lidarslam.datasets.times.azimuth import PointTiming
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
 from lidarslam.pipeline.estimates import ScanEstimate
@@ -26,6 +27,9 @@ _AHEAD_NS, _CLOCK_WAS_SET = 10**9, 6
 
 # Stamps this far behind are of a clock that was set back if this many increase in a row.
 _BEHIND_NS, _SET_BACK = 10**9, 6
+
+# Share of a sweep by which stamps may be early.
+_JITTER = 0.1
 
 _NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
 _AHEAD = "scans were left out: their stamps are ahead of the time that has passed since the scans before"
@@ -48,7 +52,8 @@ class CloudDecoder:
     """Scans from the messages of one topic, in the order of their stamps.
 
     The sensor is that of the first message unless `reader.frame_id` names one, and unit and reference of the point
-    times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are.
+    times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are, and
+    without a number in `reader.sweep_s` scans are not joined.
     """
 
     def __init__(self, config: ReaderConfig, message_type: str, faults: Faults) -> None:
@@ -65,6 +70,8 @@ class CloudDecoder:
         self._timing = PointTiming()
         self._is_settled = config.time_reference == "none"
         self.T_upright_recorded = transform_of(config.mounting)
+        self._joiner: SweepJoiner | None = None
+        self._begin_ns = 0  # stamp of the first scan of a sweep
 
     @property
     def is_set_back(self) -> bool:
@@ -72,7 +79,10 @@ class CloudDecoder:
         return self._behind >= _SET_BACK
 
     def scan(self, raw: bytes, published_ns: int) -> LiveScan | None:
-        """The scan of a serialised message; None where it cannot be used, which is counted."""
+        """The scan of a serialised message, or the sweep that ends with the one before it.
+
+        None where it cannot be used, which is counted, or continues a sweep.
+        """
         try:
             header_ns, frame_id = read_header(raw, ros2=True)
             if self._last_ns is None:  # the first one decides
@@ -91,7 +101,19 @@ class CloudDecoder:
         self._ahead = self._behind = 0
         scan = self._timing.scan(cloud, stamp, self._faults, f"{stamp:.9f}")
         scan = corrected(scan, self.T_upright_recorded, self._config.raised_deg(), self._config.time_scale)
-        return LiveScan(scan, stamp_ns, frame_id)
+        return self._joined(LiveScan(scan, stamp_ns, frame_id))
+
+    def _joined(self, live: LiveScan) -> LiveScan | None:
+        """The scan, or where `reader.sweep_s` is set, the sweep that was complete before it."""
+        if not isinstance(sweep_s := self._config.sweep_s, float) or not sweep_s:
+            return live
+        if self._joiner is None:
+            self._joiner, self._begin_ns = SweepJoiner(sweep_s, _JITTER * sweep_s, live.scan.stamp), live.stamp_ns
+        sweep = self._joiner.add(live.scan)
+        if sweep is None:
+            return None
+        begin_ns, self._begin_ns = self._begin_ns, live.stamp_ns
+        return LiveScan(sweep, begin_ns, live.frame_id)
 
     def _is_wanted(self, stamp_ns: int, published_ns: int, frame_id: str) -> bool:
         if self._frame_id is not None and frame_id != self._frame_id:

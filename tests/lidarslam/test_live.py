@@ -197,6 +197,15 @@ def test_point_times_are_inferred_and_they_and_elevations_corrected_as_set(decod
     np.testing.assert_array_equal(corrected.scan.points, correct_elevation(as_sent.scan.points, 0.2))
 
 
+def test_scans_are_joined_to_sweeps_of_a_set_duration():
+    decoder = CloudDecoder(ReaderConfig(sweep_s=0.1), CLOUD, Faults())
+    sweeps = [decoder.scan(message_at(1000.5 + 0.02 * number, last_time=2e7), NOW) for number in range(11)]
+    assert [None if sweep is None else (sweep.stamp_ns, len(sweep.scan)) for sweep in sweeps] == [
+        *[None] * 5, (1_000_500_000_000, 1000), *[None] * 4, (1_000_600_000_000, 1000)
+    ]  # fmt: skip
+    np.testing.assert_allclose(sweeps[5].scan.time_offsets[[0, -1]], [0.0, 0.1], atol=1e-7)
+
+
 def test_a_time_field_without_times_is_a_warning():
     faults = Faults()
     decoder = CloudDecoder(ReaderConfig(), CLOUD, faults)

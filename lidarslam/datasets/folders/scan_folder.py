@@ -190,7 +190,7 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         return (range(first, min(first + 2, len(self))) for first in starts)
 
     @cached_property
-    def _period_s(self) -> float | None:
+    def period_s(self) -> float | None:
         rate = scan_rate(self.stamps)
         return None if rate is None else 1.0 / rate
 

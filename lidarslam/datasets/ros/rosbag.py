@@ -200,8 +200,8 @@ class BagRecording(CloudRecording):
         return None if last is None else self._stamp(last)
 
     @cached_property
-    def _period_s(self) -> float | None:
-        """The median interval of the first stamps that increase."""
+    def period_s(self) -> float | None:
+        """The median interval of the first stamps that increase, seconds."""
         stamps = np.array([self._stamp(message) for message in islice(self._of_sensor(), _STAMPS_LOOKED_AT)])
         steps = np.diff(stamps[stamps > self._stamps.before_first])
         return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else None

@@ -1,0 +1,220 @@
+"""Sweeps joined from scans that hold a part of one, as drivers of solid-state sensors and of packets publish them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import islice
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.recording import CloudRecording, RecordingInfo, scan_indices
+
+# The duration of sweeps whose directions do not recur, and the longest until they do, seconds.
+_LONGEST_S, _SLOWEST_TURN_S = 0.1, 0.25
+# Share of the cells of a degree that two whole sweeps have in common: 0.9, or 0.35 of every fourth point; parts of a
+# sweep and scans of a Mid-360 have 0.1.
+_SAME_DIRECTIONS = 0.3
+_FEW_POINTS = 50
+
+
+class SweepJoiner:
+    """Joins consecutive scans to sweeps of equal duration; the stamp of a sweep is that of its first scan."""
+
+    def __init__(self, sweep_s: float, period_s: float, first_stamp: float) -> None:
+        self._sweep_s = sweep_s
+        self._begin = first_stamp - 0.5 * period_s  # halfway between two scans, so that jitter moves none
+        self._scans: list[Scan] = []
+        self.number = 0  # of the sweep that is being joined
+
+    def number_at(self, stamp: float) -> int:
+        """The number of the sweep that a scan of this stamp belongs to."""
+        return max(0, int((stamp - self._begin) // self._sweep_s))
+
+    def add(self, scan: Scan) -> Scan | None:
+        """The sweep before, once a scan of another one arrives; a late scan belongs to the present one."""
+        number = max(self.number, self.number_at(scan.stamp))
+        done = self.rest() if number != self.number else None
+        self.number = number
+        self._scans.append(scan)
+        return done
+
+    def rest(self) -> Scan | None:
+        """The sweep as far as it has arrived."""
+        scans, self._scans = self._scans, []
+        return joined(scans) if scans else None
+
+
+def joined(scans: Sequence[Scan]) -> Scan:
+    """One scan with the points of several; their times are offsets from the first stamp."""
+    first = scans[0]
+    offsets = [
+        scan.stamp - first.stamp + (np.zeros(len(scan)) if scan.time_offsets is None else scan.time_offsets)
+        for scan in scans
+    ]
+
+    def column(name: str) -> Any:
+        values = [getattr(scan, name) for scan in scans]
+        return None if any(part is None for part in values) else np.concatenate(values)
+
+    return Scan(
+        np.concatenate([scan.points for scan in scans]),
+        first.stamp,
+        np.concatenate(offsets) if len(scans) > 1 else first.time_offsets,
+        column("rings"),
+        sum(scan.dropped for scan in scans),
+        column("intensities"),
+        column("colours"),
+        sum(scan.untimed for scan in scans),
+    )
+
+
+def scans_of_a_sweep(scans: Sequence[Scan], period_s: float) -> int:
+    """The number of scan periods after which the directions of the points recur, or those of a tenth of a second."""
+    seen = [(scan.stamp, _directions(scan.points)) for scan in scans if len(scan) > _FEW_POINTS]
+    found = []
+    for index, (stamp, here) in enumerate(seen[: (len(seen) + 1) // 2]):
+        recurs = (later - stamp for later, there in seen[index + 1 :] if _agree(here, there))
+        found.append(next(recurs, np.inf))
+    after_s = float(np.median(found)) if found else period_s
+    return max(1, round((after_s if after_s < _SLOWEST_TURN_S else _LONGEST_S) / period_s))
+
+
+def _directions(points: FloatArray) -> NDArray[np.int64]:
+    """The cells of azimuth and elevation, a degree wide, that hold points (N, 3)."""
+    azimuth = np.floor(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
+    elevation = np.floor(np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))))
+    return np.unique((azimuth * 1000.0 + elevation).astype(np.int64))
+
+
+def _agree(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+    common = np.intersect1d(one, other, assume_unique=True)
+    return len(common) > _SAME_DIRECTIONS * min(len(one), len(other))
+
+
+class JoinedRecording:
+    """A recording whose scans are joined to sweeps of a duration, or as far as consecutive ones see other directions.
+
+    Scans of 10 Hz or less are sweeps unless a duration is set.
+    """
+
+    def __init__(self, recorded: CloudRecording, sweep_s: float | Literal["auto"], time_scale: float = 1.0) -> None:
+        self.recorded = recorded
+        self._setting, self._time_scale = sweep_s, time_scale
+
+    @cached_property
+    def _sweep(self) -> tuple[int, float, float]:
+        """Scans of a sweep, their period and the first stamp."""
+        period_s = self.recorded.period_s
+        if period_s is None:
+            return 1, 0.0, 0.0
+        wanted = None if self._setting == "auto" else round(self._setting / period_s)
+        if (round(_LONGEST_S / period_s) if wanted is None else wanted) < 2:
+            return 1, period_s, 0.0
+        looked_at = round(2.0 * _SLOWEST_TURN_S / period_s) if wanted is None else 1
+        try:
+            scans = list(islice(self.recorded.scans(faults=Faults()), looked_at))
+        except InputError:  # raised again when the scans are read
+            scans = []
+        return (wanted or scans_of_a_sweep(scans, period_s), period_s, scans[0].stamp) if scans else (1, period_s, 0.0)
+
+    def _joiner(self) -> SweepJoiner:
+        scans, period_s, first_stamp = self._sweep
+        return SweepJoiner(scans * period_s, period_s, first_stamp)
+
+    @property
+    def _is_joined(self) -> bool:
+        return self._sweep[0] > 1
+
+    @property
+    def name(self) -> str:
+        """A short name."""
+        return self.recorded.name
+
+    @cached_property
+    def _length(self) -> int:
+        if not self._is_joined:
+            return len(self.recorded)
+        return min(self._joiner().number_at(self._info.last_stamp) + 1, len(self.recorded))
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at the truth's own stamps."""
+        return self.recorded.ground_truth
+
+    @property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """Extrinsic calibration of a KITTI recording."""
+        return self.recorded.T_cam_lidar
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU."""
+        return self.recorded.imu
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Of the recording, and that scans are joined."""
+        return (*self.recorded.warnings, *self._notes)
+
+    @property
+    def _notes(self) -> tuple[str, ...]:
+        scans, period_s, _ = self._sweep
+        note = (
+            f"each {scans} scans are joined to one sweep of {scans * period_s:.2g} s, as consecutive ones see different"
+            " directions (--set reader.sweep_s=0 joins none)"
+        )
+        return (note,) if self._is_joined and self._setting == "auto" else ()
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The sweeps with the indices of `range(start, stop, step)`; earlier ones are read, too."""
+        if not self._is_joined:
+            return map(self._scaled, self.recorded.scans(start, stop, step, faults))
+        return self._sweeps(scan_indices(len(self), start, stop, step), faults)
+
+    def _sweeps(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
+        joiner = self._joiner()
+        for scan in self.recorded.scans(faults=faults):
+            number = joiner.number
+            sweep = joiner.add(self._scaled(scan))
+            if sweep is not None and number in wanted:
+                yield sweep
+            if joiner.number >= wanted.stop:
+                return
+        sweep = joiner.rest()
+        if sweep is not None and joiner.number in wanted:
+            yield sweep
+
+    def _scaled(self, scan: Scan) -> Scan:
+        if scan.time_offsets is None or self._time_scale == 1.0:
+            return scan
+        return replace(scan, time_offsets=self._time_scale * scan.time_offsets)
+
+    @cached_property
+    def _info(self) -> RecordingInfo:
+        return self.recorded.describe()
+
+    def describe(self) -> RecordingInfo:
+        """The contents of the recording, its scans being the sweeps."""
+        if not self._is_joined:
+            return replace(self._info, first=self._scaled(self._info.first))
+        first, sweep_s = next(self.scans(faults=Faults())), self._sweep[0] * self._sweep[1]
+        return replace(
+            self._info,
+            scans=len(self),
+            first=first,
+            last_stamp=first.stamp + (len(self) - 1) * sweep_s,
+            notes=(*self._info.notes, *self._notes),
+        )
