@@ -19,6 +19,8 @@ from lidarslam.datasets.recording import CloudRecording, RecordingInfo, scan_ind
 
 # The duration of sweeps whose directions do not recur, and the longest until they do, seconds.
 _LONGEST_S, _SLOWEST_TURN_S = 0.1, 0.25
+# The first scans show whether directions recur.
+LOOKED_AT_S = 2.0 * _SLOWEST_TURN_S
 # Share of the cells of a degree that two whole sweeps have in common: 0.9, or 0.35 of every fourth point; parts of a
 # sweep and scans of a Mid-360 have 0.1.
 _SAME_DIRECTIONS = 0.3
@@ -77,7 +79,12 @@ def joined(scans: Sequence[Scan]) -> Scan:
 
 
 def scans_of_a_sweep(scans: Sequence[Scan], period_s: float) -> int:
-    """The number of scan periods after which the directions of the points recur, or those of a tenth of a second."""
+    """The number of scan periods after which the directions of the points recur, or those of a tenth of a second.
+
+    1 of scans at less than 15 Hz.
+    """
+    if round(_LONGEST_S / period_s) < 2:
+        return 1
     seen = [(scan.stamp, _directions(scan.points)) for scan in scans if len(scan) > _FEW_POINTS]
     found = []
     for index, (stamp, here) in enumerate(seen[: (len(seen) + 1) // 2]):
@@ -118,7 +125,7 @@ class JoinedRecording:
         wanted = None if self._setting == "auto" else round(self._setting / period_s)
         if (round(_LONGEST_S / period_s) if wanted is None else wanted) < 2:
             return 1, period_s, 0.0
-        looked_at = round(2.0 * _SLOWEST_TURN_S / period_s) if wanted is None else 1
+        looked_at = round(LOOKED_AT_S / period_s) if wanted is None else 1
         try:
             scans = list(islice(self.recorded.scans(faults=Faults()), looked_at))
         except InputError:  # raised again when the scans are read

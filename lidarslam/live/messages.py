@@ -14,7 +14,7 @@ from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header, serialize, typestore
-from lidarslam.datasets.sweeps import SweepJoiner
+from lidarslam.datasets.sweeps import LOOKED_AT_S, SweepJoiner, scans_of_a_sweep
 from lidarslam.datasets.times.azimuth import PointTiming
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
 from lidarslam.pipeline.estimates import ScanEstimate
@@ -52,8 +52,8 @@ class CloudDecoder:
     """Scans from the messages of one topic, in the order of their stamps.
 
     The sensor is that of the first message unless `reader.frame_id` names one, and unit and reference of the point
-    times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are, and
-    without a number in `reader.sweep_s` scans are not joined.
+    times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are. Parts
+    of sweeps are joined from the second half second on, or from the first where `reader.sweep_s` is set.
     """
 
     def __init__(self, config: ReaderConfig, message_type: str, faults: Faults) -> None:
@@ -70,6 +70,7 @@ class CloudDecoder:
         self._timing = PointTiming()
         self._is_settled = config.time_reference == "none"
         self.T_upright_recorded = transform_of(config.mounting)
+        self._first_scans: list[Scan] | None = []  # until it is known whether they are joined
         self._joiner: SweepJoiner | None = None
         self._begin_ns = 0  # stamp of the first scan of a sweep
 
@@ -104,16 +105,30 @@ class CloudDecoder:
         return self._joined(LiveScan(scan, stamp_ns, frame_id))
 
     def _joined(self, live: LiveScan) -> LiveScan | None:
-        """The scan, or where `reader.sweep_s` is set, the sweep that was complete before it."""
-        if not isinstance(sweep_s := self._config.sweep_s, float) or not sweep_s:
-            return live
+        """The scan, or where scans hold a part of a sweep, the sweep that was complete before it."""
         if self._joiner is None:
+            if not (sweep_s := self._sweep_s(live.scan)):
+                return live
             self._joiner, self._begin_ns = SweepJoiner(sweep_s, _JITTER * sweep_s, live.scan.stamp), live.stamp_ns
         sweep = self._joiner.add(live.scan)
         if sweep is None:
             return None
         begin_ns, self._begin_ns = self._begin_ns, live.stamp_ns
         return LiveScan(sweep, begin_ns, live.frame_id)
+
+    def _sweep_s(self, scan: Scan) -> float:
+        """The duration of a sweep to which scans are joined, as set or as the first ones show; else 0."""
+        if isinstance(self._config.sweep_s, float):
+            return self._config.sweep_s
+        if self._first_scans is None:
+            return 0.0
+        self._first_scans.append(scan)
+        span_s = scan.stamp - self._first_scans[0].stamp
+        if span_s < LOOKED_AT_S:
+            return 0.0
+        period_s = span_s / (len(self._first_scans) - 1)
+        scans, self._first_scans = scans_of_a_sweep(self._first_scans, period_s), None
+        return scans * period_s if scans > 1 else 0.0
 
     def _is_wanted(self, stamp_ns: int, published_ns: int, frame_id: str) -> bool:
         if self._frame_id is not None and frame_id != self._frame_id:

@@ -173,10 +173,10 @@ def transform(parent: str, child: str, T: np.ndarray) -> bytes:
     return bytes(STORE.serialize_cdr(transforms(STORE, (header(STORE, 0, parent), child, T)), TRANSFORMS_TYPE))
 
 
-def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8) -> bytes:
+def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8, seed: int = 0) -> bytes:
     """A serialised cloud of 200 points, with times from 0 to 0.1 s in nanoseconds."""
     table = np.zeros(200, np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")]))
-    for axis, values in zip("xyz", np.random.default_rng(0).uniform(1.0, 5.0, (200, 3)).T, strict=True):
+    for axis, values in zip("xyz", np.random.default_rng(seed).uniform(-5.0, 5.0, (200, 3)).T, strict=True):
         table[axis] = values
     table["t"] = np.linspace(0.0, last_time, 200)
     cloud = point_cloud(STORE, header(STORE, round(1e9 * stamp_s), frame_id), table)
@@ -204,6 +204,19 @@ def test_scans_are_joined_to_sweeps_of_a_set_duration():
         *[None] * 5, (1_000_500_000_000, 1000), *[None] * 4, (1_000_600_000_000, 1000)
     ]  # fmt: skip
     np.testing.assert_allclose(sweeps[5].scan.time_offsets[[0, -1]], [0.0, 0.1], atol=1e-7)
+
+
+def test_parts_of_sweeps_are_joined_once_the_first_half_second_has_shown_them():
+    decoder = CloudDecoder(ReaderConfig(), CLOUD, Faults())
+    parts = [decoder.scan(message_at(1000.0 + 0.02 * n, last_time=2e7, seed=n), NOW) for n in range(40)]
+    assert [0 if part is None else len(part.scan) for part in parts] == [
+        *[200] * 25,
+        *[0] * 5,
+        1000,
+        *[0] * 4,
+        1000,
+        *[0] * 4,
+    ]
 
 
 def test_a_time_field_without_times_is_a_warning():
