@@ -1,6 +1,7 @@
 """Sweeps joined from scans that hold a part of one, as drivers of solid-state sensors and of packets publish them."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -24,7 +25,12 @@ LOOKED_AT_S = 2.0 * _SLOWEST_TURN_S
 # Share of the cells of a degree that two whole sweeps have in common: 0.9, or 0.35 of every fourth point; parts of a
 # sweep and scans of a Mid-360 have 0.1.
 _SAME_DIRECTIONS = 0.3
-_FEW_POINTS = 50
+_FEW_CELLS = 20
+# No LiDAR publishes faster: the unit of the stamps is wrong.
+_LEAST_PERIOD_S = 1e-3
+
+Directions = tuple[float, NDArray[np.int64]]
+"""A stamp, and the directions that were seen then."""
 
 
 class SweepJoiner:
@@ -78,27 +84,24 @@ def joined(scans: Sequence[Scan]) -> Scan:
     )
 
 
-def scans_of_a_sweep(scans: Sequence[Scan], period_s: float) -> int:
-    """The number of scan periods after which the directions of the points recur, or those of a tenth of a second.
+def directions_of(scan: Scan) -> Directions:
+    """The stamp of a scan, and the numbers (C,) of the cells of azimuth and elevation, a degree wide, with points."""
+    x, y, z = scan.points.T
+    azimuth, elevation = np.floor(np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
+    return scan.stamp, np.unique((azimuth * 1000.0 + elevation).astype(np.int64))
 
-    1 of scans at less than 15 Hz.
-    """
+
+def scans_of_a_sweep(seen: Sequence[Directions], period_s: float) -> int:
+    """The number of scan periods after which the directions recur, or those of a tenth of a second; 1 below 15 Hz."""
     if round(_LONGEST_S / period_s) < 2:
         return 1
-    seen = [(scan.stamp, _directions(scan.points)) for scan in scans if len(scan) > _FEW_POINTS]
+    seen = [(stamp, cells) for stamp, cells in seen if len(cells) >= _FEW_CELLS]
     found = []
     for index, (stamp, here) in enumerate(seen[: (len(seen) + 1) // 2]):
         recurs = (later - stamp for later, there in seen[index + 1 :] if _agree(here, there))
         found.append(next(recurs, np.inf))
     after_s = float(np.median(found)) if found else period_s
     return max(1, round((after_s if after_s < _SLOWEST_TURN_S else _LONGEST_S) / period_s))
-
-
-def _directions(points: FloatArray) -> NDArray[np.int64]:
-    """The cells of azimuth and elevation, a degree wide, that hold points (N, 3)."""
-    azimuth = np.floor(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
-    elevation = np.floor(np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))))
-    return np.unique((azimuth * 1000.0 + elevation).astype(np.int64))
 
 
 def _agree(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
@@ -120,17 +123,18 @@ class JoinedRecording:
     def _sweep(self) -> tuple[int, float, float]:
         """Scans of a sweep, their period and the first stamp."""
         period_s = self.recorded.period_s
-        if period_s is None:
+        if period_s is None or period_s < _LEAST_PERIOD_S:
             return 1, 0.0, 0.0
-        wanted = None if self._setting == "auto" else round(self._setting / period_s)
-        if (round(_LONGEST_S / period_s) if wanted is None else wanted) < 2:
-            return 1, period_s, 0.0
-        looked_at = round(LOOKED_AT_S / period_s) if wanted is None else 1
-        try:
-            scans = list(islice(self.recorded.scans(faults=Faults()), looked_at))
-        except InputError:  # raised again when the scans are read
-            scans = []
-        return (wanted or scans_of_a_sweep(scans, period_s), period_s, scans[0].stamp) if scans else (1, period_s, 0.0)
+        wanted_s = _LONGEST_S if self._setting == "auto" else self._setting
+        if (wanted := round(wanted_s / period_s)) < 2:
+            return 1, 0.0, 0.0
+        looked_at = round(LOOKED_AT_S / period_s) if self._setting == "auto" else 1
+        seen: list[Directions] = []
+        with suppress(InputError):  # raised again when the scans are read
+            seen = [directions_of(scan) for scan in islice(self.recorded.scans(faults=Faults()), looked_at)]
+        if not seen:
+            return 1, 0.0, 0.0
+        return scans_of_a_sweep(seen, period_s) if self._setting == "auto" else wanted, period_s, seen[0][0]
 
     def _joiner(self) -> SweepJoiner:
         scans, period_s, first_stamp = self._sweep

@@ -14,7 +14,7 @@ from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.ros import bag_message
 from lidarslam.datasets.ros import made_messages as made
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header, serialize, typestore
-from lidarslam.datasets.sweeps import LOOKED_AT_S, SweepJoiner, scans_of_a_sweep
+from lidarslam.datasets.sweeps import LOOKED_AT_S, Directions, SweepJoiner, directions_of, scans_of_a_sweep
 from lidarslam.datasets.times.azimuth import PointTiming
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, learn_point_time
 from lidarslam.pipeline.estimates import ScanEstimate
@@ -70,7 +70,7 @@ class CloudDecoder:
         self._timing = PointTiming()
         self._is_settled = config.time_reference == "none"
         self.T_upright_recorded = transform_of(config.mounting)
-        self._first_scans: list[Scan] | None = []  # until it is known whether they are joined
+        self._first: list[Directions] | None = []  # until it is known whether they are joined
         self._joiner: SweepJoiner | None = None
         self._begin_ns = 0  # stamp of the first scan of a sweep
 
@@ -120,14 +120,14 @@ class CloudDecoder:
         """The duration of a sweep to which scans are joined, as set or as the first ones show; else 0."""
         if isinstance(self._config.sweep_s, float):
             return self._config.sweep_s
-        if self._first_scans is None:
+        if self._first is None:
             return 0.0
-        self._first_scans.append(scan)
-        span_s = scan.stamp - self._first_scans[0].stamp
+        self._first.append(directions_of(scan))
+        span_s = scan.stamp - self._first[0][0]
         if span_s < LOOKED_AT_S:
             return 0.0
-        period_s = span_s / (len(self._first_scans) - 1)
-        scans, self._first_scans = scans_of_a_sweep(self._first_scans, period_s), None
+        period_s = span_s / (len(self._first) - 1)
+        scans, self._first = scans_of_a_sweep(self._first, period_s), None
         return scans * period_s if scans > 1 else 0.0
 
     def _is_wanted(self, stamp_ns: int, published_ns: int, frame_id: str) -> bool:
