@@ -274,16 +274,16 @@ class Attempt:
         most = _MEASURED_TURN if self.prediction.is_inertial else _LEAST_JUMP[0] + turn * since_s
         return bool(angle < most and distance_m < _LEAST_JUMP[3] + speed * since_s)
 
-    def confirms_map(self, of_predictions: bool) -> bool:
+    def confirms_map(self, of_predictions: bool, has_rings: bool) -> bool:
         """Whether a map, of one scan or of several at their predictions, suffices for this registration.
 
-        One scan may fit anywhere. Several that were inserted with a wrong motion make planes all the same; what fits
-        these agrees with the predicted motion only by chance.
+        One scan without rings may fit anywhere. Several that were inserted with a wrong motion make planes all the
+        same; what fits these agrees with the predicted motion only by chance.
         """
         if self.status is Status.LOST:
             return False
         if not of_predictions:
-            return self.rival is None
+            return has_rings or self.rival is None
         angle, distance_m = self.corrected_by
         agrees = angle < _AGREEING[0] and distance_m < _AGREEING[1] * self.local_map.cell_m
         return agrees and not self.unconstrained and self.fit.overlap >= _FOUNDED_OVERLAP

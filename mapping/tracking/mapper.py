@@ -41,9 +41,9 @@ logger = logging.getLogger(__name__)
 # Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
 # quality that this keeps: the velocity within a sparse sweep may be far off.
 _REDRAWS, _LEAST_KEPT = 2, 0.5
-# A map of sweeps without rings may begin with several at their predictions, for so many seconds: too few neighbouring
-# points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are, and the
-# sensor moves evenly.
+# A map of planes through neighbouring voxels may begin with several sweeps at their predictions, for so many seconds:
+# too few points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are,
+# and the sensor moves evenly.
 _GROWING_S = 2.0
 _EVEN_MOTION = np.diag(np.concatenate([LEAST_SIGMA, [np.deg2rad(20.0)] * 3, [0.5] * 3]) ** 2)
 _GROWING = "inserted at its prediction: the map has too few sweeps for a registration"
@@ -135,7 +135,7 @@ class Mapper(Stateful):
         has_grown = is_growing and local_map.scans > 1
         register = self._tracker.register_near if has_grown else self._tracker.register
         attempt = register(scan, prior, prediction, last, local_map)
-        if is_growing and not attempt.confirms_map(has_grown):
+        if is_growing and not attempt.confirms_map(has_grown, scan.has_rings):
             return self._grow(scan, prediction, local_map, attempt.fit)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
@@ -228,7 +228,7 @@ class Mapper(Stateful):
         local_map = (SurfelMap if is_surfels else FeatureMap)(scan.cell_m, self._config.radius_m)
         logger.info("new local map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
         self._map_since = self._scans
-        self._growing_since = None if scan.has_rings else scan.stamp
+        self._growing_since = None if is_surfels else scan.stamp
         self._insert(scan, state, local_map)
         return local_map
 

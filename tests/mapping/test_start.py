@@ -82,13 +82,25 @@ def test_a_map_too_thin_for_a_registration_grows_at_rest():
     assert errors(poses_of(results)[-1], T_first_last)[0] < 0.06
 
 
-def test_a_map_that_nothing_fits_grows_for_two_seconds(rng):
-    def clutter(stamp: float) -> Scan:
-        points = rng.normal(size=(1200, 3)) * [8.0, 8.0, 2.0]
-        points = points[np.argsort(points[:, 2] / np.linalg.norm(points, axis=1))]  # near one another at any time
-        return Scan(points, stamp, time_offsets=np.linspace(0.0, 0.1, len(points)))
+def clutter(rng: np.random.Generator, stamp: float) -> Scan:
+    """Of a sensor without rings: points that are near one another at any time."""
+    points = rng.normal(size=(1200, 3)) * [8.0, 8.0, 2.0]
+    points = points[np.argsort(points[:, 2] / np.linalg.norm(points, axis=1))]
+    return Scan(points, stamp, time_offsets=np.linspace(0.0, 0.1, len(points)))
 
-    results = process(Mapper(MappingConfig()), [clutter(0.5 * number) for number in range(6)])
+
+def bare_ground(rng: np.random.Generator, stamp: float) -> Scan:
+    """Rings that are farther apart than any plane is searched for, from half a metre above."""
+    radius, azimuth = 0.5 / np.tan(np.deg2rad(np.array([3.0, 5.0, 8.0, 12.0]))), np.linspace(-np.pi, np.pi, 900)
+    rings, columns = np.indices((len(radius), len(azimuth))).reshape(2, -1)
+    points = radius[rings, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])[columns]
+    heights = rng.normal(-0.5, 0.01, len(points))
+    return Scan(np.column_stack([points, heights]), stamp, rings=rings.astype(np.int32))
+
+
+@pytest.mark.parametrize(("method", "scan"), [("surfels", clutter), ("loam", bare_ground)])
+def test_a_map_of_planes_through_voxels_grows_for_two_seconds_where_nothing_fits(rng, method, scan):
+    results = process(Mapper(MappingConfig(method=method)), [scan(rng, 0.5 * number) for number in range(6)])
     assert [result.status for result in results[1:]] == [Status.DEGRADED] * 3 + [Status.LOST] * 2
     assert all(result.degenerate == AXES and result.added for result in results[1:4])
     assert poses_of(results) == pytest.approx(np.tile(np.eye(4), (6, 1, 1)), abs=1e-9)
