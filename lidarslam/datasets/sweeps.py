@@ -34,7 +34,7 @@ Directions = tuple[float, NDArray[np.int64]]
 
 
 class SweepJoiner:
-    """Joins consecutive scans to sweeps of equal duration; the stamp of a sweep is that of its first scan."""
+    """Joins consecutive scans to sweeps of equal duration."""
 
     def __init__(self, sweep_s: float, period_s: float, first_stamp: float) -> None:
         self._sweep_s = sweep_s
@@ -61,11 +61,12 @@ class SweepJoiner:
 
 
 def joined(scans: Sequence[Scan]) -> Scan:
-    """One scan with the points of several; their times are offsets from the first stamp."""
-    first = scans[0]
+    """One scan with the points of several, and the stamp of the middle one: there the pose is known best."""
+    if len(scans) == 1:
+        return scans[0]
+    stamp = scans[len(scans) // 2].stamp
     offsets = [
-        scan.stamp - first.stamp + (np.zeros(len(scan)) if scan.time_offsets is None else scan.time_offsets)
-        for scan in scans
+        scan.stamp - stamp + (np.zeros(len(scan)) if scan.time_offsets is None else scan.time_offsets) for scan in scans
     ]
 
     def column(name: str) -> Any:
@@ -74,8 +75,8 @@ def joined(scans: Sequence[Scan]) -> Scan:
 
     return Scan(
         np.concatenate([scan.points for scan in scans]),
-        first.stamp,
-        np.concatenate(offsets) if len(scans) > 1 else first.time_offsets,
+        stamp,
+        np.concatenate(offsets),
         column("rings"),
         sum(scan.dropped for scan in scans),
         column("intensities"),

@@ -72,7 +72,7 @@ class CloudDecoder:
         self.T_upright_recorded = transform_of(config.mounting)
         self._first: list[Directions] | None = []  # until it is known whether they are joined
         self._joiner: SweepJoiner | None = None
-        self._begin_ns = 0  # stamp of the first scan of a sweep
+        self._stamps_ns: dict[float, int] = {}  # of the scans that it holds, by their stamps in seconds
 
     @property
     def is_set_back(self) -> bool:
@@ -109,12 +109,13 @@ class CloudDecoder:
         if self._joiner is None:
             if not (sweep_s := self._sweep_s(live.scan)):
                 return live
-            self._joiner, self._begin_ns = SweepJoiner(sweep_s, _JITTER * sweep_s, live.scan.stamp), live.stamp_ns
+            self._joiner = SweepJoiner(sweep_s, _JITTER * sweep_s, live.scan.stamp)
         sweep = self._joiner.add(live.scan)
-        if sweep is None:
-            return None
-        begin_ns, self._begin_ns = self._begin_ns, live.stamp_ns
-        return LiveScan(sweep, begin_ns, live.frame_id)
+        done = None if sweep is None else LiveScan(sweep, self._stamps_ns[sweep.stamp], live.frame_id)
+        if done is not None:
+            self._stamps_ns.clear()
+        self._stamps_ns[live.scan.stamp] = live.stamp_ns
+        return done
 
     def _sweep_s(self, scan: Scan) -> float:
         """The duration of a sweep to which scans are joined, as set or as the first ones show; else 0."""

@@ -19,6 +19,9 @@ MIN_POINTS = 60
 # Cells per median range, and bounds of their size. Where walls are closer than a few metres, the cells are the
 # smallest: steps and door frames are as large in a wider stairwell.
 _CELLS_PER_RANGE = 30.0
+# Fewer of them where rings are farther apart than 2.7 degrees, down to this number: of the cells of a narrow view, most
+# would have points of a single ring, whose planes move with the sensor.
+_FEWEST_CELLS, _CELLS_PER_SPACING = 19.0, 1.4
 _LEAST_CELL_M, _MOST_CELL_M = 0.05, 1.0
 # Largest cells for planes through neighbours: in sparser maps, these are too far apart.
 MOST_SPACING_M = 0.4
@@ -32,6 +35,8 @@ MAP_SPACING, _KEYPOINT_SPACING = 0.5, 2.5
 # one instant span if they form a column. It is 0.6 to 0.9 of spinning sensors, 0.07 of a Mid-360.
 _INSTANTS, _LEAST_OF_INSTANT = 1000, 16
 _COLUMN_SHARE = 0.3
+# Rows of elevations in which rings show, and the fewest points of a ring.
+_ROW_RAD, _LEAST_OF_RING = np.deg2rad(0.25), 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +94,19 @@ class Sampler(Stateful):
     _range_m: float  # smoothed median range; 0 before the first scan with points
     _cell_range_m: float  # median range of the present cell size
     _has_rings: bool | None  # of the first scan of enough points; None before
+    _cells_per_range: float  # by the rings of that scan
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
         self._range_m, self._cell_range_m, self._has_rings = 0.0, 0.0, None
+        self._cells_per_range = _CELLS_PER_RANGE
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
         squared = squared_ranges(scan.points)
         if self._has_rings is None and len(scan) >= _INSTANTS:
             self._has_rings = has_rings(scan)
+            self._cells_per_range = cells_per_range(scan)
         cell_m = self._cell_m(squared)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
         kept, kinds = self._choose(scan, cell_m)
@@ -128,7 +136,7 @@ class Sampler(Stateful):
             self._cell_range_m = self._range_m
         if self._cell_range_m < _CLOSE_M:
             return _LEAST_CELL_M
-        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, _LEAST_CELL_M, self._most_cell_m))
+        return float(np.clip(self._cell_range_m / self._cells_per_range, _LEAST_CELL_M, self._most_cell_m))
 
     @property
     def _most_cell_m(self) -> float:
@@ -150,7 +158,7 @@ def has_rings(scan: Scan) -> bool:
     The lasers of a rosette or a raster draw strokes, numbered or not. Where they are not numbered, the points of one
     instant form a column of a spinning sensor's view, and are near one another in a stroke.
     """
-    elevations = np.arcsin(scan.points[:, 2] / np.maximum(np.sqrt(squared_ranges(scan.points)), 1e-9))
+    elevations = _elevations(scan)
     least = _COLUMN_SHARE * float(np.subtract(*np.quantile(elevations, (0.95, 0.05))))
     if scan.rings is not None:
         order = np.argsort(scan.rings, kind="stable")
@@ -162,3 +170,20 @@ def has_rings(scan: Scan) -> bool:
     size = max(_LEAST_OF_INSTANT, len(elevations) // _INSTANTS)
     instants = elevations[: len(elevations) // size * size].reshape(-1, size)
     return bool(np.median(np.subtract(*np.quantile(instants, (0.9, 0.1), axis=1))) > least)
+
+
+def cells_per_range(scan: Scan) -> float:
+    """Cells per median range, by the mean angle between the rings of a spinning sensor."""
+    rows = np.flatnonzero(
+        np.bincount(((_elevations(scan) + 0.5 * np.pi) / _ROW_RAD).astype(np.int64)) >= _LEAST_OF_RING
+    )
+    rings = 1 + np.count_nonzero(np.diff(rows) > 1)
+    if rings == 1 or 2 * len(rows) > rows[-1] - rows[0]:  # no gaps between most rings
+        return _CELLS_PER_RANGE
+    spacing_rad = _ROW_RAD * float(rows[-1] - rows[0]) / (rings - 1)
+    return float(np.clip(_CELLS_PER_SPACING / spacing_rad, _FEWEST_CELLS, _CELLS_PER_RANGE))
+
+
+def _elevations(scan: Scan) -> FloatArray:
+    """Angles (N,) of the points above the sensor's equator, radians."""
+    return np.arcsin(scan.points[:, 2] / np.maximum(np.sqrt(squared_ranges(scan.points)), 1e-9))

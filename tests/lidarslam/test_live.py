@@ -201,9 +201,9 @@ def test_scans_are_joined_to_sweeps_of_a_set_duration():
     decoder = CloudDecoder(ReaderConfig(sweep_s=0.1), CLOUD, Faults())
     sweeps = [decoder.scan(message_at(1000.5 + 0.02 * number, last_time=2e7), NOW) for number in range(11)]
     assert [None if sweep is None else (sweep.stamp_ns, len(sweep.scan)) for sweep in sweeps] == [
-        *[None] * 5, (1_000_500_000_000, 1000), *[None] * 4, (1_000_600_000_000, 1000)
+        *[None] * 5, (1_000_540_000_000, 1000), *[None] * 4, (1_000_640_000_000, 1000)
     ]  # fmt: skip
-    np.testing.assert_allclose(sweeps[5].scan.time_offsets[[0, -1]], [0.0, 0.1], atol=1e-7)
+    np.testing.assert_allclose(sweeps[5].scan.time_offsets[[0, -1]], [-0.04, 0.06], atol=1e-7)
 
 
 def test_parts_of_sweeps_are_joined_once_the_first_half_second_has_shown_them():

@@ -80,6 +80,17 @@ def test_cells_are_a_share_of_the_median_range_within_bounds(rng, radius_m, cell
     assert sample(shell(rng, radius_m)).cell_m == pytest.approx(cell_m, rel=0.02)
 
 
+@pytest.mark.parametrize(("spacing_deg", "rings", "per_range"), [
+    (0.4, 64, 30.0), (2.0, 16, 30.0), (4.0, 8, 1.4 / np.deg2rad(4.0)), (5.6, 16, 19.0)
+])  # fmt: skip
+def test_cells_are_larger_where_rings_are_farther_apart(spacing_deg, rings, per_range):
+    elevation = np.deg2rad(spacing_deg * (np.arange(rings) - 0.5 * (rings - 1))).repeat(300)
+    azimuth = np.tile(np.linspace(0.0, 2.0 * np.pi, 300, endpoint=False), rings)
+    flat = np.cos(elevation)
+    points = 12.0 * np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    assert sample(Scan(points, 0.0)).cell_m == pytest.approx(12.0 / per_range, rel=0.02)
+
+
 def test_a_given_cell_stays_whatever_the_scene(rng):
     sampler = Sampler(MappingConfig(cell_m=0.33))
     assert {sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in (1.0, 40.0, 5.0)} == {0.33}
