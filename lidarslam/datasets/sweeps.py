@@ -20,7 +20,7 @@ from lidarslam.datasets.recording import CloudRecording, RecordingInfo, scan_ind
 
 # The duration of sweeps whose directions do not recur, and the longest until they do, seconds.
 _LONGEST_S, _SLOWEST_TURN_S = 0.1, 0.25
-# The first scans show whether directions recur.
+# The time whose scans show whether they do.
 LOOKED_AT_S = 2.0 * _SLOWEST_TURN_S
 # Share of the cells of a degree that two whole sweeps have in common: 0.9, or 0.35 of every fourth point; parts of a
 # sweep and scans of a Mid-360 have 0.1.
@@ -113,7 +113,7 @@ def _agree(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
 class JoinedRecording:
     """A recording whose scans are joined to sweeps of a duration, or as far as consecutive ones see other directions.
 
-    Scans of 10 Hz or less are sweeps unless a duration is set.
+    Scans at less than 15 Hz are sweeps unless a duration is set.
     """
 
     def __init__(self, recorded: CloudRecording, sweep_s: float | Literal["auto"], time_scale: float = 1.0) -> None:
@@ -150,14 +150,9 @@ class JoinedRecording:
         """A short name."""
         return self.recorded.name
 
-    @cached_property
-    def _length(self) -> int:
-        if not self._is_joined:
-            return len(self.recorded)
-        return min(self._joiner().number_at(self._info.last_stamp) + 1, len(self.recorded))
-
     def __len__(self) -> int:
-        return self._length
+        scans = len(self.recorded)
+        return min(self._joiner().number_at(self._info.last_stamp) + 1, scans) if self._is_joined else scans
 
     @property
     def ground_truth(self) -> Trajectory | None:

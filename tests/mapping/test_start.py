@@ -91,7 +91,7 @@ def clutter(rng: np.random.Generator, stamp: float) -> Scan:
 
 def bare_ground(rng: np.random.Generator, stamp: float) -> Scan:
     """Rings that are farther apart than any plane is searched for, from half a metre above."""
-    radius, azimuth = 0.5 / np.tan(np.deg2rad(np.array([3.0, 5.0, 8.0, 12.0]))), np.linspace(-np.pi, np.pi, 900)
+    radius, azimuth = 0.5 / np.tan(np.deg2rad(np.array([2.0, 5.0, 10.0, 20.0]))), np.linspace(-np.pi, np.pi, 900)
     rings, columns = np.indices((len(radius), len(azimuth))).reshape(2, -1)
     points = radius[rings, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])[columns]
     heights = rng.normal(-0.5, 0.01, len(points))
