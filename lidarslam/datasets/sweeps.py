@@ -178,8 +178,8 @@ class JoinedRecording:
     def _notes(self) -> tuple[str, ...]:
         scans, period_s, _ = self._sweep
         note = (
-            f"each {scans} scans are joined to one sweep of {scans * period_s:.2g} s, as consecutive ones see different"
-            " directions (--set reader.sweep_s=0 joins none)"
+            f"every {scans} scans are joined to one sweep of {scans * period_s:.2g} s, as consecutive ones see"
+            " different directions (--set reader.sweep_s=0 joins none)"
         )
         return (note,) if self._is_joined and self._setting == "auto" else ()
 

@@ -17,7 +17,7 @@ from lidarslam.datasets.registry import open_recording
 from ..conftest import succeeds, write_recording
 
 PARTS, PERIOD_S = 5, 0.02
-JOINED = "each 5 scans are joined to one sweep of 0.1 s"
+JOINED = "every 5 scans are joined to one sweep of 0.1 s"
 
 
 def opened(folder: Path, scans: Iterable[Scan], **settings: object) -> Recording:
