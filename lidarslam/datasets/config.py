@@ -35,8 +35,8 @@ class ReaderConfig(Settings):
     )
     sweep_s: Annotated[float, Field(ge=0.0, le=10.0)] | Literal["auto"] = Field(
         "auto",
-        description="duration of a sweep, to which shorter scans are joined; auto: at most 0.1, as long as consecutive"
-        " scans see other directions",
+        description="seconds of a sweep, to which shorter scans are joined; 0: none are; auto: until their directions"
+        " recur, or 0.1",
     )
     mounting: Mounting = Field(
         "auto",
