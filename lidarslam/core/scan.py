@@ -1,7 +1,7 @@
 """One sweep of a LiDAR, the attributes of its points, and the protocol of a recording."""
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Annotated, Any, Protocol, Self
 
@@ -148,6 +148,12 @@ class Scan:
             lasers = None
         lasers = None if lasers is None else lasers.astype(np.int32)
         return cls(xyz, float(stamp), offsets, lasers, dropped, brightness, rgb, untimed)
+
+    def with_times_scaled(self, scale: float) -> "Scan":
+        """The scan with the times of its points, from the stamp, multiplied by a factor."""
+        if self.time_offsets is None or scale == 1.0:
+            return self
+        return replace(self, time_offsets=scale * self.time_offsets)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":
         """The scan with only the chosen points (a mask or indices), and their attributes."""

@@ -81,8 +81,7 @@ def transform_of(mounting: Mounting) -> FloatArray:
 
 def corrected(scan: Scan, T_upright_recorded: FloatArray, raised_deg: float, time_scale: float) -> Scan:
     """A scan in upright axes, its points raised above the recorded x-y plane, their times from the stamp scaled."""
-    if scan.time_offsets is not None and time_scale != 1.0:
-        scan = replace(scan, time_offsets=time_scale * scan.time_offsets)
+    scan = scan.with_times_scaled(time_scale)
     if raised_deg:
         scan = replace(scan, points=correct_elevation(scan.points, raised_deg))
     if np.array_equal(T_upright_recorded, np.eye(4)):

@@ -1,6 +1,6 @@
 """Sweeps joined from scans that hold a part of one, as drivers of solid-state sensors and of packets publish them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -92,11 +92,11 @@ def directions_of(scan: Scan) -> Directions:
     return scan.stamp, np.unique((azimuth * 1000.0 + elevation).astype(np.int64))
 
 
-def scans_of_a_sweep(seen: Sequence[Directions], period_s: float) -> int:
+def scans_of_a_sweep(scans: Iterable[Directions], period_s: float) -> int:
     """The number of scan periods after which the directions recur, or those of a tenth of a second; 1 below 15 Hz."""
     if round(_LONGEST_S / period_s) < 2:
         return 1
-    seen = [(stamp, cells) for stamp, cells in seen if len(cells) >= _FEW_CELLS]
+    seen = [(stamp, cells) for stamp, cells in scans if len(cells) >= _FEW_CELLS]
     found = []
     for index, (stamp, here) in enumerate(seen[: (len(seen) + 1) // 2]):
         recurs = (later - stamp for later, there in seen[index + 1 :] if _agree(here, there))
@@ -121,29 +121,28 @@ class JoinedRecording:
         self._setting, self._time_scale = sweep_s, time_scale
 
     @cached_property
-    def _sweep(self) -> tuple[int, float, float]:
-        """Scans of a sweep, their period and the first stamp."""
+    def _parts(self) -> int:
+        """Scans of a sweep."""
         period_s = self.recorded.period_s
         if period_s is None or period_s < _LEAST_PERIOD_S:
-            return 1, 0.0, 0.0
-        wanted_s = _LONGEST_S if self._setting == "auto" else self._setting
-        if (wanted := round(wanted_s / period_s)) < 2:
-            return 1, 0.0, 0.0
-        looked_at = round(LOOKED_AT_S / period_s) if self._setting == "auto" else 1
-        seen: list[Directions] = []
+            return 1
+        if self._setting != "auto":
+            return max(1, round(self._setting / period_s))
         with suppress(InputError):  # raised again when the scans are read
-            seen = [directions_of(scan) for scan in islice(self.recorded.scans(faults=Faults()), looked_at)]
-        if not seen:
-            return 1, 0.0, 0.0
-        return scans_of_a_sweep(seen, period_s) if self._setting == "auto" else wanted, period_s, seen[0][0]
+            first = islice(self.recorded.scans(faults=Faults()), round(LOOKED_AT_S / period_s))
+            return scans_of_a_sweep(map(directions_of, first), period_s)
+        return 1
+
+    @property
+    def _sweep_s(self) -> float:
+        return self._parts * (self.recorded.period_s or 0.0)
 
     def _joiner(self) -> SweepJoiner:
-        scans, period_s, first_stamp = self._sweep
-        return SweepJoiner(scans * period_s, period_s, first_stamp)
+        return SweepJoiner(self._sweep_s, self._sweep_s / self._parts, self._info.first.stamp)
 
     @property
     def _is_joined(self) -> bool:
-        return self._sweep[0] > 1
+        return self._parts > 1
 
     @property
     def name(self) -> str:
@@ -176,9 +175,8 @@ class JoinedRecording:
 
     @property
     def _notes(self) -> tuple[str, ...]:
-        scans, period_s, _ = self._sweep
         note = (
-            f"every {scans} scans are joined to one sweep of {scans * period_s:.2g} s, as consecutive ones see"
+            f"every {self._parts} scans are joined to one sweep of {self._sweep_s:.2g} s, as consecutive ones see"
             " different directions (--set reader.sweep_s=0 joins none)"
         )
         return (note,) if self._is_joined and self._setting == "auto" else ()
@@ -188,14 +186,14 @@ class JoinedRecording:
     ) -> Iterator[Scan]:
         """The sweeps with the indices of `range(start, stop, step)`; earlier ones are read, too."""
         if not self._is_joined:
-            return map(self._scaled, self.recorded.scans(start, stop, step, faults))
+            return map(self._timed, self.recorded.scans(start, stop, step, faults))
         return self._sweeps(scan_indices(len(self), start, stop, step), faults)
 
     def _sweeps(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
         joiner = self._joiner()
         for scan in self.recorded.scans(faults=faults):
             number = joiner.number
-            sweep = joiner.add(self._scaled(scan))
+            sweep = joiner.add(self._timed(scan))
             if sweep is not None and number in wanted:
                 yield sweep
             if joiner.number >= wanted.stop:
@@ -204,10 +202,8 @@ class JoinedRecording:
         if sweep is not None and joiner.number in wanted:
             yield sweep
 
-    def _scaled(self, scan: Scan) -> Scan:
-        if scan.time_offsets is None or self._time_scale == 1.0:
-            return scan
-        return replace(scan, time_offsets=self._time_scale * scan.time_offsets)
+    def _timed(self, scan: Scan) -> Scan:
+        return scan.with_times_scaled(self._time_scale)
 
     @cached_property
     def _info(self) -> RecordingInfo:
@@ -216,12 +212,12 @@ class JoinedRecording:
     def describe(self) -> RecordingInfo:
         """The contents of the recording, its scans being the sweeps."""
         if not self._is_joined:
-            return replace(self._info, first=self._scaled(self._info.first))
-        first, sweep_s = next(self.scans(faults=Faults())), self._sweep[0] * self._sweep[1]
+            return replace(self._info, first=self._timed(self._info.first))
+        first = next(self.scans(faults=Faults()))
         return replace(
             self._info,
             scans=len(self),
             first=first,
-            last_stamp=first.stamp + (len(self) - 1) * sweep_s,
+            last_stamp=first.stamp + (len(self) - 1) * self._sweep_s,
             notes=(*self._info.notes, *self._notes),
         )

@@ -183,7 +183,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
             )
         return [*present, *([] if resume else [ABOUT])]
     if present and not resume:
-        listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
+        listed = first_few(present, 3)
         if not config_begins_with(path, RUN_SECTION):
             raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
         if not overwrite:

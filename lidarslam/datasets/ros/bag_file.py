@@ -10,7 +10,8 @@ import struct
 from bz2 import BZ2Decompressor
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from functools import cached_property
 from io import BytesIO, RawIOBase
 from itertools import chain, count, pairwise
 from pathlib import Path
@@ -27,6 +28,7 @@ from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, read_exact, 
 from rosbags.typesys.msg import normalize_msgtype
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import reading
 from lidarslam.core.text import reason
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, Topic
@@ -161,7 +163,7 @@ class BagFile:
         self._has_index = False
         self.damage = (
             f"{self.path}: has no index that can be read, so its {counts.total()} messages were read one after another"
-            f" as far as they go{why}; {self._remedy()}"
+            f" as far as they go{why}; {self._remedy}"
         )
         return counts
 
@@ -240,19 +242,13 @@ class BagFile:
         finally:
             reader.close()
 
-    @contextmanager
-    def _damage(self, place: str) -> Iterator[None]:
-        """Damaged files make rosbags raise nearly anything: its own errors, assertions, KeyError, struct.error."""
-        try:
-            yield
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"{self.path}: {place} ({reason(error)}); {self._remedy()}") from error
+    def _damage(self, place: str) -> AbstractContextManager[None]:
+        return reading(self.path, place, self._remedy)
 
     def _suffix(self) -> str:
         return self.path.suffix if self.ros2 else ".bag"
 
+    @cached_property
     def _remedy(self) -> str:
         if self.path.is_dir() and self.ros2:
             whole = min(self.path.glob("*.zstd"), default=None)
