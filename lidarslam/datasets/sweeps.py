@@ -25,6 +25,7 @@ LOOKED_AT_S = 2.0 * _SLOWEST_TURN_S
 # Share of the cells of a degree that two whole sweeps have in common: 0.9, or 0.35 of every fourth point; parts of a
 # sweep and scans of a Mid-360 have 0.1.
 _SAME_DIRECTIONS = 0.3
+# Scans with points in fewer cells are not compared.
 _FEW_CELLS = 20
 # No LiDAR publishes faster: the unit of the stamps is wrong.
 _LEAST_PERIOD_S = 1e-3

@@ -53,7 +53,7 @@ class CloudDecoder:
 
     The sensor is that of the first message unless `reader.frame_id` names one, and unit and reference of the point
     times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are. Parts
-    of sweeps are joined from the second half second on, or from the first where `reader.sweep_s` is set.
+    of sweeps are joined after the first half second, or from the first scan on where `reader.sweep_s` is set.
     """
 
     def __init__(self, config: ReaderConfig, message_type: str, faults: Faults) -> None:
@@ -80,9 +80,9 @@ class CloudDecoder:
         return self._behind >= _SET_BACK
 
     def scan(self, raw: bytes, published_ns: int) -> LiveScan | None:
-        """The scan of a serialised message, or the sweep that ends with the one before it.
+        """The scan of a serialised message, or the sweep that was complete before it.
 
-        None where it cannot be used, which is counted, or continues a sweep.
+        None where the message cannot be used, which is counted, or where it continues a sweep.
         """
         try:
             header_ns, frame_id = read_header(raw, ros2=True)
