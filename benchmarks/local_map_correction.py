@@ -34,6 +34,7 @@ from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
+from lidarslam.mapping.registration.sampled_scan import CellSizes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig
@@ -56,13 +57,13 @@ class _Graph(SlamGraph):
         self.laid: list[tuple[int, FloatArray]] = []  # first scan registered to it, poses of the keyframes so far
         self.first_closure: int | None = None  # number of scans before it
 
-    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
+    def redrawn_local_map(self, cells_m: CellSizes) -> SurfelMap | None:
         if self.first_closure is None and any(closure.accepted for closure in self._closures):
             self.first_closure = len(self.scan_poses)
         if not self._redraws:
             return None
         started = time.thread_time()
-        drawn = super().redrawn_local_map(cell_m)
+        drawn = super().redrawn_local_map(cells_m)
         if drawn is not None:
             self.drawn_ms.append(1e3 * (time.thread_time() - started))
             self.laid.append((len(self.scan_poses) - 1 + SCANS_LATER, np.array(self._laid._poses)))

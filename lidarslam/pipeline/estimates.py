@@ -12,7 +12,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew, even
 from lidarslam.mapping.motion.prediction import GravityDirection
 from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
 from lidarslam.odometry.interface import Motion
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
@@ -139,7 +139,7 @@ class ScanEstimate:
     belongs_in_map: bool  # whether the pose is accurate enough to add the scan to the map
     is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
     gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not
-    cell_m: float | None = None  # edge of the finest cells of the local map; None without one
+    cells_m: CellSizes | None = None  # of the local map; None without one
     has_surfels: bool = False  # whether that map is one of surfels
     turn_rate: Annotated[FloatArray, Shape(3)] | None = None  # rad/s as the sweep alone shows it, in the LiDAR frame
     stage_ms: dict[str, float]  # wall time of the stages so far, see `STAGES`

@@ -165,7 +165,7 @@ class ScanToMap(Stateful):
             degenerate=mapped.degenerate,
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
-            cell_m=mapped.cell_m,
+            cells_m=mapped.cells_m,
             has_surfels=mapped.has_surfels,
             turn_rate=mapped.turn_rate,
         )

@@ -95,7 +95,7 @@ class OdometryGate(Stateful):
 
     def _take(self) -> None:
         estimate, self._before = self._waiting.popleft()(), (self._ok, self._error_cells)
-        if estimate.status is not Status.OK or not estimate.is_connected or not estimate.cell_m:
+        if estimate.status is not Status.OK or not estimate.is_connected or not estimate.cells_m:
             self._ok, self._T_world_last, self._velocity = 0, None, None
             return
         before, self._T_world_last = self._T_world_last, estimate.T_world_lidar
@@ -106,7 +106,7 @@ class OdometryGate(Stateful):
         motion = log(inverse(before) @ estimate.T_world_lidar)
         if self._velocity is not None:
             error = log(inverse(exp(self._velocity * interval_s)) @ exp(motion))
-            error_cells = displacement_m(error, _RANGE_M) / estimate.cell_m
+            error_cells = displacement_m(error, _RANGE_M) / estimate.cells_m[0]
             self._error_cells = max(_FADING * self._error_cells, error_cells)
             self._ok += 1
         self._velocity = motion / interval_s

@@ -21,6 +21,7 @@ from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan, KeyframeGraph
+from lidarslam.mapping.registration.sampled_scan import CellSizes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline import threads
@@ -201,8 +202,8 @@ class Pipeline(Stateful):
         self.map.add(thinned, estimate)
         if self._graph is not None:
             arrived = graph_scan(odometry, estimate)
-            cell_m = estimate.cell_m if self._correction is not None and estimate.has_surfels else None
-            drawing = self._graph_worker.submit(_give, self._graph, self.map, arrived, cell_m)
+            cells_m = estimate.cells_m if self._correction is not None and estimate.has_surfels else None
+            drawing = self._graph_worker.submit(_give, self._graph, self.map, arrived, cells_m)
             if self._correction is not None:
                 self._correction.add(drawing)
         return replace(estimate, stage_ms=estimate.stage_ms | {"deskew": deskew_ms, "map": _ms_since(started)})
@@ -213,12 +214,12 @@ class Pipeline(Stateful):
             self._graph_worker.submit(self._graph.draw, *added)
 
 
-def _give(graph: KeyframeGraph, built: MapBuilder, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
+def _give(graph: KeyframeGraph, built: MapBuilder, scan: GraphScan, cells_m: CellSizes | None) -> SurfelMap | None:
     """Give the graph a scan, and the map a submap that is complete; the local map where loop closures change it."""
     submap = graph.add(scan)
     if submap is not None and built.global_map is not None:  # of the keyframe before the new one
         built.global_map.add_means(submap, graph.scan_poses[graph.keyframes[-2].scan])
-    return None if cell_m is None else graph.redrawn_local_map(cell_m)
+    return None if cells_m is None else graph.redrawn_local_map(cells_m)
 
 
 def map_error(error: Exception) -> LidarSlamError:

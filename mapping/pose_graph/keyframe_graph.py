@@ -20,6 +20,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
 from lidarslam.mapping.global_map.voxels import Layout
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.motion.prediction import GravityDirection
+from lidarslam.mapping.registration.sampled_scan import CellSizes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import key_steps, point_keys
 
@@ -280,7 +281,7 @@ class KeyframeGraph(Stateful):
         self.attitudes += measured_attitude(scan, self.keyframes, self.scan_poses)
         return complete
 
-    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:  # noqa: ARG002
+    def redrawn_local_map(self, cells_m: CellSizes) -> SurfelMap | None:  # noqa: ARG002
         """None: without loop closures the running local map stays as it is."""
         return None
 

@@ -38,6 +38,7 @@ from lidarslam.mapping.pose_graph.keyframe_graph import (
 )
 from lidarslam.mapping.pose_graph.optimizer import Optimised, RelaxSchedule, optimise, relax
 from lidarslam.mapping.pose_graph.submap_placement import SubmapPlacement, connected_with_last
+from lidarslam.mapping.registration.sampled_scan import CellSizes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 logger = logging.getLogger(__name__)
@@ -99,8 +100,8 @@ class SlamGraph(KeyframeGraph):
             self._keep(tracked.means(key))
             self.keyframe_ms.append(tracked.keyframe_ms[key] + 1e3 * (time.perf_counter() - started))
 
-    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
-        """The local map rebuilt without the latest scan, in the frame of registration, with cells of that edge.
+    def redrawn_local_map(self, cells_m: CellSizes) -> SurfelMap | None:
+        """The local map rebuilt without the latest scan, in the frame of registration, with cells of those sizes.
 
         None unless closures refined since the last call show that submaps lie elsewhere in it, or are missing.
         """
@@ -110,7 +111,7 @@ class SlamGraph(KeyframeGraph):
         certain = [c for c in self._closures if c.accepted and squared_error(c, self._poses) < CHI_SQUARED_99]
         members = connected_with_last(self.keyframes, certain)
         targets = self.scan_poses[self.keyframes[-1].scan] @ inverse(self._poses[-1]) @ np.array(self._poses)
-        drawn = self._laid.redrawn(targets, members, cell_m, self.means, scan=len(self.scan_poses) - 1)
+        drawn = self._laid.redrawn(targets, members, cells_m, self.means, scan=len(self.scan_poses) - 1)
         self.redraws += [] if drawn is None else [len(self.keyframes)]
         return drawn
 

@@ -18,6 +18,7 @@ from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxels import POSITION, VIEW, Rows
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.keyframe_graph import Keyframe, first_connected
+from lidarslam.mapping.registration.sampled_scan import CellSizes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 # A submap is off when its place in the local map differs from the corrected one by more than this share of a cell or
@@ -74,8 +75,8 @@ class SubmapPlacement(Stateful):
         self._held = [key for key, is_near in zip(self._held, near, strict=True) if is_near]
 
     def redrawn(
-        self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans],
-        scan: int,
+        self, targets: FloatArray, members: NDArray[np.bool_], cells_m: CellSizes,
+        submap: Callable[[int], VoxelMeans], scan: int,
     ) -> SurfelMap | None:  # fmt: skip
         """The map rebuilt without the latest scan; None unless a submap nearby is missing, or lies where it should not.
 
@@ -86,7 +87,7 @@ class SubmapPlacement(Stateful):
         is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()
         near = np.flatnonzero(relative < _RIGHT_WITHIN)
         off = inverse(np.array([self._poses[key] for key in near]).reshape(-1, 4, 4)) @ targets[near]
-        is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cell_m
+        is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cells_m[0]
         if not is_missing and not (is_far | (rotation_angle(off) > _OFF_RAD)).any():
             return None
         self._poses, self._held = list(targets), np.flatnonzero(relative < 1.0).tolist()
@@ -97,7 +98,7 @@ class SubmapPlacement(Stateful):
         submaps = [(targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True)]
         # Ended the map before a submap does, its border would be of the latest scans alone.
         reaches = (float(np.linalg.norm(rows[:, POSITION], axis=1).max(initial=0.0)) for rows in held)
-        return draw_local_map(submaps, cell_m, max(self.radius_m, *reaches))
+        return draw_local_map(submaps, cells_m, max(self.radius_m, *reaches))
 
     def is_exchanged(self, first: int, second: int) -> bool:
         """Whether two scans were registered to different maps, one of them rebuilt."""
@@ -151,9 +152,9 @@ def connected_with_last(keyframes: Sequence[Keyframe], closures: Iterable[Relati
     return np.asarray(component == component[-1])
 
 
-def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, radius_m: float) -> SurfelMap:
+def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cells_m: CellSizes, radius_m: float) -> SurfelMap:
     """Surfels of submaps, each with `T_odom_keyframe` (4, 4) and its rows; full cells are those of the first ones."""
-    drawn = SurfelMap(cell_m, radius_m)
+    drawn = SurfelMap(cells_m, radius_m)
     for T_odom_keyframe, rows in submaps:
         views = rows[:, VIEW].astype(np.float64)
         lengths = np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
 
-# Resolutions of a map, in cells. A point's correspondence is the plane of the finest one that has one.
-LEVELS = (1, 2, 4)
 # In a map of fewer scans, planes are of few points: their normals are uncertain.
 _YOUNG_SCANS = 5
 # Surfaces within this cosine of the z axis are floors or ceilings.
@@ -79,19 +77,27 @@ class Matcher(ABC):
 
 
 class LocalMap(Stateful, ABC):
-    """Surfaces within a radius of the sensor, in several resolutions."""
+    """Surfaces within a radius of the sensor, in several resolutions.
 
-    cell_m: float  # edge of the finest cells
+    A point's correspondence is the surface of the finest one that has one.
+    """
+
+    cells_m: CellSizes
     scans: int  # number of inserted scans
     _radius_m: float
     _centre: Annotated[FloatArray, Shape(3)] | None
 
-    def __init__(self, cell_m: float, radius_m: float) -> None:
-        self.cell_m, self.scans, self._radius_m, self._centre = cell_m, 0, radius_m, None
+    def __init__(self, cells_m: CellSizes, radius_m: float) -> None:
+        self.cells_m, self.scans, self._radius_m, self._centre = cells_m, 0, radius_m, None
 
     def __len__(self) -> int:
         """Number of cells of all resolutions."""
         return sum(map(len, self.grids))
+
+    @property
+    def cell_m(self) -> float:
+        """Edge of the finest cells."""
+        return self.cells_m[0]
 
     @property
     @abstractmethod
@@ -118,11 +124,11 @@ class LocalMap(Stateful, ABC):
     def resample(self, other: Self) -> None:
         """Fill an empty map with what another one, of other cells, holds."""
 
-    def resized(self, cell_m: float) -> Self:
-        """The map in cells of another size; the map itself for its own size."""
-        if cell_m == self.cell_m:
+    def resized(self, cells_m: CellSizes) -> Self:
+        """The map in cells of other sizes; the map itself for its own sizes."""
+        if cells_m == self.cells_m:
             return self
-        other = type(self)(cell_m, self._radius_m)
+        other = type(self)(cells_m, self._radius_m)
         other._centre, other.scans = self._centre, self.scans
         other.resample(self)
         return other

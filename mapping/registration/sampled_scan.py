@@ -14,6 +14,8 @@ from lidarslam.core.thinning import central_per_cell, evenly, one_per_cell
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 
+CellSizes = tuple[float, ...]  # edges of a map's cells in each of its resolutions, the finest first
+
 # Least number of points for the scale of a scene, and of keypoints and their correspondences for a pose.
 MIN_POINTS = 60
 # Cells per median range, and bounds of their size. Where walls are closer than a few metres, the cells are the
@@ -23,6 +25,11 @@ _CELLS_PER_RANGE = 30.0
 # would have points of a single ring, whose planes move with the sensor.
 _FEWEST_CELLS, _CELLS_PER_SPACING = 19.0, 1.4
 _LEAST_CELL_M, _MOST_CELL_M = 0.05, 1.0
+# Resolutions of a map, in its finest cells.
+_LEVELS = (1, 2, 4)
+# The coarsest cells are as wide as the gap between rings at this range: where walls are close, only floor and ceiling
+# constrain the height, and they are seen at 5 m and more, where a smaller cell has points of a single ring.
+_GAP_RANGE_M = 10.0
 # Largest cells for planes through neighbours: in sparser maps, these are too far apart.
 MOST_SPACING_M = 0.4
 _CLOSE_M = 3.0
@@ -44,7 +51,7 @@ class SampledScan:
     """A thinned scan, as measured."""
 
     stamp: float  # of the scan, seconds
-    cell_m: float  # size of the map's cells for the scene
+    cells_m: CellSizes  # of the map for the scene
     range_m: float  # smoothed median range of the scene
     sweep: Sweep  # N points for the map
     # (N,) their angles above the sensor's equator, radians; all zero where points do not lie in rings
@@ -53,6 +60,11 @@ class SampledScan:
 
     def __len__(self) -> int:
         return len(self.sweep)
+
+    @property
+    def cell_m(self) -> float:
+        """Size of the finest cells."""
+        return self.cells_m[0]
 
     @property
     def is_sparse(self) -> bool:
@@ -94,19 +106,18 @@ class Sampler(Stateful):
     _range_m: float  # smoothed median range; 0 before the first scan with points
     _cell_range_m: float  # median range of the present cell size
     _has_rings: bool | None  # of the first scan of enough points; None before
-    _cells_per_range: float  # by the rings of that scan
+    _spacing_rad: float  # mean angle between the rings of that scan
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
-        self._range_m, self._cell_range_m, self._has_rings = 0.0, 0.0, None
-        self._cells_per_range = _CELLS_PER_RANGE
+        self._range_m, self._cell_range_m, self._has_rings, self._spacing_rad = 0.0, 0.0, None, 0.0
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
         squared = squared_ranges(scan.points)
         if self._has_rings is None and len(scan) >= _INSTANTS:
             self._has_rings = has_rings(scan)
-            self._cells_per_range = cells_per_range(scan)
+            self._spacing_rad = ring_spacing(scan) if self._has_rings else 0.0
         cell_m = self._cell_m(squared)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
         kept, kinds = self._choose(scan, cell_m)
@@ -120,7 +131,8 @@ class Sampler(Stateful):
         rings = 0.0 if self._has_rings is False else 1.0
         elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
         keypoints = sweep.take(self._keypoints(sweep, cell_m))
-        return SampledScan(scan.stamp, cell_m, self._range_m, sweep, elevations, keypoints)
+        cells_m = sizes_of_cells(cell_m, _GAP_RANGE_M * self._spacing_rad)
+        return SampledScan(scan.stamp, cells_m, self._range_m, sweep, elevations, keypoints)
 
     def _cell_m(self, squared: FloatArray) -> float:
         """The size of cells for the latest squared ranges (N,), with hysteresis."""
@@ -136,7 +148,8 @@ class Sampler(Stateful):
             self._cell_range_m = self._range_m
         if self._cell_range_m < _CLOSE_M:
             return _LEAST_CELL_M
-        return float(np.clip(self._cell_range_m / self._cells_per_range, _LEAST_CELL_M, self._most_cell_m))
+        per_range = np.clip(_CELLS_PER_SPACING / max(self._spacing_rad, 1e-9), _FEWEST_CELLS, _CELLS_PER_RANGE)
+        return float(np.clip(self._cell_range_m / per_range, _LEAST_CELL_M, self._most_cell_m))
 
     @property
     def _most_cell_m(self) -> float:
@@ -150,6 +163,12 @@ class Sampler(Stateful):
         """Indices (K,) of the points that are registered."""
         # The last points of the sweep would lie on the same side of every tree, and a sensor at rest would rotate.
         return evenly(central_per_cell(sweep.points, _KEYPOINT_SPACING * cell_m), self._config.keypoints)
+
+
+def sizes_of_cells(finest_m: float, coarsest_m: float = 0.0) -> CellSizes:
+    """The sizes of a map with such finest cells; the coarsest are at least of another size."""
+    sizes_m = [finest_m * level for level in _LEVELS]
+    return *sizes_m[:-1], max(sizes_m[-1], coarsest_m)
 
 
 def has_rings(scan: Scan) -> bool:
@@ -172,16 +191,15 @@ def has_rings(scan: Scan) -> bool:
     return bool(np.median(np.subtract(*np.quantile(instants, (0.9, 0.1), axis=1))) > least)
 
 
-def cells_per_range(scan: Scan) -> float:
-    """Cells per median range, by the mean angle between the rings of a spinning sensor."""
+def ring_spacing(scan: Scan) -> float:
+    """Mean angle between the rings of a spinning sensor, radians; 0 of a single ring, and where most have no gaps."""
     rows = np.flatnonzero(
         np.bincount(((_elevations(scan) + 0.5 * np.pi) / _ROW_RAD).astype(np.int64)) >= _LEAST_OF_RING
     )
     rings = 1 + np.count_nonzero(np.diff(rows) > 1)
-    if rings == 1 or 2 * len(rows) > rows[-1] - rows[0]:  # no gaps between most rings
-        return _CELLS_PER_RANGE
-    spacing_rad = _ROW_RAD * float(rows[-1] - rows[0]) / (rings - 1)
-    return float(np.clip(_CELLS_PER_SPACING / spacing_rad, _FEWEST_CELLS, _CELLS_PER_RANGE))
+    if rings == 1 or 2 * len(rows) > rows[-1] - rows[0]:
+        return 0.0
+    return float(_ROW_RAD * (rows[-1] - rows[0]) / (rings - 1))
 
 
 def _elevations(scan: Scan) -> FloatArray:

@@ -15,8 +15,8 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
-from lidarslam.mapping.registration.local_map import LEVELS, LocalMap, Matcher, Surfaces, vertical_of
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.local_map import LocalMap, Matcher, Surfaces, vertical_of
+from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
@@ -192,9 +192,9 @@ class SurfelMap(LocalMap):
 
     _grids: list[SurfelGrid]
 
-    def __init__(self, cell_m: float, radius_m: float) -> None:
-        super().__init__(cell_m, radius_m)
-        self._grids = [SurfelGrid(cell_m * level) for level in LEVELS]
+    def __init__(self, cells_m: CellSizes, radius_m: float) -> None:
+        super().__init__(cells_m, radius_m)
+        self._grids = [SurfelGrid(cell_m) for cell_m in cells_m]
 
     @property
     def grids(self) -> list[SurfelGrid]:
@@ -207,7 +207,7 @@ class SurfelMap(LocalMap):
         InputError where points lie beyond the reach of the cells.
         """
         require_reach(points, cell_m)
-        surfel_map = cls(cell_m, radius_m)
+        surfel_map = cls(sizes_of_cells(cell_m), radius_m)
         # No plane of a merged map is that of a single ring.
         elevations = np.where(np.arange(len(points)) % 2, _ANY_HEIGHT_RAD, -_ANY_HEIGHT_RAD)
         # The two sides of a thin wall after one another: the second is known by its view then.

@@ -13,7 +13,7 @@ from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
 from lidarslam.mapping.registration.local_map import LocalMap, Matcher
 from lidarslam.mapping.registration.registration import Registration
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
 
 # Largest distance of an inlier from its surface: the largest of a length, a share of the cell, a share of the range,
 # and standard deviations of the surface.
@@ -337,7 +337,7 @@ class MappedScan:
     turn_rate: FloatArray | None = None  # (3,) rad/s within the sweep, in the LiDAR frame; None without point times
     # (6,) body velocity of the first scan as the second shows it, in the result of the second; None in all others
     first_velocity: FloatArray | None = None
-    cell_m: float | None = None  # edge of the finest cells of a local map
+    cells_m: CellSizes | None = None  # of a local map
     has_surfels: bool = False  # whether that map is one of surfels
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU
 

@@ -115,12 +115,12 @@ class Mapper(Stateful):
         else:
             mapped = self._track(scan, prior, last, self._map)
         self._last = mapped.state
-        cell_m = None if self._map is None else self._map.cell_m
-        return replace(mapped, cell_m=cell_m, has_surfels=isinstance(self._map, SurfelMap))
+        cells_m = None if self._map is None else self._map.cells_m
+        return replace(mapped, cells_m=cells_m, has_surfels=isinstance(self._map, SurfelMap))
 
     def _track(self, scan: SampledScan, prior: Prior, last: MotionState, local_map: LocalMap) -> MappedScan:
         """Predict, register, judge, insert."""
-        self._map = local_map = local_map.resized(scan.cell_m)
+        self._map = local_map = local_map.resized(scan.cells_m)
         # Predict the pose and the velocity from the last motion and the odometry.
         prediction = self._tracker.tracking.predict(scan, prior, last, self._config)
         if scan.is_sparse:
@@ -225,7 +225,7 @@ class Mapper(Stateful):
         """A map of one scan."""
         # Of sparse strokes, few cells have more than one; a plane through neighbouring voxels spans several.
         is_surfels = self._config.method == "surfels" and scan.has_rings
-        local_map = (SurfelMap if is_surfels else FeatureMap)(scan.cell_m, self._config.radius_m)
+        local_map = (SurfelMap if is_surfels else FeatureMap)(scan.cells_m, self._config.radius_m)
         logger.info("new local map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
         self._map_since = self._scans
         self._growing_since = None if is_surfels else scan.stamp

@@ -16,6 +16,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.registration.sampled_scan import CellSizes, sizes_of_cells
 from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -168,6 +169,7 @@ def test_scans_may_be_thinned_ahead_of_their_poses(room_scans, room_truth):
 
 
 CELL_M = 0.4
+CELLS_M = sizes_of_cells(CELL_M)
 VELOCITY = np.array([0.0, 0.0, 0.2, 5.0, 0.0, 0.0])
 
 
@@ -186,7 +188,7 @@ def asked(
     stamps: FloatArray | None = None,
     empty: int | None = None,
     behind: int = 1,
-    cell_m: float | None = CELL_M,
+    cells_m: CellSizes | None = CELLS_M,
     wider_from: int | None = None,
     saved_at: int | None = None,
 ) -> list[int]:
@@ -206,7 +208,8 @@ def asked(
         if done >= 0:
             status = (statuses or {}).get(done, Status.OK)
             is_wider = wider_from is not None and done >= wider_from
-            result = scan_estimate(float(times[done]), poses[done], status, cell_m=2.0 * CELL_M if is_wider else cell_m)
+            present_m = sizes_of_cells(2.0 * CELL_M) if is_wider else cells_m
+            result = scan_estimate(float(times[done]), poses[done], status, cells_m=present_m)
             gate.follow(lambda result=result: result)
     asked, skipped = stamps_of(odometry.estimate), stamps_of(odometry.skip)
     assert sorted(asked + skipped) == times.tolist()
@@ -244,7 +247,7 @@ def test_after_a_gap_and_at_an_empty_scan_it_is_asked():
 
 def test_at_a_low_rate_and_without_a_local_map_of_known_cells_it_is_always_asked():
     assert asked(steady(), stamps=0.2 * np.arange(40)) == list(range(40))
-    assert asked(steady(), cell_m=None) == list(range(40))
+    assert asked(steady(), cells_m=None) == list(range(40))
 
 
 def test_the_choice_does_not_depend_on_when_the_state_is_saved(rng):
@@ -264,7 +267,7 @@ def test_only_results_that_can_matter_are_waited_for():
         gate.estimate(Scan(np.ones((5, 3)), stamp))
         if index < 8:
             assert not taken
-        result = scan_estimate(stamp, pose, cell_m=CELL_M)
+        result = scan_estimate(stamp, pose, cells_m=CELLS_M)
         gate.follow(lambda index=index, result=result: (taken.append(index), result)[1])
     gate.state()
     assert taken == list(range(12))

@@ -17,6 +17,7 @@ from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER
+from lidarslam.mapping.registration.sampled_scan import CellSizes
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.methods.external import ExternalOdometry
@@ -43,12 +44,12 @@ class Graph:
         time.sleep(self.delay_s)
         self.scans.append(scan)
 
-    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
+    def redrawn_local_map(self, cells_m: CellSizes) -> SurfelMap | None:
         if len(self.scans) - 1 != CLOSED_AT or not self.closes:
             return None
         if self.fails:
             raise InputError("no room left")
-        drawn = SurfelMap(cell_m, CONFIG.radius_m)
+        drawn = SurfelMap(cells_m, CONFIG.radius_m)
         for scan in self.scans[:-1]:
             points = transform_points(scan.T_world_lidar, scan.points) + APART
             drawn.insert(points, np.linspace(-0.2, 0.2, len(points)), scan.T_world_lidar[:3, 3] + APART)
@@ -130,10 +131,10 @@ def test_a_map_that_has_begun_since_stays(room_scans):
     mapper = Mapper(CONFIG, kept_scans=SCANS_LATER)
     for scan in room_scans[:6]:  # the map begins anew with the second one, when the first one's velocity is known
         mapper.process(mapper.sample(scan), Prior())
-    begun, cell_m = mapper.local_map, mapper.local_map.cell_m
-    assert not mapper.redraw(SurfelMap(cell_m, CONFIG.radius_m), 5)
+    begun, cells_m = mapper.local_map, mapper.local_map.cells_m
+    assert not mapper.redraw(SurfelMap(cells_m, CONFIG.radius_m), 5)
     assert mapper.local_map is begun
-    drawn = SurfelMap(cell_m, CONFIG.radius_m)
+    drawn = SurfelMap(cells_m, CONFIG.radius_m)
     assert mapper.redraw(drawn, 4)
     assert mapper.local_map is drawn
     assert mapper.process(mapper.sample(room_scans[6]), Prior()).registered  # to the last four scans, which are in it

@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
+from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -65,7 +66,7 @@ def insert(surfel_map: SurfelMap, points: FloatArray, sensor: Sequence[float] = 
 
 def surfel_map_of(points: FloatArray, cell_m: float, radius_m: float = 100.0) -> SurfelMap:
     """The map of points (N, 3) seen from the origin."""
-    surfel_map = SurfelMap(cell_m, radius_m)
+    surfel_map = SurfelMap(sizes_of_cells(cell_m), radius_m)
     insert(surfel_map, points)
     return surfel_map
 

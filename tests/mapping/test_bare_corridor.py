@@ -10,7 +10,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction
 from lidarslam.mapping.registration.registration import register
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap, constraining_points
 from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.mapped_scan import Fit, measure_fit
@@ -93,7 +93,7 @@ def test_a_scan_that_slid_has_no_evidence_of_the_length_nor_has_one_without_face
 def test_what_nothing_constrains_keeps_the_imus_prediction(without_faces):
     """As uncertain as it was, and it is no measurement."""
     bare_map, bare = without_faces
-    sampled = SampledScan(0.1, CELL, 3.0, Sweep(bare), elevations_of(bare), Sweep(bare))
+    sampled = SampledScan(0.1, sizes_of_cells(CELL), 3.0, Sweep(bare), elevations_of(bare), Sweep(bare))
     sigmas = np.array([0.02] * 3 + [0.1, 0.03, 0.03] + [0.1] * 6)
     start = Prediction(0.1, T_TRUE @ exp([0.0, 0.0, 0.01, 0.0, 0.02, 0.0]), np.zeros(6), np.diag(sigmas**2))
     last = MotionState(0.0, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)

@@ -11,13 +11,14 @@ from lidarslam.mapping.loam.features import EDGE, PLANE
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.registration import are_large, register
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 
 from .shapes import across_x, grass_on_a_slope, on_sides
 
 ORIGIN = np.zeros(3)
 CELL_M = 0.2
+CELLS_M = sizes_of_cells(CELL_M)
 
 
 def kinds_of(edges: FloatArray, planes: FloatArray) -> NDArray[np.int8]:
@@ -27,12 +28,12 @@ def kinds_of(edges: FloatArray, planes: FloatArray) -> NDArray[np.int8]:
 def add(feature_map: FeatureMap, edges: FloatArray, planes: FloatArray, sensor: FloatArray = ORIGIN) -> None:
     points = np.concatenate([edges, planes])
     sweep = Sweep(points, None, kinds_of(edges, planes))
-    scan = SampledScan(0.0, feature_map.cell_m, 1.0, sweep, np.zeros(len(points)), sweep)
+    scan = SampledScan(0.0, feature_map.cells_m, 1.0, sweep, np.zeros(len(points)), sweep)
     feature_map.add(scan, points, sensor)
 
 
 def map_of(edges: FloatArray, planes: FloatArray, cell_m: float = CELL_M, radius_m: float = 100.0) -> FeatureMap:
-    feature_map = FeatureMap(cell_m, radius_m)
+    feature_map = FeatureMap(sizes_of_cells(cell_m), radius_m)
     add(feature_map, edges, planes)
     return feature_map
 
@@ -53,8 +54,8 @@ def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng):
 def test_a_map_of_other_cells_has_the_same_points(rng):
     points = rng.uniform(-3.0, 3.0, (3000, 3))
     fine, coarse = map_of(points[:900], points[900:], 0.1), map_of(points[:900], points[900:], 0.4)
-    resized = fine.resized(0.4)
-    assert fine.resized(0.1) is fine
+    resized = fine.resized(sizes_of_cells(0.4))
+    assert fine.resized(sizes_of_cells(0.1)) is fine
     assert resized.scans == fine.scans
     for found, expected in zip(resized.grids, coarse.grids, strict=True):
         assert found._sums[:, 0].sum() == expected._sums[:, 0].sum()
@@ -87,7 +88,7 @@ def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng):
 def test_a_plane_is_matched_from_the_side_it_was_seen_from_and_its_normal_faces_that(rng):
     points, asked = on_plane(rng, 20_000), on_plane(rng, 50)
     for z in (5.0, -5.0):
-        feature_map = FeatureMap(CELL_M, 100.0)
+        feature_map = FeatureMap(CELLS_M, 100.0)
         add(feature_map, NONE, points, np.array([0.0, 0.0, z]))
         found = feature_map.match(asked, exp([0, 0, 0, 0, 0, z]))
         np.testing.assert_allclose(found.normals, np.tile([0.0, 0.0, np.sign(z - 1.0)], (50, 1)), atol=1e-6)
@@ -151,8 +152,8 @@ def test_the_plane_of_a_ring_that_was_swept_a_little_or_grazes_its_relief_is_non
     """
     n = 6000
     floor = np.column_stack([rng.uniform(-half_m, half_m, n) + away_m, rng.uniform(-2.0, 2.0, n), np.full(n, -1.7)])
-    feature_map, sweep = FeatureMap(CELL_M, 100.0), Sweep(floor, None, kinds_of(NONE, floor))
-    feature_map.add(SampledScan(0.0, CELL_M, 1.0, sweep, np.resize(elevations, n), sweep), floor, ORIGIN)
+    feature_map, sweep = FeatureMap(CELLS_M, 100.0), Sweep(floor, None, kinds_of(NONE, floor))
+    feature_map.add(SampledScan(0.0, CELLS_M, 1.0, sweep, np.resize(elevations, n), sweep), floor, ORIGIN)
     asked = np.column_stack([np.full(50, away_m), rng.uniform(-1.5, 1.5, 50), np.full(50, -1.7)])
     assert len(feature_map.match(asked, np.eye(4))) == (50 if is_found else 0)
 

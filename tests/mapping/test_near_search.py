@@ -12,7 +12,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, OdometryNoise, Prediction, Prior
-from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt, judge
@@ -22,6 +22,7 @@ from lidarslam.mapping.tracking.tracker import Tracker
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 CELL_M, FINS_M, SHELVES_M = 0.05, 0.6, 0.2
+CELLS_M = sizes_of_cells(CELL_M)
 HERE, LOWER = np.eye(4), make_transform(np.eye(3), [0.0, 0.0, -1.5 * SHELVES_M])
 
 Scene = Callable[[np.random.Generator, int], FloatArray]
@@ -54,11 +55,11 @@ def shelves(rng: np.random.Generator, count: int) -> FloatArray:
 
 def matcher_of(scene: Scene, stamp: float) -> ScanMatcher:
     """Of a scan at rest, in a map of eight of which the last was taken at 1 s; its points are of no rings."""
-    rng, surfel_map = np.random.default_rng(0), SurfelMap(CELL_M, 20.0)
+    rng, surfel_map = np.random.default_rng(0), SurfelMap(CELLS_M, 20.0)
     for _ in range(8):
         surfel_map.insert(scene(rng, 6000), rng.uniform(-0.2, 0.2, 6000), np.zeros(3))
     points = scene(rng, 2500)
-    scan = SampledScan(stamp, CELL_M, 2.0, Sweep(points), rng.uniform(-0.2, 0.2, 2500), Sweep(points))
+    scan = SampledScan(stamp, CELLS_M, 2.0, Sweep(points), rng.uniform(-0.2, 0.2, 2500), Sweep(points))
     last = MotionState(1.0, HERE, np.zeros(6), 1e-6 * np.eye(12))
     return ScanMatcher(scan, last, surfel_map, MappingConfig(), Budget())
 

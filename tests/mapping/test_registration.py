@@ -13,6 +13,7 @@ from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.registration.gauss_newton import find_degeneracy, geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.registration import register as register_sweep
+from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .runs import assert_near
@@ -137,7 +138,7 @@ def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(corrido
 def test_too_few_points_make_no_pose(box_map, rng, count, suffices):
     few = snapshot(rng, count=count)
     assert (register_sweep(few, predicted(T_TRUE), box_map, with_velocity=False) is not None) == suffices
-    assert register_sweep(few, predicted(T_TRUE), SurfelMap(CELL, 10.0), with_velocity=False) is None
+    assert register_sweep(few, predicted(T_TRUE), SurfelMap(sizes_of_cells(CELL), 10.0), with_velocity=False) is None
 
 
 def test_outliers_do_not_move_the_pose(box_map, rng):
@@ -183,7 +184,7 @@ def test_errors_are_as_large_as_the_covariance_says(room):
     velocity, sigma_m = np.array([0.0, 0.0, 0.3, 0.8, 0.05, 0.0]), 0.02
     start, squared = exp([0.0, 0.0, 0.3, -4.0, 0.0, -0.4]), []
     for seed in range(10):
-        local_map = SurfelMap(CELL, 100.0)
+        local_map = SurfelMap(sizes_of_cells(CELL), 100.0)
         for k in range(3):
             T = start @ exp(0.1 * k * velocity)
             points, times = noisy_scan(room, 100 * seed + k, T, velocity, sigma_m, 6_000)

@@ -84,11 +84,21 @@ def test_cells_are_a_share_of_the_median_range_within_bounds(rng, radius_m, cell
     (0.4, 64, 30.0), (2.0, 16, 30.0), (4.0, 8, 1.4 / np.deg2rad(4.0)), (5.6, 16, 19.0)
 ])  # fmt: skip
 def test_cells_are_larger_where_rings_are_farther_apart(spacing_deg, rings, per_range):
+    assert sample(ringed_shell(spacing_deg, rings, 12.0)).cell_m == pytest.approx(12.0 / per_range, rel=0.02)
+
+
+@pytest.mark.parametrize(("spacing_deg", "rings", "coarsest_m"), [(0.4, 64, 0.2), (2.0, 16, 0.35), (4.0, 8, 0.7)])
+def test_where_walls_are_close_the_coarsest_cells_have_floor_of_two_rings(spacing_deg, rings, coarsest_m):
+    sampled = sample(ringed_shell(spacing_deg, rings, 1.3))
+    assert sampled.cells_m == pytest.approx((0.05, 0.1, coarsest_m), rel=0.02)
+
+
+def ringed_shell(spacing_deg: float, rings: int, radius_m: float) -> Scan:
     elevation = np.deg2rad(spacing_deg * (np.arange(rings) - 0.5 * (rings - 1))).repeat(300)
     azimuth = np.tile(np.linspace(0.0, 2.0 * np.pi, 300, endpoint=False), rings)
     flat = np.cos(elevation)
-    points = 12.0 * np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-    assert sample(Scan(points, 0.0)).cell_m == pytest.approx(12.0 / per_range, rel=0.02)
+    points = radius_m * np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    return Scan(points, 0.0)
 
 
 def test_a_given_cell_stays_whatever_the_scene(rng):

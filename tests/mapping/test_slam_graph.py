@@ -17,6 +17,7 @@ from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.keyframe_graph import GraphScan, KeyframeGraph
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
 
 from .runs import assert_near
 
@@ -242,7 +243,7 @@ def test_the_local_map_is_drawn_anew_where_the_second_round_is(walk):
     graph, redrawn = SlamGraph(CONFIG, local_radius_m=8.0), []
     for i, scan in enumerate(walk.scans()):
         graph.add(scan)
-        local_map = graph.redrawn_local_map(CELL_M)
+        local_map = graph.redrawn_local_map(sizes_of_cells(CELL_M))
         if local_map is not None:
             redrawn.append((i, local_map))
         graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
@@ -267,7 +268,7 @@ def test_a_local_map_that_is_right_is_left_alone(walk):
     right = replace(walk, estimate=walk.truth)
     for scan in right.scans():
         graph.add(scan)
-        assert graph.redrawn_local_map(CELL_M) is None
+        assert graph.redrawn_local_map(sizes_of_cells(CELL_M)) is None
         graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
     result = graph.finish()
     assert sum(result.inliers) >= 2

@@ -11,11 +11,13 @@ from lidarslam.mapping.global_map.voxels import Layout, Rows
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.mapping.pose_graph.keyframe_graph import Keyframe
 from lidarslam.mapping.pose_graph.submap_placement import SCANS_LATER, Drawn, SubmapPlacement, draw_local_map
+from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .shapes import insert
 
 CELL_M, RADIUS_M, SPACING_M = 0.3, 10.0, 3.0
+CELLS_M = sizes_of_cells(CELL_M)
 WALL_M, OFF_M = 6.1, 0.1
 
 
@@ -44,7 +46,7 @@ def off_wall_m(local_map: SurfelMap, half_size_m: float) -> float:
 def test_scans_that_follow_do_not_shift_what_was_drawn(rng):
     """They are registered to it; their own errors would repeat, and carry the surfaces along."""
     submaps = [(np.eye(4), means_of_wall(rng, WALL_M, 2.5)) for _ in range(2)]
-    drawn = draw_local_map(submaps, CELL_M, RADIUS_M)
+    drawn = draw_local_map(submaps, CELLS_M, RADIUS_M)
     assert off_wall_m(drawn, 1.5) < 0.005
     for _ in range(20):
         insert(drawn, means_of_wall(rng, WALL_M + OFF_M, 2.5)[:, :3].astype(np.float64))
@@ -59,7 +61,7 @@ def laid(
     for pose in poses:
         laid.follow(pose)
     members = np.ones(len(targets), dtype=np.bool_)
-    drawn = laid.redrawn(targets, members, CELL_M, lambda key: VoxelMeans(submaps[key], Layout()), scan=40)
+    drawn = laid.redrawn(targets, members, CELLS_M, lambda key: VoxelMeans(submaps[key], Layout()), scan=40)
     return laid, drawn
 
 

@@ -5,12 +5,14 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.local_map import LEVELS, Correspondences
+from lidarslam.mapping.registration.local_map import Correspondences
+from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .shapes import across_x, grass_on_a_slope, insert, on_sides, surfel_map_of
 
 CELL = 0.4
+CELLS = sizes_of_cells(CELL)
 HALF = np.array([7.0, 5.0, 2.0])
 HERE = np.eye(4)
 CORNER = (4.0, 5.0)  # x and y of its walls
@@ -52,14 +54,14 @@ def test_where_fine_cells_show_nothing_coarse_ones_do(rng):
     assert distances(asked, matches).max() < 1e-5
 
 
-@pytest.mark.parametrize("first_level", range(len(LEVELS)))
+@pytest.mark.parametrize("first_level", range(len(CELLS)))
 def test_coarse_grids_reach_farther(rng, first_level):
     """Alone they reach at least as far above the floor as their own cells, and not three times as far."""
     local_map = surfel_map_of(floor_points(rng, 40_000, z=-0.01), CELL)
-    cell_m = CELL * LEVELS[first_level]
+    cell_m = CELLS[first_level]
     above = floor_points(rng, 100, half_size=1.0, z=0.9 * cell_m)
     assert len(local_map.match(above, make_transform(np.eye(3), [0.0, 0.0, 5.0]), first_level)) == 100
-    beyond = above + np.array([0.0, 0.0, 3.0 * CELL * LEVELS[-1]])
+    beyond = above + np.array([0.0, 0.0, 3.0 * CELLS[-1]])
     assert len(local_map.match(beyond, make_transform(np.eye(3), [0.0, 0.0, 9.0]), first_level)) == 0
 
 
@@ -69,7 +71,7 @@ def test_finer_grids_are_left_out_on_request(rng):
     local_map = surfel_map_of(np.concatenate([low, high]), CELL)
     asked = floor_points(rng, 200, half_size=2.0)
     assert distances(asked, local_map.match(asked, HERE, 0)).max() < 1e-5
-    assert distances(asked, local_map.match(asked, HERE, len(LEVELS) - 1)).min() > 0.01
+    assert distances(asked, local_map.match(asked, HERE, len(CELLS) - 1)).min() > 0.01
 
 
 @pytest.mark.parametrize(("elevation_deg", "walls"), [(-4.0, CORNER), (0.5, CORNER), (8.0, CORNER), (-5.7, None)])
@@ -81,7 +83,7 @@ def test_a_ring_bent_around_a_corner_or_on_the_ground_is_no_plane(elevation_deg,
 @pytest.mark.parametrize(("elevation_deg", "counts"), [(-15.0, True), (-1.0, False)])
 def test_what_a_ring_draws_from_afar_as_the_sensor_pitches_is_no_plane(elevation_deg, counts):
     """The ground rises by 15 degrees where the pitch is off by ever more: no other ring contradicts that."""
-    local_map = SurfelMap(CELL, 100.0)
+    local_map = SurfelMap(CELLS, 100.0)
     for step in range(12):
         moved = np.array([0.08 * step, 0.0, 0.02 * step])
         points = ring(elevation_deg) + moved
@@ -110,7 +112,7 @@ def test_the_map_stays_around_the_sensor(rng):
 @pytest.mark.parametrize("factor", [0.45, 0.8, 2.0])
 def test_planes_stay_in_place_when_cells_change_their_size(rng, factor):
     """By more than two it changes when the sensor leaves a hall for a corridor, or the other way round."""
-    resized = surfel_map_of(on_sides(rng, HALF, 60_000), CELL).resized(CELL * factor)
+    resized = surfel_map_of(on_sides(rng, HALF, 60_000), CELL).resized(sizes_of_cells(CELL * factor))
     assert resized.cell_m == CELL * factor
     asked = on_sides(rng, HALF, 2_000, margin_m=max(1.0, 2 * CELL * factor))
     matches = resized.match(asked, HERE)
@@ -125,7 +127,8 @@ def test_grazed_ground_is_still_known_when_cells_change_their_size(rng):
     distance = 1.0 / np.tan(np.deg2rad(-elevation_deg))
     ground = np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), np.full(20_000, -1.0)])
     local_map = surfel_map_of(ground, CELL)
-    before, after = (len(m.match(ground[:500], HERE)) for m in (local_map, local_map.resized(2.0 * CELL)))
+    maps = local_map, local_map.resized(sizes_of_cells(2.0 * CELL))
+    before, after = (len(one.match(ground[:500], HERE)) for one in maps)
     assert after > 0.8 * before > 350
 
 
@@ -167,7 +170,7 @@ def test_a_restored_map_that_has_forgotten_goes_on_to_the_last_bit(rng, through_
         sensor = np.array([2.0 * step, 0.0, 0.0])
         insert(local_map, np.random.default_rng(step).uniform(-4.0, 4.0, (3000, 3)) + sensor, sensor)
 
-    whole, restored = SurfelMap(0.3, 6.0), SurfelMap(0.3, 6.0)
+    whole, restored = (SurfelMap(sizes_of_cells(0.3), 6.0) for _ in range(2))
     for step in range(4):
         add(whole, step)
     restored.restore(through_disk(whole.state()))

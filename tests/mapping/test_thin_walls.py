@@ -8,6 +8,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import Correspondences
+from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
 from lidarslam.mapping.surfels.grid import MEAN, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import OTHER_SIDE, VoxelHash, key_cells, point_keys
@@ -29,7 +30,7 @@ def show(grid: SurfelGrid, points: FloatArray, view: Sequence[float]) -> None:
 
 def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float], sides: list[int]) -> SurfelMap:
     """A map of a wall with faces at these x, of which scan after scan saw one side."""
-    local_map, half_size = SurfelMap(cell_m, 100.0), 6.0 * cell_m
+    local_map, half_size = SurfelMap(sizes_of_cells(cell_m), 100.0), 6.0 * cell_m
     for side in sides:
         points = across_x(rng, faces[side], half_size, 1_000)
         local_map.match(points, make_transform(np.eye(3), SENSORS[side]))  # as a scan is before it is added
@@ -70,7 +71,7 @@ def test_each_side_of_a_wall_within_a_cell_pulls_those_who_see_it(rng, cell_m, t
 @pytest.mark.parametrize("factor", [0.5, 2.2])
 def test_both_sides_stay_when_cells_change_their_size(rng, factor):
     cell_m, faces = 0.25, (2.03, 2.13)
-    resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(cell_m * factor)
+    resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(sizes_of_cells(cell_m * factor))
     for side in (0, 1):
         asked = across_x(rng, faces[side], 2.0 * cell_m, 500)
         matches = first_matches(resized, asked, side)
