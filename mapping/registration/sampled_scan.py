@@ -27,9 +27,9 @@ _FEWEST_CELLS, _CELLS_PER_SPACING = 19.0, 1.4
 _LEAST_CELL_M, _MOST_CELL_M = 0.05, 1.0
 # Resolutions of a map, in its finest cells.
 _LEVELS = (1, 2, 4)
-# The coarsest cells are as wide as the gap between rings at this range: where walls are close, only floor and ceiling
-# constrain the height, and they are seen at 5 m and more, where a smaller cell has points of a single ring.
-_GAP_RANGE_M = 10.0
+# The least size of the coarsest where rings are farther apart than this: with walls close by, only floor and ceiling
+# constrain the height, and they are seen at 5 m and more, where smaller cells have points of a single ring.
+_SPARSE_RINGS_RAD, _LEAST_COARSEST_M = np.deg2rad(1.6), 0.4
 # Largest cells for planes through neighbours: in sparser maps, these are too far apart.
 MOST_SPACING_M = 0.4
 _CLOSE_M = 3.0
@@ -131,7 +131,8 @@ class Sampler(Stateful):
         rings = 0.0 if self._has_rings is False else 1.0
         elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
         keypoints = sweep.take(self._keypoints(sweep, cell_m))
-        cells_m = sizes_of_cells(cell_m, _GAP_RANGE_M * self._spacing_rad)
+        coarsest_m = _LEAST_COARSEST_M if self._spacing_rad > _SPARSE_RINGS_RAD else 0.0
+        cells_m = sizes_of_cells(cell_m, coarsest_m)
         return SampledScan(scan.stamp, cells_m, self._range_m, sweep, elevations, keypoints)
 
     def _cell_m(self, squared: FloatArray) -> float:
