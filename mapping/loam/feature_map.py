@@ -14,7 +14,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.local_map import LocalMap, Matcher, Surfaces, vertical_of
+from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces, vertical_of
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
@@ -400,7 +400,7 @@ class FeatureMap(LocalMap):
     def __init__(self, cells_m: CellSizes, radius_m: float) -> None:
         super().__init__(cells_m, radius_m)
         self._has_rings = False
-        self._edges, self._planes = ([VoxelGrid(cell_m) for cell_m in cells_m] for _ in range(2))
+        self._edges, self._planes = ([VoxelGrid(cell_m) for cell_m in cells_m[: COARSE + 1]] for _ in range(2))
 
     @property
     def grids(self) -> list[VoxelGrid]:

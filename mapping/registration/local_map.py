@@ -13,6 +13,9 @@ from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
 
+# The resolution that registrations of uncertain predictions begin with. A coarser one only has the surfaces of points
+# without any other.
+COARSE = 2
 # In a map of fewer scans, planes are of few points: their normals are uncertain.
 _YOUNG_SCANS = 5
 # Surfaces within this cosine of the z axis are floors or ceilings.
@@ -143,7 +146,7 @@ class LocalMap(Stateful, ABC):
 
     @abstractmethod
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Planes in the coarsest resolution at points (N, 3) of the world, seen from (3,).
+        """Planes in the coarse resolution at points (N, 3) of the world, seen from (3,).
 
         Unit normals (N, 3), and standard deviations (N,) along them, infinite where there is no plane.
         """

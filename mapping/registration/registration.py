@@ -23,7 +23,7 @@ from lidarslam.mapping.registration.gauss_newton import (
     geman_mcclure,
     point_to_plane_jacobian,
 )
-from lidarslam.mapping.registration.local_map import LocalMap, Matcher, Surfaces
+from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.
@@ -121,7 +121,7 @@ def register(
     try:
         prior = predicted = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
         inflation = uniform = np.ones(len(sweep))
-        for level in reversed(range(len(local_map.cells_m))) if coarse_first else (0,):
+        for level in range(COARSE, -1, -1) if coarse_first else (0,):
             cell_m = local_map.cells_m[level]
             matcher = local_map.matcher(sweep, level, prediction.is_inertial)
             for _ in range(coarse if level else most - iterations):
@@ -185,7 +185,7 @@ def with_mean_velocity(
 def are_large(local_map: LocalMap, points: FloatArray, normals: FloatArray, sensor: FloatArray) -> NDArray[np.bool_]:
     """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), are part of large ones."""
     coarse, spread_m = local_map.coarse_planes(points, sensor)
-    is_thin = spread_m < _MOST_THICKNESS * local_map.cells_m[-1]
+    is_thin = spread_m < _MOST_THICKNESS * local_map.cells_m[COARSE]
     return np.asarray(is_thin & (np.abs(np.einsum("ij,ij->i", normals, coarse)) > _SAME_COSINE))
 
 

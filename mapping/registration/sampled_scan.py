@@ -27,9 +27,9 @@ _FEWEST_CELLS, _CELLS_PER_SPACING = 19.0, 1.4
 _LEAST_CELL_M, _MOST_CELL_M = 0.05, 1.0
 # Resolutions of a map, in its finest cells.
 _LEVELS = (1, 2, 4)
-# The least size of the coarsest where rings are farther apart than this: with walls close by, only floor and ceiling
+# Where rings are farther apart than this, there are larger cells, too: with walls close by, only floor and ceiling
 # constrain the height, and they are seen at 5 m and more, where smaller cells have points of a single ring.
-_SPARSE_RINGS_RAD, _LEAST_COARSEST_M = np.deg2rad(1.6), 0.4
+_SPARSE_RINGS_RAD, _LARGE_CELL_M = np.deg2rad(1.6), 0.4
 # Largest cells for planes through neighbours: in sparser maps, these are too far apart.
 MOST_SPACING_M = 0.4
 _CLOSE_M = 3.0
@@ -131,8 +131,7 @@ class Sampler(Stateful):
         rings = 0.0 if self._has_rings is False else 1.0
         elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
         keypoints = sweep.take(self._keypoints(sweep, cell_m))
-        coarsest_m = _LEAST_COARSEST_M if self._spacing_rad > _SPARSE_RINGS_RAD else 0.0
-        cells_m = sizes_of_cells(cell_m, coarsest_m)
+        cells_m = sizes_of_cells(cell_m, are_rings_sparse=self._spacing_rad > _SPARSE_RINGS_RAD)
         return SampledScan(scan.stamp, cells_m, self._range_m, sweep, elevations, keypoints)
 
     def _cell_m(self, squared: FloatArray) -> float:
@@ -166,10 +165,10 @@ class Sampler(Stateful):
         return evenly(central_per_cell(sweep.points, _KEYPOINT_SPACING * cell_m), self._config.keypoints)
 
 
-def sizes_of_cells(finest_m: float, coarsest_m: float = 0.0) -> CellSizes:
-    """The sizes of a map with such finest cells; the coarsest are at least of another size."""
-    sizes_m = [finest_m * level for level in _LEVELS]
-    return *sizes_m[:-1], max(sizes_m[-1], coarsest_m)
+def sizes_of_cells(finest_m: float, are_rings_sparse: bool = False) -> CellSizes:
+    """The sizes of the cells of a map by the finest: three, or four for sparse rings where walls are close."""
+    sizes_m = tuple(finest_m * level for level in _LEVELS)
+    return (*sizes_m, _LARGE_CELL_M) if are_rings_sparse and sizes_m[-1] < _LARGE_CELL_M else sizes_m
 
 
 def has_rings(scan: Scan) -> bool:

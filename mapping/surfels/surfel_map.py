@@ -1,4 +1,4 @@
-"""Local map of surfels in three sizes of cells, and the point-to-plane correspondences of a scan with it.
+"""Local map of surfels in several sizes of cells, and the point-to-plane correspondences of a scan with it.
 
 The columns of surfels (M, 15) are as in `mapping.surfels.grid`.
 """
@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
-from lidarslam.mapping.registration.local_map import LocalMap, Matcher, Surfaces, vertical_of
+from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces, vertical_of
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
@@ -245,7 +245,7 @@ class SurfelMap(LocalMap):
         return vertical_of(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL])
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        grid = self._grids[-1]
+        grid = self._grids[COARSE]
         rows = grid.find(points, np.array(sensor))
         planes = grid.refreshed(rows)[rows]
         is_plane = (rows >= 0) & (planes[:, IS_PLANE] > 0.0)

@@ -10,7 +10,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.local_map import COARSE, LocalMap
 from lidarslam.mapping.registration.registration import register, with_mean_velocity
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.budget import Budget, Steps
@@ -197,6 +197,6 @@ def start_score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
 def _distances(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> tuple[FloatArray, FloatArray]:
     """Normals (M, 3) of the surfaces in the coarsest cells, and distances (M,) in half-weight units."""
     world = transform_points(T_world_lidar, points)
-    matches = local_map.match(world, T_world_lidar, len(local_map.cells_m) - 1)
+    matches = local_map.match(world, T_world_lidar, COARSE)
     distances = matches.residuals(world.take(matches.index, axis=0))
     return matches.normals, distances / (_HALF_CELLS * local_map.cell_m)
