@@ -21,8 +21,7 @@ from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracker import Tracker
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
-CELL_M, FINS_M, SHELVES_M = 0.05, 0.6, 0.2
-CELLS_M = sizes_of_cells(CELL_M)
+CELLS_M, FINS_M, SHELVES_M = sizes_of_cells(0.05), 0.6, 0.2
 HERE, LOWER = np.eye(4), make_transform(np.eye(3), [0.0, 0.0, -1.5 * SHELVES_M])
 
 Scene = Callable[[np.random.Generator, int], FloatArray]
@@ -117,7 +116,7 @@ def test_another_place_is_a_rival_where_an_odometry_leaves_the_motion_open(prior
     if prior.T_prev_curr is None or sigma_m < 0.1:
         assert found.rival is None
     else:
-        assert 4.0 * CELL_M < abs(found.rival[0]) < 2.0 * sigma_m
+        assert 4.0 * CELLS_M[0] < abs(found.rival[0]) < 2.0 * sigma_m
         np.testing.assert_allclose(found.rival[1:], 0.0, atol=0.02)
         assert found.unconstrained == ("x",)
 

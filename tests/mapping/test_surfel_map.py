@@ -182,3 +182,16 @@ def test_a_restored_map_that_has_forgotten_goes_on_to_the_last_bit(rng, through_
         found = restored.match(queries, np.eye(4))
         for name, value in vars(whole.match(queries, np.eye(4))).items():
             np.testing.assert_array_equal(getattr(found, name), value)
+
+
+@pytest.mark.parametrize("are_sparse", [False, True])
+def test_only_larger_cells_have_a_ceiling_that_one_scan_of_sparse_rings_sees_from_afar(are_sparse):
+    """1 m above the sensor, at 3.7 m and more, where the rings are 0.6 m apart."""
+    azimuth, elevation = np.meshgrid(np.deg2rad(np.arange(-14.0, 14.0, 0.4)), np.deg2rad([15.0, 13.0]))
+    away = 1.0 / np.tan(elevation)
+    ceiling = np.stack([away * np.cos(azimuth), away * np.sin(azimuth), np.ones_like(away)], axis=-1).reshape(-1, 3)
+    local_map = SurfelMap(sizes_of_cells(0.05, are_sparse), 100.0)
+    local_map.insert(ceiling, elevation.ravel(), np.zeros(3))
+    planes = local_map.match(ceiling, HERE)
+    assert len(planes) == are_sparse * len(ceiling)
+    np.testing.assert_allclose(planes.normals[:, 2], -1.0, atol=1e-3)
