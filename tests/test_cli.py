@@ -7,6 +7,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from click.shell_completion import BashComplete
 
 from lidarslam.cli import main
 from lidarslam.commands.options import take_config
@@ -185,7 +186,27 @@ def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path, recording):
 def test_verbose_says_what_is_chosen_before_the_command_or_after(recording, tmp_path, before, caplog):
     command = ["run", recording, "--out", tmp_path / "run", "--odometry", "constant-velocity", "--no-report"]
     lidarslam(*(["-v", *command] if before else [*command, "-v"]), "--stop", 3)
-    assert "reader: scan-folder" in caplog.text
+    said = [record.message for record in caplog.records]
+    for words in (
+        "reader: scan-folder, because the names fit",
+        "time of a point: none is known",
+        "3 scans of 5, to ",
+        "odometry: constant-velocity; mapping: surfels; pose graph: off",
+        "new local map at ",
+        "voxels of the map: ",
+        "writing the results of 3 scans",
+    ):
+        assert sum(line.startswith(words) for line in said) == 1, words
     caplog.clear()
     lidarslam(*command, "--stop", 3, "--overwrite")
     assert not caplog.records
+
+
+@pytest.mark.parametrize(("line", "expected"), [
+    ("run --mapping ", ["plain surfels", "plain loam", "plain off"]), ("run -c ind", ["file ind", "plain indoor"]),
+    ("compare --benchmark sim", ["file sim", "plain simulated"]), ("run x -o r", ["file r"]),
+])  # fmt: skip
+def test_words_are_completed(line, expected):
+    *words, last = line.split(" ")
+    completions = BashComplete(main, {}, "lidarslam", "_LIDARSLAM_COMPLETE").get_completions(words, last)
+    assert [f"{item.type} {item.value}" for item in completions] == expected

@@ -10,7 +10,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angl
 from lidarslam.core.tracking import Degeneracy
 from lidarslam.mapping.motion.deskew import Sweep, move
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.registration.gauss_newton import find_degeneracy, point_to_plane_jacobian
+from lidarslam.mapping.registration.gauss_newton import find_degeneracy, geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.registration import register as register_sweep
 from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
@@ -213,6 +213,13 @@ def test_the_jacobian_is_the_derivative_with_a_motion_from_the_right(rng):
         ahead, behind = (transform_points(exp(sign * step * np.eye(6)[axis]), points) for sign in (1.0, -1.0))
         numeric = np.einsum("ij,ij->i", ahead - behind, normals) / (2.0 * step)
         np.testing.assert_allclose(J[:, axis], numeric, atol=1e-8)
+
+
+def test_weights_are_the_information_nearby_and_vanish_far_away():
+    weights = geman_mcclure(np.array([0.0, 0.1, 10.0]), 0.1**2, 0.02**2)
+    assert weights[0] == pytest.approx(1.0 / 0.02**2)
+    assert weights[1] == pytest.approx(0.25 / 0.02**2)
+    assert weights[2] < 1e-6 * weights[0]
 
 
 def wall(rng: np.random.Generator, axis: int, at: float, reach: tuple[float, float, float], count: int = 500) -> Scene:
