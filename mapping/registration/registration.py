@@ -49,7 +49,7 @@ _FREEDOM = 4.0
 # A velocity that differs by less than this over the interval needs no second compensation.
 _SAME_ROTATION, _SAME_TRANSLATION_M = np.deg2rad(0.1), 0.01
 
-# The plane of a point is part of a large one, as a wall or floor, where the coarsest cell has a plane of nearly its
+# The plane of a point is part of a large one, as a wall or floor, where the coarse cell has a plane of nearly its
 # normal, no thicker than this share of that cell.
 _SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
 # Large surfaces suffice where they constrain every direction this many times as well as the noise of their normals.

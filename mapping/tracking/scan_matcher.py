@@ -195,7 +195,7 @@ def start_score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
 
 
 def _distances(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> tuple[FloatArray, FloatArray]:
-    """Normals (M, 3) of the surfaces in the coarsest cells, and distances (M,) in half-weight units."""
+    """Normals (M, 3) of the surfaces in the coarse cells, and distances (M,) in half-weight units."""
     world = transform_points(T_world_lidar, points)
     matches = local_map.match(world, T_world_lidar, COARSE)
     distances = matches.residuals(world.take(matches.index, axis=0))
