@@ -86,17 +86,22 @@ def smoothed_start(
     scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
     and the motions of the first half are those that this map shows, as is the first sweep's turn rate where the motion
     to the second would bend it. None is known where that loses track, or fits worse than in order, as on stairs, unless
-    the motions in order are hardly constrained. A new IMU's samples are used in both directions of time.
+    the motions in order are hardly constrained; nor where the sensor rests by its IMU. The IMU's samples are used in
+    both directions of time; where scans refute the rest, its attribute `may_rest` ends.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
-    ordered, taken, needed, least = _Tracking(unlimited, inertial), list[Scan](), False, np.inf
+    own = None if inertial is None else inertial.anew()
+    ordered, taken, needed, least = _Tracking(unlimited, own), list[Scan](), False, np.inf
     for scan in scans:
         mapped = ordered.process(scan, Prior())
         taken.append(scan)
         needed |= not ordered.has_rings or mapped.status is not Status.OK
-        if inertial is not None and len(taken) == TRIED:
-            is_long = taken[1].stamp - taken[0].stamp > _LONG_S
-            if is_long or not all(one.fit is None or one.fit.is_constrained for one in ordered.results):
+        if inertial is not None and own is not None and len(taken) == TRIED:
+            if own.is_at_rest:
+                return {}
+            inertial.may_rest, is_long = own.may_rest, taken[1].stamp - taken[0].stamp > _LONG_S
+            are_constrained = all(one.fit is None or one.fit.is_constrained for one in ordered.results)
+            if is_long or not (own.may_rest and are_constrained):
                 ordered = _likeliest(taken, unlimited, inertial, _quality if is_long else _constraint)
                 needed, least = True, _LEAST_CONSTRAINT
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not (needed or ordered.is_bent)):

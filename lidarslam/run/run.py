@@ -325,7 +325,7 @@ def _start(config: Config, recording: Recording, chosen: range, inertial: "Inert
         scans = take_in(recording, chosen, Faults())
         if inertial is None:
             return smoothed_start(scans, config.mapping)
-        return smoothed_start(map(inertial.gyroscope.evened, scans), config.mapping, inertial.anew())
+        return smoothed_start(map(inertial.gyroscope.evened, scans), config.mapping, inertial)
     return {}
 
 

@@ -23,6 +23,9 @@ KNOWN_LEVER_M, UNKNOWN_LEVER_M = 0.02, 0.3
 _LEVEL_S, _STEP_S = 1.0, 0.02
 # Dead reckoning by the IMU alone ends after this time, seconds.
 _DEAD_RECKONING_S = 2.0
+# At rest, samples are steady from this time before a stamp until that after it, seconds, and scans are registered
+# within this distance.
+_REST_S, _REST_M = (0.25, 0.5), 0.05
 # Gravity is measured this often, seconds, where its direction is known to this, radians.
 _EVERY_S, _LEVEL_SIGMA = 1.0, np.deg2rad(0.5)
 # The vertical of the world is replaced by one whose deviation is smaller by this factor.
@@ -44,6 +47,7 @@ class Inertial(Stateful):
 
     _window: InertialWindow
     _registered_s: float | None  # stamp of the last registered scan
+    _rest_position: Annotated[FloatArray, Shape(3)] | None  # of a LiDAR that has been at rest since the first scan
     _measured_s: float | None  # stamp at which gravity was measured last
     _up_world: Annotated[FloatArray, Shape(3)] | None  # unit, as first known well
     _up_sigma: float  # radians
@@ -55,11 +59,13 @@ class Inertial(Stateful):
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray, lever_sigma_m: float = KNOWN_LEVER_M) -> None:
         self._extrinsics, self._lever_sigma_m = T_lidar_imu, lever_sigma_m
+        self.may_rest = True  # where its samples are steady; otherwise it moves at a constant velocity
         self.is_mounting_known = lever_sigma_m < UNKNOWN_LEVER_M  # given; else its rotation was found
         self._integrate(samples)
         self._window = InertialWindow(self.gyroscope, T_lidar_imu[:3, 3], lever_sigma_m)
         self._predicted: Knot | None = None
         self._registered_s, self._measured_s, self.direction = None, None, None
+        self._rest_position = None
         self._up_world, self._up_sigma = None, np.pi
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
 
@@ -70,7 +76,9 @@ class Inertial(Stateful):
 
     def anew(self) -> "Inertial":
         """A new instance with the same samples."""
-        return Inertial(self._samples, self._extrinsics, self._lever_sigma_m)
+        other = Inertial(self._samples, self._extrinsics, self._lever_sigma_m)
+        other.may_rest = self.may_rest
+        return other
 
     def reversed(self, about_s: float) -> "Inertial":
         """A new instance with the same samples, with time reversed about an instant."""
@@ -101,6 +109,11 @@ class Inertial(Stateful):
         return warnings
 
     @property
+    def is_at_rest(self) -> bool:
+        """Whether the sensor has been at rest since the first scan, by its IMU and by the registrations."""
+        return self._rest_position is not None
+
+    @property
     def T_lidar_imu(self) -> FloatArray:
         """(4, 4) extrinsic calibration, its position as estimated."""
         lever = self._extrinsics[:3, 3] if self._window.last is None else self._window.last.lever
@@ -119,11 +132,16 @@ class Inertial(Stateful):
     def update(self, scan: Scan, mapped: MappedScan) -> None:
         """Update with the result of a scan: biases, velocity and gravity follow it."""
         knot, self._predicted, self.direction = self._predicted, None, None
-        if knot is None or (mapped.registered and not mapped.is_connected):
+        has_moved = self._has_moved(mapped)
+        self.may_rest &= not has_moved
+        if not (self.may_rest and self._is_steady(scan.stamp)):
+            self._rest_position = None
+        if knot is None or has_moved or (mapped.registered and not mapped.is_connected):
             self._up_world = None
             if mapped.registered or self._window.last is None:
                 self._begin(scan, mapped.state.T_world_lidar)
             return
+        knot = replace(knot, is_at_rest=self.is_at_rest)
         if mapped.registered and mapped.measured is not None:
             self._compare(knot, mapped)
             root = _root_of(mapped.measured.information)
@@ -150,6 +168,15 @@ class Inertial(Stateful):
             up, self._up_world, across @ covariance[:3, :3] @ across.T + self._up_sigma**2 * np.eye(3)
         )
 
+    def _is_steady(self, stamp: float) -> bool:
+        return self.gyroscope.is_steady(stamp - _REST_S[0], stamp + _REST_S[1])
+
+    def _has_moved(self, mapped: MappedScan) -> bool:
+        """Whether a sensor that is at rest by its IMU was registered elsewhere: it moves at a constant velocity."""
+        if self._rest_position is None or not mapped.registered:
+            return False
+        return bool(np.linalg.norm(mapped.state.T_world_lidar[:3, 3] - self._rest_position) > _REST_M)
+
     def _integrate(self, samples: ImuSamples) -> None:
         self._samples = samples
         self.gyroscope = Preintegration(samples, self._extrinsics[:3, :3])
@@ -161,7 +188,10 @@ class Inertial(Stateful):
             at = self.gyroscope.turn(scan.stamp, instants[0], np.zeros(3))
             up = at @ np.einsum("nij,nj->i", turns[:-1], self.gyroscope.means(instants)[:, 3:])
             is_level = self._registered_s is not None and scan.stamp - self._registered_s < _DEAD_RECKONING_S
-            self._window.begin(scan.stamp, T_world_lidar, np.diag(1.0 / _REGISTRATION), up, is_level)
+            root = np.diag(1.0 / _REGISTRATION)
+            if self._window.last is None and self.may_rest and self._is_steady(scan.stamp):
+                self._rest_position = T_world_lidar[:3, 3].copy()
+            self._window.begin(scan.stamp, T_world_lidar, root, up, is_level, self.is_at_rest)
             self._registered_s = scan.stamp
 
     def _lidar_state(self, scan: Scan, knot: Knot, covariance: FloatArray) -> MotionState:

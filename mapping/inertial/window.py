@@ -43,6 +43,11 @@ _CONVERGED = 0.005
 _SIZE = 25
 _POSE, _VELOCITY, _BIASES, _WORLD = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 21)
 SCALE, LEVER = 21, slice(22, 25)
+# Samples are steady where their variance is at most this many times that of their white noise, and their mean rate,
+# which has the bias, at most this, rad/s.
+_STEADY, _STEADY_RATE, _FEWEST_STEADY = 3.0, 0.05, 20
+# Standard deviation of the velocity at rest, m/s.
+_REST = 0.01
 # Standard deviations of the first state: velocity, m/s; biases of accelerometer and gyroscope; tilt; scale.
 _SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT, _SCALE = 15.0, 0.15, 0.01, np.deg2rad(5.0), 0.1
 # Walk of gravity in the world, which follows the drift of the map: rad/sqrt(s); nothing else of the calibration walks.
@@ -90,6 +95,18 @@ class Preintegration:
         near = self._stamps[max(0, before - 1) : after + 1]
         at_ends = first_s >= near[0] - self._longest_s and last_s <= near[-1] + self._longest_s if len(near) else False
         return bool(at_ends and (np.diff(near) <= self._longest_s).all())
+
+    def is_steady(self, first_s: float, last_s: float) -> bool:
+        """Whether samples scatter as their white noise does, and do not turn: at rest, or at a constant velocity.
+
+        The white noise is that of their second differences.
+        """
+        begin, end = np.searchsorted(self._stamps, (first_s, last_s))
+        rows = self._rows[begin:end].reshape(-1, 2, 3)
+        if len(rows) < _FEWEST_STEADY or np.linalg.norm(rows[:, 0].mean(axis=0)) > _STEADY_RATE:
+            return False
+        noise = (self._variances[end - 1] - self._variances[begin + 1]) / (len(rows) - 2)
+        return bool((rows.var(axis=0).mean(axis=1) <= _STEADY * noise).all())
 
     def within(self, first_s: float, last_s: float, step_s: float) -> FloatArray:
         """(M,) even instants of a time that samples cover, as far as they do."""
@@ -198,6 +215,7 @@ class Knot:
     lever: Annotated[FloatArray, Shape(3)]  # (3,) position of the IMU in the LiDAR frame, whose axes are the IMU's, too
     T_world_lidar: Annotated[FloatArray, TRANSFORM]  # (4, 4) as registered
     sqrt_information: Annotated[FloatArray, Shape(6, 6)]  # of the registration; zero where there was none
+    is_at_rest: bool = False
 
     @property
     def T_imu_lidar(self) -> FloatArray:
@@ -261,8 +279,9 @@ class InertialWindow(Stateful):
         return self._knots[-1] if self._knots else None
 
     def begin(
-        self, stamp: float, T_world_lidar: FloatArray, sqrt_information: FloatArray, up: FloatArray, is_level: bool
-    ) -> None:
+        self, stamp: float, T_world_lidar: FloatArray, sqrt_information: FloatArray, up: FloatArray, is_level: bool,
+        is_at_rest: bool,
+    ) -> None:  # fmt: skip
         """Begin at a registered pose (4, 4), with the specific force (3,) there; the calibration stays.
 
         With `is_level`, so does the tilt of the world; after a long loss of tracking, the map may have been restarted.
@@ -282,8 +301,9 @@ class InertialWindow(Stateful):
             T_nav_world = last.T_nav_world if is_level else T_nav_world
         T_nav_imu = T_nav_world @ T_world_lidar @ make_transform(np.eye(3), lever)
         knot = Knot(
-            stamp, T_nav_imu, np.zeros(3), bias, T_nav_world, bias, scale, lever, T_world_lidar, sqrt_information
-        )
+            stamp, T_nav_imu, np.zeros(3), bias, T_nav_world, bias, scale, lever, T_world_lidar, sqrt_information,
+            is_at_rest,
+        )  # fmt: skip
         self._knots, self._measurements = [knot], {}
         self._prior = _Prior(knot, A, np.zeros(_SIZE))
         self._latest = _triangle(_own_rows(self._prior, knot)[:, :_SIZE])
@@ -403,7 +423,7 @@ def _remaining(second: Knot, R: FloatArray) -> _Prior:
 
 
 def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:
-    """Whitened rows `[own | b]` (31, 26) of a knot's Gaussian, and of its registered pose, by Huber's kernel."""
+    """Whitened rows `[own | b]` (N, 26) of a knot's Gaussian, its registered pose, by Huber's kernel, and its rest."""
     away = (prior.b - prior.A @ knot.away_from(prior.mean))[:, None]
     expected, root = knot.T_world_estimated, knot.sqrt_information
     residual = root @ log(inverse(knot.T_world_lidar) @ expected)
@@ -413,7 +433,10 @@ def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:
     rows[:, _POSE] = root @ adjoint(inverse(knot.T_imu_lidar))
     rows[:, _WORLD] = -root @ adjoint(inverse(expected))
     rows[:, LEVER], rows[:, -1] = -root[:, 3:], -residual
-    return np.vstack([np.hstack([prior.A, away]), weight * rows])
+    rest: FloatArray = np.zeros((3 if knot.is_at_rest else 0, _SIZE + 1))
+    if knot.is_at_rest:
+        rest[:, _VELOCITY], rest[:, -1] = np.eye(3) / _REST, -knot.velocity / _REST
+    return np.vstack([np.hstack([prior.A, away]), weight * rows, rest])
 
 
 def _rotated(points: FloatArray, vectors: FloatArray) -> FloatArray:

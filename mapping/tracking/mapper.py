@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam.feature_map import FeatureMap
@@ -41,6 +41,9 @@ logger = logging.getLogger(__name__)
 # Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
 # quality that this keeps: the velocity within a sparse sweep may be far off.
 _REDRAWS, _LEAST_KEPT = 2, 0.5
+# A scan from within so many cells of an earlier one's pose is inserted only if it is among the first few: the rings of
+# a sensor that stands still hit the same spots of rough ground again, and its planes would seem certain.
+_STANDING_CELLS, _MOST_REPEATED = 0.5, 3
 # A map of planes through neighbouring voxels may begin with several sweeps at their predictions, for so many seconds:
 # too few points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are,
 # and the sensor moves evenly.
@@ -75,6 +78,8 @@ class Mapper(Stateful):
     _first: SampledScan | None
     _scans: int
     _map_since: int  # number of scans before the present map began, or came back from the archive
+    _place: Annotated[FloatArray, TRANSFORM] | None  # of the latest scan inserted from another pose than the one before
+    _repeated: int  # scans registered there since
     _growing_since: float | None  # stamp of the map's first scan, if that may be too thin for a registration
     _recent: list[Insertion]
 
@@ -91,6 +96,7 @@ class Mapper(Stateful):
         self._last = None
         self._first = None  # while it alone is the map, drawn with a guessed motion
         self._growing_since = None
+        self._place, self._repeated = None, 0
 
     @property
     def local_map(self) -> LocalMap | None:
@@ -150,8 +156,19 @@ class Mapper(Stateful):
         if mapped.added:
             if not has_grown:
                 self._growing_since = None
-            self._insert(scan, mapped.state, self._map)
+            if self._adds_views(scan, mapped.state.T_world_lidar):
+                self._insert(scan, mapped.state, self._map)
         return mapped
+
+    def _adds_views(self, scan: SampledScan, T_world_lidar: FloatArray) -> bool:
+        """Whether a scan sees other spots than the latest ones, or is one of the first few from its pose."""
+        if self._place is not None and scan.has_rings:
+            moved_m = displacement_m(log(inverse(self._place) @ T_world_lidar), scan.range_m)
+            if moved_m < _STANDING_CELLS * scan.cell_m:
+                self._repeated += 1
+                return self._repeated < _MOST_REPEATED
+        self._place, self._repeated = T_world_lidar, 0
+        return True
 
     def redraw(self, drawn: SurfelMap, scans: int) -> bool:
         """Replace the local map of surfels by a rebuilt one without the latest `scans` scans, which are then inserted.
@@ -227,7 +244,7 @@ class Mapper(Stateful):
         is_surfels = self._config.method == "surfels" and scan.has_rings
         local_map = (SurfelMap if is_surfels else FeatureMap)(scan.cells_m, self._config.radius_m)
         logger.info("new local map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
-        self._map_since = self._scans
+        self._map_since, self._place = self._scans, None
         self._growing_since = None if is_surfels else scan.stamp
         self._insert(scan, state, local_map)
         return local_map

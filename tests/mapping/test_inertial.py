@@ -255,6 +255,62 @@ def test_a_direction_without_structure_is_held_by_the_imu(walked):
     assert error**2 < 9.0 * variance < 0.3**2
 
 
+def noisy(motion: Path, last_s: float, rng: np.random.Generator) -> ImuSamples:
+    """Samples with white noise of an ordinary IMU."""
+    exact = samples(motion, last_s)
+    noise = rng.normal(size=(2, len(exact.stamps), 3))
+    return replace(
+        exact,
+        angular_velocities=exact.angular_velocities + 0.003 * noise[0],
+        accelerations=exact.accelerations + 0.03 * noise[1],
+    )
+
+
+def test_from_rest_a_corridor_is_passed_by_the_imu_alone(rng):
+    """The registrations along it agree with any motion."""
+
+    def departure(times: FloatArray) -> FloatArray:
+        t = np.asarray(times, dtype=np.float64)
+        along = 0.4 * np.maximum(0.0, t - 2.0) ** 2
+        return make_transform(np.broadcast_to(np.eye(3), (*t.shape, 3, 3)), np.stack([along, 0 * t, 0 * t], axis=-1))
+
+    inertial = Inertial(noisy(departure, 6.0, rng), T_LIDAR_IMU)
+    information = np.diag([0.0 if axis == 3 else 1.0 / REGISTRATION[axis, axis] for axis in range(6)])
+    rested = []
+    for stamp in np.arange(0.3, 4.0, PERIOD_S):
+        T, state = departure(stamp), inertial.prior(empty(stamp), Prior()).inertial
+        mapped = registered(state, stamp, T, is_connected=state is not None)
+        if state is not None:
+            T = make_transform(T[:3, :3], [state.T_world_lidar[0, 3], 0.0, 0.0])
+            mapped = replace(mapped, state=replace(state, T_world_lidar=T), measured=MeasuredPose(T, information))
+        inertial.update(empty(stamp), mapped)
+        rested.append(inertial.is_at_rest)
+    assert rested == sorted(rested, reverse=True)
+    assert 10 < sum(rested) < 18, "until it begins to move"
+    state = inertial.prior(empty(4.0), Prior()).inertial
+    assert_predicted(state, departure(4.0), 0.05)
+    assert np.sqrt(state.covariance[3, 3]) < 0.2, "of 1.6 m"
+
+
+def test_a_constant_velocity_is_no_rest(rng):
+    """The samples are as steady; the registrations show the motion."""
+
+    def glide(times: FloatArray) -> FloatArray:
+        t = np.asarray(times, dtype=np.float64)
+        return make_transform(
+            np.broadcast_to(np.eye(3), (*t.shape, 3, 3)), np.stack([1.2 * (t - 0.3), 0 * t, 0 * t], axis=-1)
+        )
+
+    inertial = Inertial(noisy(glide, 3.0, rng), T_LIDAR_IMU)
+    take(inertial, 0.3, glide(0.3))
+    assert inertial.is_at_rest
+    for stamp in np.arange(0.4, 2.0, PERIOD_S):
+        take(inertial, stamp, glide(stamp))
+        assert not inertial.is_at_rest
+    assert not inertial.anew().may_rest
+    assert_predicted(inertial.prior(empty(2.0), Prior()).inertial, glide(2.0), 0.03)
+
+
 def test_reversed_time_gives_the_reversed_motion(rng):
     inertial = Inertial(samples(walk, 12.0), T_LIDAR_IMU).reversed(10.0)
     for stamp in np.arange(10.0, 16.0, PERIOD_S):

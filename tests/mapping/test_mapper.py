@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp, inverse
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
@@ -18,8 +18,9 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
+from lidarslam.simulation.sensors import find_sensor
 
-from .runs import assert_near, poses_of, process
+from .runs import assert_near, poses_of, process, simulated
 from .shapes import on_sides
 
 Path = Callable[[FloatArray], FloatArray]
@@ -320,3 +321,15 @@ def test_a_restored_mapper_goes_on_to_the_last_bit(through_disk, request, monkey
                 np.testing.assert_array_equal(getattr(found.state, name), value, err_msg=name)
             for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "is_connected"):
                 assert getattr(found, name) == getattr(mapped, name), name
+
+
+@pytest.mark.parametrize(("angle_deg", "added"), [(0.0, 4), (2.0, 12)])
+def test_a_sensor_that_stands_adds_few_scans_to_the_map(angle_deg, added):
+    """Its rings hit the same spots of rough ground again and again, and these must not seem certain."""
+    (scan,) = simulated("fields", "car", find_sensor("vlp-16"), 1).scans()
+    mapper = Mapper(MappingConfig())
+    turns = exp(np.outer(np.deg2rad(angle_deg) * np.arange(12), [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    turned = [Scan(transform_points(inverse(T), scan.points), 0.1 * number) for number, T in enumerate(turns)]
+    results = process(mapper, turned)
+    assert all(result.added for result in results)
+    assert mapper.local_map.scans == added
