@@ -41,9 +41,9 @@ logger = logging.getLogger(__name__)
 # Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
 # quality that this keeps: the velocity within a sparse sweep may be far off.
 _REDRAWS, _LEAST_KEPT = 2, 0.5
-# A scan from within so many cells of an earlier one's pose is inserted only if it is among the first few: the rings of
-# a sensor that stands still hit the same spots of rough ground again, and its planes would seem certain.
-_STANDING_CELLS, _MOST_REPEATED = 0.5, 3
+# Where the median residual exceeds the noise of ranges, the ground is rough, and the rings of a sensor that stands still
+# hit the same spots again, so that its planes would seem certain: of scans within so many cells, the first few count.
+_ROUGH_M, _STANDING_CELLS, _MOST_REPEATED = 0.02, 0.5, 3
 # A map of planes through neighbouring voxels may begin with several sweeps at their predictions, for so many seconds:
 # too few points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are,
 # and the sensor moves evenly.
@@ -156,13 +156,14 @@ class Mapper(Stateful):
         if mapped.added:
             if not has_grown:
                 self._growing_since = None
-            if self._adds_views(scan, mapped.state.T_world_lidar):
+            if self._adds_views(scan, mapped):
                 self._insert(scan, mapped.state, self._map)
         return mapped
 
-    def _adds_views(self, scan: SampledScan, T_world_lidar: FloatArray) -> bool:
-        """Whether a scan sees other spots than the latest ones, or is one of the first few from its pose."""
-        if self._place is not None and scan.has_rings:
+    def _adds_views(self, scan: SampledScan, mapped: MappedScan) -> bool:
+        """Whether a scan sees other spots of rough ground than the latest ones, or is one of the first few."""
+        T_world_lidar, residual_m = mapped.state.T_world_lidar, 0.0 if mapped.fit is None else mapped.fit.residual_m or 0.0
+        if self._place is not None and scan.has_rings and residual_m > _ROUGH_M:
             moved_m = displacement_m(log(inverse(self._place) @ T_world_lidar), scan.range_m)
             if moved_m < _STANDING_CELLS * scan.cell_m:
                 self._repeated += 1
