@@ -106,9 +106,13 @@ def smoothed_start(
                 needed, least = True, _LEAST_CONSTRAINT
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not (needed or ordered.is_bent)):
             break
-    forwards = ordered.results
     if len(taken) < SHOWING or not (needed or ordered.is_bent):
         return {}
+    if inertial is None and not ordered.has_rings:
+        # Sparse strokes fit facades at any speed. A sensor at rest, or slow, is the likelier one.
+        slow = _tracked_from(np.zeros(3), taken, unlimited, None)
+        ordered = slow if _quality(slow.results[1:]) >= _quality(ordered.results[1:]) else ordered
+    forwards = ordered.results
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
     is_plausible = sum(one.status is Status.OK for one in known) >= _LEAST_OK * len(known) or _constraint(known) > least
     if len(known) < _FEWEST_KNOWN or not is_plausible:
@@ -155,19 +159,22 @@ def _likeliest(
 
     The IMU's measurements relate it to the motion between all scans, and so the later ones decide.
     """
-    interval_s, best, most = scans[1].stamp - scans[0].stamp, None, -np.inf
-    for velocity in _VELOCITIES:
-        tracking = _Tracking(config, inertial.anew())
-        tracking.process(scans[0], Prior())
-        moved = exp(np.concatenate([np.zeros(3), velocity * interval_s]))
-        covariance = np.diag([np.pi**2] * 3 + [(0.5 * _SPACING_M_S * interval_s) ** 2] * 3)
-        tracking.process(scans[1], Prior(moved, covariance=covariance, caution=1.0))
-        for scan in scans[2:]:
-            tracking.process(scan, Prior())
-        if (scored := score(tracking.results)) > most:
-            best, most = tracking, scored
-    assert best is not None
-    return best
+    tracked = [_tracked_from(velocity, scans, config, inertial.anew()) for velocity in _VELOCITIES]
+    return max(tracked, key=lambda tracking: score(tracking.results))
+
+
+def _tracked_from(
+    velocity: FloatArray, scans: list[Scan], config: MappingConfig, inertial: "Inertial | None"
+) -> _Tracking:
+    """The first scans, tracked from a velocity (3,), m/s."""
+    tracking, interval_s = _Tracking(config, inertial), scans[1].stamp - scans[0].stamp
+    tracking.process(scans[0], Prior())
+    moved = exp(np.concatenate([np.zeros(3), velocity * interval_s]))
+    covariance = np.diag([np.pi**2] * 3 + [(0.5 * _SPACING_M_S * interval_s) ** 2] * 3)
+    tracking.process(scans[1], Prior(moved, covariance=covariance, caution=1.0))
+    for scan in scans[2:]:
+        tracking.process(scan, Prior())
+    return tracking
 
 
 def _backwards(scans: list[Scan], known: list[FloatArray], tracking: _Tracking) -> list[MappedScan]:

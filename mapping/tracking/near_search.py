@@ -112,7 +112,8 @@ class NearSearch:
             return near
         moved_m = float(np.linalg.norm(prior.T_prev_curr[:3, 3]))
         is_weak = (fit.support or 0.0) < _WEAK_SUPPORT or (fit.evidence or 0.0) < _WEAK_EVIDENCE
-        is_weak &= fit.constraint >= _LEAST_CONSTRAINT or near.status is Status.LOST
+        counts = fit.constraint >= _LEAST_CONSTRAINT or not self.matcher.scan.has_rings
+        is_weak &= counts or near.status is Status.LOST
         if not is_weak or moved_m > _WEAK_CELLS * self.matcher.scan.cell_m:
             return near
         held = self.matcher.register(self._predict(replace(prior, caution=WEAK_CAUTION)), coarse_first=False)
@@ -154,7 +155,8 @@ class NearSearch:
 
     def at_any_speed(self, near: Attempt) -> Attempt:
         """Where velocity or position is open, or the odometry poor: displaced; a rival is a place that fits as well."""
-        is_open = not self.state.velocity_known or self._is_open
+        is_known = self.state.velocity_known or self.prediction.is_smoothed
+        is_open = not is_known or self._is_open
         if not is_open and not self._is_poor(near):
             return near
         displaced = self.matcher.budget.run(self._displaced())
@@ -163,7 +165,7 @@ class NearSearch:
         best, (others,) = near, displaced
         for other in others:
             # With a known velocity, a place that leaves a direction unconstrained is no better than the prediction.
-            counts = (other.is_reliable and not other.unconstrained) or not self.state.velocity_known
+            counts = (other.is_reliable and not other.unconstrained) or not is_known
             if counts and other.quality > _CLEARLY_BETTER * best.quality:
                 best = other
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best

@@ -18,7 +18,8 @@ from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt, measure_fit,
 
 # Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
-# Evidence below which a direction is held at an IMU's prediction.
+# Evidence below which a direction is held at the prediction, with an IMU or without rings, whose sparse strokes fit a
+# corridor anywhere.
 _HELD_EVIDENCE = 4.0
 # Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
 # kept along a direction that the scan does not constrain, metres.
@@ -82,10 +83,11 @@ class ScanMatcher:
         if attempt.registration is None or attempt.fit.weakest is None:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
-        is_known = start.is_inertial and evidence < _HELD_EVIDENCE and start.sigma_along(direction) < _KNOWN_M
-        if not is_known:
+        is_held = (start.is_inertial or not self.scan.has_rings) and evidence < _HELD_EVIDENCE
+        if not is_held or start.sigma_along(direction) > _KNOWN_M:
             return attempt
-        if (found := self._found_along(prediction, start, direction, keypoints)) is not None:
+        found = self._found_along(prediction, start, direction, keypoints) if start.is_inertial else None
+        if found is not None:
             return found
         held = self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
         if held.registration is None:
