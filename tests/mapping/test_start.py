@@ -122,6 +122,18 @@ def test_a_drone_takes_off(seed):
     assert Status.LOST not in {result.status for result in results}
 
 
+@pytest.mark.long
+def test_between_facades_a_sensor_without_rings_is_not_at_speed():
+    """The strokes of its first sweeps fit one another along the houses at 30 m/s, too; it is at rest, then tracked."""
+    simulation = simulated("terrace", "tracked", find_sensor("mid-360"), 24, seed=36)
+    scans = list(simulation.scans())
+    smoothed = smoothed_start(scans, MappingConfig())
+    results = process(Mapper(MappingConfig()), scans, [smoothed.get(scan.stamp, NOTHING) for scan in scans])
+    truth = true_poses(simulation, scans)
+    assert errors(poses_of(results), inverse(truth[0]) @ truth)[0].max() < 0.3
+    assert Status.LOST not in {result.status for result in results}
+
+
 # What an odometry states of itself: a tenth of a degree and a centimetre.
 STATED = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3) ** 2)
 
