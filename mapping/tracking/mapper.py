@@ -41,8 +41,8 @@ logger = logging.getLogger(__name__)
 # Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
 # quality that this keeps: the velocity within a sparse sweep may be far off.
 _REDRAWS, _LEAST_KEPT = 2, 0.5
-# Where the median residual exceeds the noise of ranges, the ground is rough, and the rings of a sensor that stands still
-# hit the same spots again, so that its planes would seem certain: of scans within so many cells, the first few count.
+# Where the median residual exceeds the noise of ranges, the ground is rough, and rings of a sensor that stands still hit
+# the same spots again, so that planes would seem certain: of scans within so many cells, the first few are inserted.
 _ROUGH_M, _STANDING_CELLS, _MOST_REPEATED = 0.02, 0.5, 3
 # A map of planes through neighbouring voxels may begin with several sweeps at their predictions, for so many seconds:
 # too few points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are,
@@ -162,8 +162,9 @@ class Mapper(Stateful):
 
     def _adds_views(self, scan: SampledScan, mapped: MappedScan) -> bool:
         """Whether a scan sees other spots of rough ground than the latest ones, or is one of the first few."""
-        T_world_lidar, residual_m = mapped.state.T_world_lidar, 0.0 if mapped.fit is None else mapped.fit.residual_m or 0.0
-        if self._place is not None and scan.has_rings and residual_m > _ROUGH_M:
+        T_world_lidar, fit = mapped.state.T_world_lidar, mapped.fit
+        is_rough = scan.has_rings and fit is not None and (fit.residual_m or 0.0) > _ROUGH_M
+        if self._place is not None and is_rough:
             moved_m = displacement_m(log(inverse(self._place) @ T_world_lidar), scan.range_m)
             if moved_m < _STANDING_CELLS * scan.cell_m:
                 self._repeated += 1
