@@ -41,8 +41,8 @@ logger = logging.getLogger(__name__)
 # Times that the first sweep is inserted again, with the motion that the second one showed, and the least share of the
 # quality that this keeps: the velocity within a sparse sweep may be far off.
 _REDRAWS, _LEAST_KEPT = 2, 0.5
-# Where the median residual exceeds the noise of ranges, the ground is rough, and rings of a sensor that stands still hit
-# the same spots again, so that planes would seem certain: of scans within so many cells, the first few are inserted.
+# Where the median residual exceeds the noise of ranges, the ground is rough, and rings of a sensor at rest hit the
+# same spots again, so that planes would seem certain: of scans within so many cells, the first few are inserted.
 _ROUGH_M, _STANDING_CELLS, _MOST_REPEATED = 0.02, 0.5, 3
 # A map of planes through neighbouring voxels may begin with several sweeps at their predictions, for so many seconds:
 # too few points of a single one are on a common plane. Covariance (12, 12) of their states: the map is where they are,
