@@ -40,6 +40,8 @@ _VELOCITIES = [np.zeros(3)] + [
     for speed, count in ((1.0, 6), (2.0, 8))
     for angle in 2.0 * np.pi / count * np.arange(count)
 ]
+# Factor by which scans must fit better when they are tracked from rest.
+_BETTER = 1.05
 # Standard deviations of a smoothed motion, rotation first.
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
 
@@ -109,9 +111,9 @@ def smoothed_start(
     if len(taken) < SHOWING or not (needed or ordered.is_bent):
         return {}
     if inertial is None and not ordered.has_rings:
-        # Sparse strokes fit facades at any speed. A sensor at rest, or slow, is the likelier one.
+        # Sparse strokes fit facades at any speed.
         slow = _tracked_from(np.zeros(3), taken, unlimited, None)
-        ordered = slow if _quality(slow.results[1:]) >= _quality(ordered.results[1:]) else ordered
+        ordered = slow if _quality(slow.results[1:]) > _BETTER * _quality(ordered.results[1:]) else ordered
     forwards = ordered.results
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
     is_plausible = sum(one.status is Status.OK for one in known) >= _LEAST_OK * len(known) or _constraint(known) > least

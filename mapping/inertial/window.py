@@ -49,7 +49,7 @@ _STEADY, _STEADY_RATE, _FEWEST_STEADY = 3.0, 0.05, 20
 # Standard deviation of the velocity at rest, m/s.
 _REST = 0.01
 # Standard deviations of the first state: velocity, m/s; biases of accelerometer and gyroscope; tilt; scale.
-_SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT, _SCALE = 15.0, 0.15, 0.01, np.deg2rad(5.0), 0.03
+_SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT, _SCALE = 15.0, 0.15, 0.01, np.deg2rad(5.0), 0.1
 # Walk of gravity in the world, which follows the drift of the map: rad/sqrt(s); nothing else of the calibration walks.
 _TILT_WALK, _FIXED = np.deg2rad(0.01), 1e-5
 # Registrations off by more deviations count less.
