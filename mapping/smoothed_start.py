@@ -187,7 +187,7 @@ def _backwards(scans: list[Scan], known: list[FloatArray], tracking: _Tracking) 
         if step <= len(known):
             T_prev_curr = inverse(known[-step])
             velocity = body_velocity(T_prev_curr, scans[-step].stamp - scans[-step - 1].stamp)
-            prior = Prior(T_prev_curr if number else None, velocity, _COVARIANCE, is_smoothed=True)
+            prior = Prior(T_prev_curr if number else None, velocity, _COVARIANCE, is_smoothed=not tracking.has_rings)
         times = None if scan.time_offsets is None else -scan.time_offsets
         tracking.process(replace(scan, stamp=2.0 * end - scan.stamp, time_offsets=times), prior)
     return tracking.results
