@@ -161,7 +161,7 @@ def _likeliest(
 
     The IMU's measurements relate it to the motion between all scans, and so the later ones decide.
     """
-    tracked = [_tracked_from(velocity, scans, config, inertial.anew()) for velocity in _VELOCITIES]
+    tracked = (_tracked_from(velocity, scans, config, inertial.anew()) for velocity in _VELOCITIES)
     return max(tracked, key=lambda tracking: score(tracking.results))
 
 
