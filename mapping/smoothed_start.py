@@ -69,6 +69,11 @@ class _Tracking:
         return mapped
 
     @property
+    def is_sparse(self) -> bool:
+        """Whether sparse strokes alone measure the motion: they fit facades at any speed."""
+        return self._inertial is None and not self.has_rings
+
+    @property
     def is_bent(self) -> bool:
         """Whether the first sweep turned so differently from the second that the latter's motion would bend it."""
         (first, second), (_, moved) = self._sampled, self.results[:2]
@@ -110,8 +115,7 @@ def smoothed_start(
             break
     if len(taken) < SHOWING or not (needed or ordered.is_bent):
         return {}
-    if inertial is None and not ordered.has_rings:
-        # Sparse strokes fit facades at any speed.
+    if ordered.is_sparse:
         slow = _tracked_from(np.zeros(3), taken, unlimited, None)
         ordered = slow if _quality(slow.results[1:]) > _BETTER * _quality(ordered.results[1:]) else ordered
     forwards = ordered.results
@@ -187,7 +191,7 @@ def _backwards(scans: list[Scan], known: list[FloatArray], tracking: _Tracking) 
         if step <= len(known):
             T_prev_curr = inverse(known[-step])
             velocity = body_velocity(T_prev_curr, scans[-step].stamp - scans[-step - 1].stamp)
-            prior = Prior(T_prev_curr if number else None, velocity, _COVARIANCE, is_smoothed=not tracking.has_rings)
+            prior = Prior(T_prev_curr if number else None, velocity, _COVARIANCE, is_smoothed=tracking.is_sparse)
         times = None if scan.time_offsets is None else -scan.time_offsets
         tracking.process(replace(scan, stamp=2.0 * end - scan.stamp, time_offsets=times), prior)
     return tracking.results

@@ -156,8 +156,8 @@ class NearSearch:
     def at_any_speed(self, near: Attempt) -> Attempt:
         """Where velocity or position is open, or the odometry poor: displaced; a rival is a place that fits as well."""
         # Sparse strokes fit many places: their smoothed motion is better known.
-        is_smoothed = self.prediction.is_smoothed and not self.matcher.scan.has_rings
-        is_known = self.state.velocity_known or is_smoothed
+        is_sparse = not (self.matcher.scan.has_rings or self.prediction.is_inertial)
+        is_known = self.state.velocity_known or (is_sparse and self.prediction.is_smoothed)
         is_open = not is_known or self._is_open
         if not is_open and not self._is_poor(near):
             return near
