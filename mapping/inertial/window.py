@@ -433,10 +433,9 @@ def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:
     rows[:, _POSE] = root @ adjoint(inverse(knot.T_imu_lidar))
     rows[:, _WORLD] = -root @ adjoint(inverse(expected))
     rows[:, LEVER], rows[:, -1] = -root[:, 3:], -residual
-    rest: FloatArray = np.zeros((3 if knot.is_at_rest else 0, _SIZE + 1))
-    if knot.is_at_rest:
-        rest[:, _VELOCITY], rest[:, -1] = np.eye(3) / _REST, -knot.velocity / _REST
-    return np.vstack([np.hstack([prior.A, away]), weight * rows, rest])
+    rest: FloatArray = np.zeros((3, _SIZE + 1))
+    rest[:, _VELOCITY], rest[:, -1] = np.eye(3) / _REST, -knot.velocity / _REST
+    return np.vstack([np.hstack([prior.A, away]), weight * rows, rest[: 3 * knot.is_at_rest]])
 
 
 def _rotated(points: FloatArray, vectors: FloatArray) -> FloatArray:
