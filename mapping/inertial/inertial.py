@@ -76,16 +76,18 @@ class Inertial(Stateful):
 
     def anew(self) -> "Inertial":
         """A new instance with the same samples."""
-        other = Inertial(self._samples, self._extrinsics, self._lever_sigma_m)
-        other.may_rest = self.may_rest
-        return other
+        return self._with(self._samples)
 
     def reversed(self, about_s: float) -> "Inertial":
         """A new instance with the same samples, with time reversed about an instant."""
         samples = self._samples
         stamps = 2.0 * about_s - samples.stamps[::-1]
-        reversed_ = ImuSamples(stamps, -samples.angular_velocities[::-1], samples.accelerations[::-1])
-        return Inertial(reversed_, self._extrinsics, self._lever_sigma_m)
+        return self._with(ImuSamples(stamps, -samples.angular_velocities[::-1], samples.accelerations[::-1]))
+
+    def _with(self, samples: ImuSamples) -> "Inertial":
+        other = Inertial(samples, self._extrinsics, self._lever_sigma_m)
+        other.may_rest = self.may_rest
+        return other
 
     @property
     def warnings(self) -> list[str]:
