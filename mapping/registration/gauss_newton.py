@@ -29,11 +29,9 @@ def point_to_plane_jacobian(points: FloatArray, normals: FloatArray) -> FloatArr
     return J
 
 
-def geman_mcclure(
-    residuals: FloatArray, squared_scale: FloatArray | float, variance: FloatArray | float = 1.0
-) -> FloatArray:
-    """Information (M,) of residuals (M,) under the kernel of Geman and McClure: `1 / ((1 + r^2 / s^2)^2 variance)`."""
-    return np.asarray(1.0 / ((1.0 + residuals**2 / squared_scale) ** 2 * variance), dtype=np.float64)
+def geman_mcclure(residuals: FloatArray, squared_scale: float) -> FloatArray:
+    """Weights (M,) of residuals (M,) under the kernel of Geman and McClure: `1 / (1 + r^2 / s^2)^2`."""
+    return np.asarray(1.0 / (1.0 + residuals**2 / squared_scale) ** 2, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

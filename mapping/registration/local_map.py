@@ -1,9 +1,10 @@
 """The local map that scans are registered to: surfels, or LOAM's edges and planes; and the surfaces found in it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
+
+Grid = TypeVar("Grid")
 
 # The resolution that registrations of uncertain predictions begin with. A coarser one only has the surfaces of points
 # without any other.
@@ -162,9 +165,17 @@ class LocalMap(Stateful, ABC):
         self._centre = sensor if self._centre is None else self._centre
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
             self._centre = sensor
-            for grid in self.grids:
-                grid.drop_beyond(sensor, self._radius_m)
+            for_each_grid(self.grids, lambda grid: grid.drop_beyond(sensor, self._radius_m))
         self.scans += 1
+
+
+def for_each_grid(grids: Sequence[Grid], change: Callable[[Grid], None]) -> None:
+    """Change the grids of a map, the first, which has the most cells, on a thread of its own: grids share nothing."""
+    with ThreadPoolExecutor(1, "grid") as pool:
+        first = pool.submit(change, grids[0])
+        for grid in grids[1:]:
+            change(grid)
+        first.result()
 
 
 def vertical_of(normals: FloatArray) -> FloatArray:

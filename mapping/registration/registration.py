@@ -17,12 +17,7 @@ from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, lo
 from lidarslam.core.tracking import Degeneracy, lever_scale
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
-from lidarslam.mapping.registration.gauss_newton import (
-    DEGENERATE_INFORMATION,
-    degenerate_directions,
-    geman_mcclure,
-    point_to_plane_jacobian,
-)
+from lidarslam.mapping.registration.gauss_newton import DEGENERATE_INFORMATION, degenerate_directions
 from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 
@@ -200,26 +195,21 @@ def inflation_of_small(
     """
     matched = np.flatnonzero(surfaces.counts)
     world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]
-    is_large = are_large(local_map, world, normals, T_world_lidar[:3, 3])
-    large = matched[is_large]
+    large = matched[are_large(local_map, world, normals, T_world_lidar[:3, 3])]
     if len(large) < _FEWEST_LARGE:
         return None
-    world, normals = world[is_large], normals[is_large]
-    residuals = np.einsum("ij,ij->i", world - surfaces.points[large], normals)
-    variances = surfaces.thickness_m[large, 0] ** 2 + _RANGE_NOISE_M**2
-    scale_m = _SCALE_PER_MEDIAN * np.median(np.abs(residuals))
-    weights = geman_mcclure(residuals, scale_m**2 + variances, variances)
-    scale = lever_scale(float(np.sqrt(np.mean(np.sum(points[large] ** 2, axis=1)))))
-    jacobian = point_to_plane_jacobian(points[large], normals @ T_world_lidar[:3, :3]) / scale
-    hessian = (jacobian * weights[:, None]).T @ jacobian
-    if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * float(weights @ surfaces.tilt[large, 0] ** 2):
+    inflation, counts = np.full(len(points), _INFLATION), np.zeros_like(surfaces.counts)
+    inflation[large] = counts[large] = 1
+    rows, total, at_rest = np.empty((len(large), COLUMNS)), np.zeros((13, 13)), np.empty(0)
+    _, squared = linearise(points, at_rest, T_world_lidar, surfaces._replace(counts=counts), inflation, rows)
+    squared_scale = (_SCALE_PER_MEDIAN * _median_residual_m(rows)) ** 2 + _RANGE_NOISE_M**2
+    _, tilt, _ = accumulate(rows, squared_scale, _RANGE_NOISE_M, np.inf, np.zeros((3, 6, 6)), total)
+    scale = lever_scale(float(np.sqrt(squared / len(large))))
+    hessian = total[:6, :6] / np.outer(scale, scale)
+    if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * tilt:
         return None
-    step_m = np.linalg.norm(np.linalg.solve(hessian, jacobian.T @ (weights * residuals)))
-    if step_m < _CONTRADICTION_CELLS * local_map.cell_m:
-        return None
-    inflation = np.full(len(points), _INFLATION)
-    inflation[large] = 1.0
-    return inflation
+    step_m = np.linalg.norm(np.linalg.solve(hessian, total[:6, 12] / scale))
+    return inflation if step_m > _CONTRADICTION_CELLS * local_map.cell_m else None
 
 
 def _heavy_tailed(prior: FloatArray, error: FloatArray) -> FloatArray:
@@ -260,9 +250,7 @@ class _System:
         if count < MIN_POINTS:
             return None
         rows, total = rows[:count], np.zeros((13, 13))
-        middle = count // 2  # the upper median, in half the time of NumPy's
-        median_m = float(np.partition(np.abs(rows[:, RESIDUAL]), middle)[middle])
-        scale = max(_SCALE_PER_MEDIAN * median_m, _LEAST_SCALE * cell_m)
+        scale = max(_SCALE_PER_MEDIAN * _median_residual_m(rows), _LEAST_SCALE * cell_m)
         crossed = unknown[:6, 6:]
         of_time = np.array([unknown[:6, :6], crossed + crossed.T, unknown[6:, 6:]])
         weight, tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, of_time, total)
@@ -314,6 +302,12 @@ def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
     b = -(prior + holding) @ error - system.gradient
     step: FloatArray = np.asarray(np.linalg.solve(system.hessian + prior + holding, b), dtype=np.float64)
     return _Solution(step, system, prior)
+
+
+def _median_residual_m(rows: FloatArray) -> float:
+    """The upper median of the absolute residuals of rows (M, 10), in half the time of NumPy's."""
+    middle = len(rows) // 2
+    return float(np.partition(np.abs(rows[:, RESIDUAL]), middle)[middle])
 
 
 @compiled

@@ -104,7 +104,7 @@ class SurfelGrid(Stateful):
         rows = self._hash.insert(keys)
         self._reserve(len(self))
         behind = np.empty(len(points), dtype=np.bool_)
-        belong_to_others(views, rows, self._cells(), self._surfels, self._surfel_counts, behind)
+        belong_to_others(views, rows, *self.arrays, behind)
         turned = np.flatnonzero(behind)
         if len(turned):
             keys[turned] |= OTHER_SIDE
@@ -127,10 +127,9 @@ class SurfelGrid(Stateful):
         Of a cell with two sides, the one that faces the sensor (3,), or the first where no sensor is given.
         """
         points, rows = np.ascontiguousarray(points), np.empty(len(points), dtype=np.int32)
-        look_up(points, self._cells(), rows)
+        look_up(points, self.arrays[0], rows)
         if sensor is not None:
-            sensor = np.ascontiguousarray(sensor)
-            turn_to_sensor(points, sensor, self._cells(), self._surfels, self._surfel_counts, rows)
+            turn_to_sensor(points, np.ascontiguousarray(sensor), *self.arrays, rows)
         return rows
 
     def surfels(self, rows: Rows) -> FloatArray:
@@ -139,8 +138,13 @@ class SurfelGrid(Stateful):
 
     def refreshed(self, rows: Rows) -> FloatArray:
         """Surfels (M, 15) of all cells by row, up to date in these rows (N,), or `ABSENT`."""
-        refresh(rows, self._cells(), self._surfels, self._surfel_counts)
+        refresh(rows, *self.arrays)
         return self._surfels
+
+    @property
+    def arrays(self) -> tuple[Cells, FloatArray, NDArray[np.float32]]:
+        """The cells, their surfels (M, 15), and the points (M,) of each when its surfel was computed."""
+        return Cells(self.cell_m, *self._hash.slots, self._keys, self._sums), self._surfels, self._surfel_counts
 
     def means(self) -> FloatArray:
         """Mean point (M, 3) of every cell, in the world."""
@@ -216,9 +220,6 @@ class SurfelGrid(Stateful):
             self._hash.rebuild(keys)
         self._sums[:, OTHER] = 0.0
         link_sides(keys, np.arange(count, dtype=np.int32), *self._hash.slots, self._sums)
-
-    def _cells(self) -> Cells:
-        return Cells(self.cell_m, *self._hash.slots, self._keys, self._sums)
 
     def _reserve(self, count: int) -> None:
         if count > len(self._keys):

@@ -15,10 +15,17 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import lever_scale
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.gauss_newton import point_to_plane_jacobian
-from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces, vertical_of
+from lidarslam.mapping.registration.local_map import (
+    COARSE,
+    LocalMap,
+    Matcher,
+    Surfaces,
+    for_each_grid,
+    vertical_of,
+)
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
-from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
+from lidarslam.mapping.surfels.surfel_kernels import Cells, is_steep, look_up, refresh, turn_to_sensor, views_of
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 
 # A single ring bent around a corner spans a plane too, that of its own rays. A plane seen at a grazing angle counts
@@ -58,13 +65,14 @@ def match_planes(
     """Write the surface of every unmatched point (N, 3) whose cell has a plane, unless it has a better one already.
 
     A better one is known better and its points are spread less: across steps, a coarse plane's are spread more.
-    `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
+    `unmatched` (W,) has the indices of the points, `rows` (N,) those of their cells in `surfels` (M, 15), or -1. Points
     without a plane, or with one whose normal has a standard deviation of `certain_tilt` and more, are moved to the
     beginning of `unmatched`; their number is returned. `spread_m` (N,), of each plane's points across it, is written.
     """
     left = 0
     for w in range(len(unmatched)):
-        n, row = unmatched[w], rows[w]
+        n = unmatched[w]
+        row = rows[n]
         if row >= 0:
             p = surfels[row]
             x, y, z = points[n, 0] - sensor[0], points[n, 1] - sensor[1], points[n, 2] - sensor[2]
@@ -148,6 +156,23 @@ def _write(found: Surfaces, n: int, surfel: FloatArray, axis: int, u: float, v: 
     found.counts[n] += 1
 
 
+@compiled
+def find_planes(
+    points: FloatArray, unmatched: NDArray[np.intp], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
+    sensor: FloatArray, spread_m: FloatArray, certain_tilt: float, found: Surfaces, rows: NDArray[np.int32],
+) -> int:  # fmt: skip
+    """Look up the cells of the unmatched points in a grid, and match their planes, as of `match_planes`.
+
+    `rows` (N,) of these points' cells are written, of the sides that face the sensor (3,), or `ABSENT`.
+    """
+    looked_up, at = points[unmatched], np.empty(len(unmatched), dtype=np.int32)
+    look_up(looked_up, cells, at)
+    turn_to_sensor(looked_up, sensor, cells, surfels, counts, at)
+    refresh(at, cells, surfels, counts)
+    rows[unmatched] = at
+    return match_planes(points, unmatched, rows, surfels, sensor, spread_m, certain_tilt, found)
+
+
 class SurfelMatcher(Matcher):
     """Surfels of the cells that N points lie in, of grids that do not change meanwhile, the finest first.
 
@@ -172,15 +197,12 @@ class SurfelMatcher(Matcher):
         self.surfaces.counts[unmatched] = 0
         sensor, finest = np.array(T[:3, 3]), None
         for grid in self._grids:
-            rows = grid.find(points.take(unmatched, axis=0), sensor)
-            surfels = grid.refreshed(rows)
-            if finest is None:
-                finest = np.empty(len(points), dtype=np.int32), surfels
-                finest[0][unmatched] = rows
-            given = self._spread_m, self._certain_tilt, self.surfaces
-            unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, *given)]
-        assert finest is not None
-        match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
+            rows = np.empty(len(points), dtype=np.int32)
+            given = sensor, self._spread_m, self._certain_tilt, self.surfaces, rows
+            unmatched = unmatched[: find_planes(points, unmatched, *grid.arrays, *given)]
+            finest = rows if finest is None else finest
+        grid = self._grids[0]
+        match_compact(points, unmatched, finest, grid.arrays[1], T, _COMPACT * grid.cell_m, self.surfaces)
 
 
 class SurfelMap(LocalMap):
@@ -234,8 +256,7 @@ class SurfelMap(LocalMap):
 
         Each point counts `weight` times.
         """
-        for grid in self._grids:
-            grid.insert(points, elevations, views, weight)
+        for_each_grid(self._grids, lambda grid: grid.insert(points, elevations, views, weight))
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
         return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
