@@ -183,26 +183,26 @@ class SurfelMatcher(Matcher):
 
     def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
         self._grids, self._certain_tilt = grids, np.inf if keeps_finest else _CERTAIN_TILT
-        self._cells = np.full(count, _NOWHERE, dtype=np.int64)
+        self._keys = np.full(count, _NOWHERE, dtype=np.int64)  # of the points' cells
         self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
-        cells = point_keys(points, self._grids[0].cell_m)
-        unmatched = np.flatnonzero(cells != self._cells)
-        self._cells = cells
+        keys = point_keys(points, self._grids[0].cell_m)
+        unmatched = np.flatnonzero(keys != self._keys)
+        self._keys = keys
         if not len(unmatched):
             return
         self.surfaces.counts[unmatched] = 0
         sensor, finest = np.array(T[:3, 3]), None
         for grid in self._grids:
-            rows = np.empty(len(points), dtype=np.int32)
-            given = sensor, self._spread_m, self._certain_tilt, self.surfaces, rows
-            unmatched = unmatched[: find_planes(points, unmatched, *grid.arrays, *given)]
-            finest = rows if finest is None else finest
-        grid = self._grids[0]
-        match_compact(points, unmatched, finest, grid.arrays[1], T, _COMPACT * grid.cell_m, self.surfaces)
+            (cells, surfels, counts), rows = grid.arrays, np.empty(len(points), dtype=np.int32)
+            given = self._spread_m, self._certain_tilt, self.surfaces, rows
+            unmatched = unmatched[: find_planes(points, unmatched, cells, surfels, counts, sensor, *given)]
+            finest = finest or (rows, surfels)
+        assert finest is not None
+        match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
 
 
 class SurfelMap(LocalMap):
