@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state import Shape, State, Stateful
 from lidarslam.mapping.loam.features import EDGE, squared_distance
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces, vertical_of
+from lidarslam.mapping.registration.local_map import (
+    COARSE,
+    LocalMap,
+    Matcher,
+    Surfaces,
+    for_each_grid,
+    vertical_of,
+)
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
+from lidarslam.mapping.surfels.grid import resized
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 from lidarslam.mapping.surfels.voxel_hash import (
@@ -322,36 +330,44 @@ class VoxelGrid(Stateful):
         self._hash = VoxelHash()
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self._hash)
 
     @property
     def means(self) -> FloatArray:
         """(M, 3) in the world."""
-        return np.asarray(self._sums[:, 1:4] / self._sums[:, :1], dtype=np.float64)
+        sums = self._sums[: len(self)]
+        return np.asarray(sums[:, 1:4] / sums[:, :1], dtype=np.float64)
 
     def insert(self, points: FloatArray, views: NDArray[np.float32], elevations: FloatArray) -> None:
         """Insert points (N, 3) of the world, with unit views (N, 3) to the sensor, and elevations (N,), radians."""
-        keys = point_keys(points, self.cell_m)
-        rows = self._hash.insert(keys)
-        new = len(self._hash) - len(self._keys)
-        if new:
-            self._keys = np.concatenate([self._keys, np.empty(new, dtype=np.int64)])
-            self._keys[rows] = keys
-            self._sums = np.concatenate([self._sums, np.zeros((new, 15))])
-        add_moments(points, views, elevations, rows, self._sums)
+        add_moments(points, views, elevations, self._rows_of(points), self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:
         """Insert the voxels of another grid, with their numbers of points."""
-        rows = self._hash.insert(point_keys(other.means, self.cell_m))
-        self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 15))
-        self._keys[rows] = point_keys(other.means, self.cell_m)
-        np.add.at(self._sums, rows, other._sums)
+        np.add.at(self._sums, self._rows_of(other.means), other._sums[: len(other)])
 
     def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the voxels farther than `radius_m` from `centre` (3,)."""
         near = np.flatnonzero(np.linalg.norm(self.means - centre, axis=1) < radius_m)
         self._keys, self._sums = self._keys[near], self._sums[near]
         self._hash.rebuild(self._keys)
+
+    def state(self) -> State:
+        """The voxels in the order of their rows."""
+        self._resize(len(self))
+        return super().state()
+
+    def _rows_of(self, points: FloatArray) -> Rows:
+        """Rows (N,) of the voxels of points (N, 3), which are made where there is none."""
+        keys = point_keys(points, self.cell_m)
+        rows = self._hash.insert(keys)
+        if len(self) > len(self._keys):
+            self._resize(2 * len(self))
+        self._keys[rows] = keys
+        return rows
+
+    def _resize(self, capacity: int) -> None:
+        self._keys, self._sums = resized(self._keys, capacity), resized(self._sums, capacity)
 
     @property
     def voxels(self) -> Voxels:
@@ -412,8 +428,7 @@ class FeatureMap(LocalMap):
         for grids, is_kind in ((self._edges, is_edge), (self._planes, ~is_edge)):
             chosen = np.flatnonzero(is_kind)
             inserted = points.take(chosen, axis=0), views.take(chosen, axis=0), scan.elevations.take(chosen)
-            for grid in grids:
-                grid.insert(*inserted)
+            for_each_grid(grids, VoxelGrid.insert, *inserted)
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002

@@ -165,16 +165,16 @@ class LocalMap(Stateful, ABC):
         self._centre = sensor if self._centre is None else self._centre
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
             self._centre = sensor
-            for_each_grid(self.grids, lambda grid: grid.drop_beyond(sensor, self._radius_m))
+            for_each_grid(self.grids, type(self.grids[0]).drop_beyond, sensor, self._radius_m)
         self.scans += 1
 
 
-def for_each_grid(grids: Sequence[Grid], change: Callable[[Grid], None]) -> None:
-    """Change the grids of a map, the first, which has the most cells, on a thread of its own: grids share nothing."""
+def for_each_grid(grids: Sequence[Grid], change: Callable[..., None], *arguments: object) -> None:
+    """Change all grids of a map, the first, which has the most cells, on a thread of its own: grids share nothing."""
     with ThreadPoolExecutor(1, "grid") as pool:
-        first = pool.submit(change, grids[0])
+        first = pool.submit(change, grids[0], *arguments)
         for grid in grids[1:]:
-            change(grid)
+            change(grid, *arguments)
         first.result()
 
 

@@ -226,13 +226,13 @@ class SurfelGrid(Stateful):
             self._resize(max(4096, 2 * count))
 
     def _resize(self, capacity: int) -> None:
-        self._keys = _resized(self._keys, capacity)
-        self._sums = _resized(self._sums, capacity)
-        self._surfels = _resized(self._surfels, capacity)
-        self._surfel_counts = _resized(self._surfel_counts, capacity)
+        self._keys = resized(self._keys, capacity)
+        self._sums = resized(self._sums, capacity)
+        self._surfels = resized(self._surfels, capacity)
+        self._surfel_counts = resized(self._surfel_counts, capacity)
 
 
-def _resized(values: NDArray[Any], capacity: int) -> NDArray[Any]:
+def resized(values: NDArray[Any], capacity: int) -> NDArray[Any]:
     """A copy with more rows, or fewer; it begins with a cache line, so that few rows lie across two."""
     shape = (capacity, *values.shape[1:])
     size = math.prod(shape) * values.itemsize
