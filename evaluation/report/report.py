@@ -79,7 +79,6 @@ def render_markdown(comparison: Comparison) -> str:
 def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table | Figure]:
     """Tables and figures of a recording, as far as there are values for them."""
     tables = sequence_tables(sequence)
-    several = len(sequence.methods) > 1
     order: list[Table | Figure | None] = [
         *tables["summary"],
         accuracy.trajectory_figure(sequence, styles),
@@ -88,12 +87,9 @@ def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Ta
         *accuracy.drift_figures(sequence, styles),
         *tables["drift"],
         accuracy.map_figure(sequence),
-        accuracy.entropy_figure(sequence, styles) if several else None,
         *tables["map"],
         execution.scan_figure(sequence, styles),
-        execution.resources_figure(sequence, styles) if several else None,
         *tables["time"],
-        execution.tracking_figure(sequence, styles) if several else None,
         *tables["tracking"],
     ]
     return (block for block in order if block is not None)
