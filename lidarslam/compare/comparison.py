@@ -4,14 +4,11 @@ import contextlib
 import os
 import platform
 import subprocess
-import tarfile
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
-from io import BytesIO
 from pathlib import Path
 
 from lidarslam.assessment.evaluate import evaluate_map
@@ -29,7 +26,7 @@ from lidarslam.compare.plan import (
     make_recordings,
     require_data,
 )
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, only_writer
 from lidarslam.core.tasks import open_tasks, usable_cores
 from lidarslam.core.text import as_typed, command_line, count, joined
@@ -163,26 +160,28 @@ class _Turns:
         if not wanted:
             return
         scans = [len(range(len(p.recording))[p.entry.start : p.entry.stop : p.entry.step]) for p, _ in wanted]
-        where, counted = self.request.where, 0
+        counted = 0
+        for _, run in wanted:
+            (run.request.out / method_run.PROCESS).unlink(missing_ok=True)  # of an earlier comparison
 
-        def take(index: int, done: tuple[MethodResult, bytes | None]) -> None:
+        def take(index: int, result: MethodResult) -> None:
             nonlocal counted
-            (planned, run), (result, packed) = wanted[index], done
-            if packed is not None:
-                method_run.clear(run.request.out)
-                with tarfile.open(fileobj=BytesIO(packed)) as archive:
-                    archive.extractall(run.request.out, filter="data")
+            planned, run = wanted[index]
+            if not (run.request.out / method_run.PROCESS).is_file():
+                raise OutputError(
+                    f"{self.request.out}: is not shared by the nodes of the cluster; name a folder that is with --out"
+                )
             counted += scans[index]
             counter(counted, sum(scans))
             self._done[run.request.out] = result
             self.narrator.tell(format_result(planned.name, result))
 
-        command, is_remote = None if self.command == method_run.COMMAND else self.command, where.cluster is not None
+        command = None if self.command == method_run.COMMAND else self.command
         limits, here = self.request.limits, str(Path.cwd())
-        tasks = [MethodTask(r, limits, command, here, url_of(r.request.source), is_remote) for _, r in wanted]
+        tasks = [MethodTask(run, limits, command, here, url_of(run.request.source)) for _, run in wanted]
         with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
             try:
-                with open_tasks(where) as executor:
+                with open_tasks(self.request.where) as executor:
                     deque(executor.run(run_task, tasks, take), maxlen=0)
             except KeyboardInterrupt:
                 self.interrupted = True
@@ -227,33 +226,16 @@ class MethodTask:
     command: Sequence[str] | None  # the process; None: that of the machine that runs it
     folder: str  # that relative paths are relative to
     url: str | None  # of the source, where it was fetched
-    is_remote: bool  # whether the run directory comes back with the result: the machine may have other disks
 
 
-def run_task(task: MethodTask) -> tuple[MethodResult, bytes | None]:
-    """Run the method of a task; its result, and the run directory where it has to be brought back."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a machine without that folder has no file there either
-            stack.enter_context(contextlib.chdir(task.folder))
-        request = task.run.request
+def run_task(task: MethodTask) -> MethodResult:
+    """Run the method of a task."""
+    folder = task.folder if Path(task.folder).is_dir() else "."  # a machine without it has no file there either
+    with contextlib.chdir(folder):
         if task.url is not None:
-            fetch(task.url, request.source)
-        if task.is_remote:
-            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarslam-")))
-            # The last two parts are in the result.
-            request = replace(request, out=place / request.out.parent.name / request.out.name)
-        run = replace(task.run, request=request)
-        result, _ = method_run.run_method(run, task.limits, lambda *_: None, task.command or method_run.COMMAND)
-        return result, _packed(request.out) if task.is_remote else None
-
-
-def _packed(folder: Path) -> bytes:
-    """The files of a run directory; last the one that says how the process ended, which marks a whole one."""
-    packed = BytesIO()
-    with tarfile.open(fileobj=packed, mode="w") as archive:
-        for path in sorted(folder.iterdir(), key=lambda path: (path.name == method_run.PROCESS, path)):
-            archive.add(path, path.name)
-    return packed.getvalue()
+            fetch(task.url, task.run.request.source)
+        result, _ = method_run.run_method(task.run, task.limits, lambda *_: None, task.command or method_run.COMMAND)
+    return result
 
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
