@@ -204,8 +204,7 @@ def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: C
     path = file_of(piece, config, cache)
     try:
         kept = PreparedRecording(**read_tensor_file(path, _KIND)[0])
-        kept.require(len(piece), config.images)
-    except (InputError, TypeError, ValueError):  # not there yet, or damaged: made again
+    except (InputError, TypeError):  # not there yet, or damaged: made again
         made = _prepare(piece, config, count)
         write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **_key(piece, config)})
         return made
