@@ -3,7 +3,6 @@
 import re
 from base64 import b64encode
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from importlib.resources import files
 from itertools import groupby
@@ -21,23 +20,15 @@ _MARKDOWN_SPECIAL = re.compile(r"([\\`*_\[\]|~#$])")
 _HTML_SPECIAL = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;"})
 
 
-@dataclass(frozen=True, eq=False)
-class Section:
-    """One recording in the report: its tables and figures in order."""
-
-    sequence: SequenceComparison
-    blocks: list[Table | Figure]
-
-
 def render_html(comparison: Comparison) -> str:
     """The report as one page; see `render_page`."""
     styles = method_styles(method.name for sequence in comparison.sequences for method in sequence.methods)
-    sections = [Section(sequence, list(sequence_blocks(sequence, styles))) for sequence in comparison.sequences]
+    sections = [(sequence, list(sequence_blocks(sequence, styles))) for sequence in comparison.sequences]
     return render_page(
         "report.html.j2",
         comparison.title,
         styles,
-        [block for section in sections for block in section.blocks],
+        [block for _, blocks in sections for block in blocks],
         comparison=comparison,
         sections=sections,
         settings=_settings(comparison),
@@ -69,7 +60,7 @@ def render_page(template: str, title: str, styles: Styles, blocks: Sequence[Tabl
 def render_markdown(comparison: Comparison) -> str:
     """The tables of the report as Markdown."""
     sections = [
-        Section(sequence, [table for tables in sequence_tables(sequence).values() for table in tables])
+        (sequence, [table for tables in sequence_tables(sequence).values() for table in tables])
         for sequence in comparison.sequences
     ]
     template = _environment().get_template("report.md.j2")

@@ -6,7 +6,6 @@ import platform
 import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -56,17 +55,6 @@ from lidarslam.storage.finished_run import COMPARISON, REPORT_HTML, REPORT_MD, r
 
 _INTERRUPTED = "the comparison was interrupted before its turn"
 
-Counter = Callable[[int, int], None]
-"""Called with the number of the scan just finished, from 1, and how many there are."""
-
-
-@dataclass(frozen=True)
-class Narrator:
-    """Progress: `counting` for the time of one method, by its name; `tell` with a line for each finished method."""
-
-    counting: Callable[[str], AbstractContextManager[Counter]]
-    tell: Callable[[str], None]
-
 
 @dataclass(frozen=True)
 class CompareOutcome:
@@ -92,7 +80,7 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
             require_data(request, benchmark)
         require_methods(request.gates, [method.name for method in request.methods])
         make_recordings(request)
-        outcome = compare(request, Narrator(show_count, tell))
+        outcome = compare(request, tell)
     say(format_comparison(outcome.comparison, request.out))
     if outcome.is_empty:
         tell("no method came to a result; the table says why")
@@ -105,11 +93,13 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
     return replace(outcome, gates_passed=all(gate.passed for gate in judged))
 
 
-def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = method_run.COMMAND) -> CompareOutcome:
+def compare(
+    request: CompareRequest, tell: Callable[[str], None], command: Sequence[str] = method_run.COMMAND
+) -> CompareOutcome:
     """Run, evaluate, and write comparison.json and the report.
 
-    A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. The command is the
-    process of each method, see `run_method`.
+    A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. `tell` is called
+    with a line for each finished method; the command is the process of each, see `run_method`.
     """
     from lidarslam.evaluation.report.report import render_html, render_markdown
 
@@ -118,7 +108,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
         request.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(request.out, error) from error
-    turns, directory = _Turns(request, narrator, command), RunDirectory(request.out)
+    turns, directory = _Turns(request, tell, command), RunDirectory(request.out)
     sequences: list[SequenceComparison] = []
     with only_writer(request.out):
         if not request.where.is_serial:
@@ -148,7 +138,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
 @dataclass
 class _Turns:
     request: CompareRequest
-    narrator: Narrator
+    tell: Callable[[str], None]
     command: Sequence[str]
     interrupted: bool = False
     # of those that ran side by side, by their directories
@@ -174,12 +164,12 @@ class _Turns:
             counted += scans[index]
             counter(counted, sum(scans))
             self._done[run.request.out] = result
-            self.narrator.tell(format_result(planned.name, result))
+            self.tell(format_result(planned.name, result))
 
         command = None if self.command == method_run.COMMAND else self.command
         limits, here = self.request.limits, str(Path.cwd())
         tasks = [MethodTask(run, limits, command, here, url_of(run.request.source)) for _, run in wanted]
-        with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
+        with show_count(f"{count(len(tasks), 'run')} side by side") as counter:
             try:
                 with open_tasks(self.request.where) as executor:
                     deque(executor.run(run_task, tasks, take), maxlen=0)
@@ -209,11 +199,11 @@ class _Turns:
         result = known or MethodResult(run.name, "not run", _INTERRUPTED)
         try:
             if known is None:
-                with self.narrator.counting(f"{planned.name} {run.name}") as counter:
+                with show_count(f"{planned.name} {run.name}") as counter:
                     result, self.interrupted = method_run.run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
-        self.narrator.tell(format_result(planned.name, result, known is not None and known.status in WHOLE))
+        self.tell(format_result(planned.name, result, known is not None and known.status in WHOLE))
         return result
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarslam.assessment.inputs import truth_of_run
-from lidarslam.compare.comparison import CompareOutcome, Narrator, compare, format_comparison
+from lidarslam.compare.comparison import CompareOutcome, compare, format_comparison
 from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text import as_typed, command_line
@@ -48,7 +48,7 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
         title="A tracked robot turns on the spot in an office",
         command=f"lidarslam demo --out {out} --scans {scans}",
     )
-    outcome = compare(comparison, Narrator(show_count, tell))
+    outcome = compare(comparison, tell)
     (sequence,) = outcome.comparison.sequences
     runs = [out / result.run for result in sequence.methods if result.run and result.trajectory is not None]
     if runs:
