@@ -7,10 +7,11 @@ import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from lidarslam.assessment.evaluate import evaluate_map
+from lidarslam.assessment.evaluate import EvaluateRequest, evaluate_map
 from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
 from lidarslam.compare import method_run
 from lidarslam.compare.method_run import Limits, MethodRun
@@ -167,12 +168,12 @@ class _Turns:
             self.tell(format_result(planned.name, result))
 
         command = None if self.command == method_run.COMMAND else self.command
-        limits, here = self.request.limits, str(Path.cwd())
-        tasks = [MethodTask(run, limits, command, here, url_of(run.request.source)) for _, run in wanted]
+        run_one = partial(run_task, limits=self.request.limits, command=command, folder=str(Path.cwd()))
+        tasks = [(run, url_of(run.request.source)) for _, run in wanted]
         with show_count(f"{count(len(tasks), 'run')} side by side") as counter:
             try:
                 with open_tasks(self.request.where) as executor:
-                    deque(executor.run(run_task, tasks, take), maxlen=0)
+                    deque(executor.run(run_one, tasks, take), maxlen=0)
             except KeyboardInterrupt:
                 self.interrupted = True
 
@@ -207,25 +208,18 @@ class _Turns:
         return result
 
 
-@dataclass(frozen=True)
-class MethodTask:
-    """One method on one recording, as a task."""
+def run_task(
+    task: tuple[MethodRun, str | None], limits: Limits, command: Sequence[str] | None, folder: str
+) -> MethodResult:
+    """Run a method in a folder that relative paths are relative to, on whichever machine.
 
-    run: MethodRun
-    limits: Limits
-    command: Sequence[str] | None  # the process; None: that of the machine that runs it
-    folder: str  # that relative paths are relative to
-    url: str | None  # of the source, where it was fetched
-
-
-def run_task(task: MethodTask) -> MethodResult:
-    """Run the method of a task."""
-    folder = task.folder if Path(task.folder).is_dir() else "."  # a machine without it has no file there either
-    with contextlib.chdir(folder):
-        if task.url is not None:
-            fetch(task.url, task.run.request.source)
-        result, _ = method_run.run_method(task.run, task.limits, lambda *_: None, task.command or method_run.COMMAND)
-    return result
+    With the method comes the URL of its source, where that was fetched. Without a command it is that of the machine.
+    """
+    run, url = task
+    with contextlib.chdir(folder if Path(folder).is_dir() else "."):  # a machine without it has no file there either
+        if url is not None:
+            fetch(url, run.request.source)
+        return method_run.run_method(run, limits, lambda *_: None, command or method_run.COMMAND)[0]
 
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
@@ -294,9 +288,9 @@ def _measure_maps(planned: PlannedRecording, results: Sequence[MethodResult], no
         if reference is None or result.trajectory is None:
             continue
         try:
-            compared = evaluate_map(
-                read_estimate(folders[result.name]), None if is_method else result.metrics, reference
-            )
+            request = EvaluateRequest(folders[result.name])
+            metrics = None if is_method else result.metrics
+            compared = evaluate_map(request, read_estimate(request.run), metrics, reference)
         except InputError as error:
             notes.append(f"{result.name}: no map is compared: {error}")
             continue
