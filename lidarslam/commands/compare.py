@@ -193,6 +193,6 @@ def compare(
 @click.option("--scans", type=click.IntRange(min=20), default=400, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:
     """Simulate an office, map it, and compare with KISS-ICP."""
-    from lidarslam.compare.demo import format_demo, run_demo
+    from lidarslam.compare.demo import run_demo
 
-    say(format_demo(run_demo(out, scans, tell=note)))
+    run_demo(out, scans, say, note)
