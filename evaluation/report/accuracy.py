@@ -20,7 +20,7 @@ from lidarslam.evaluation.report.figure import (
     plot_text,
     thin_curve,
 )
-from lidarslam.evaluation.report.tables import drift_series
+from lidarslam.evaluation.report.tables import DriftSeries, drift_series
 from lidarslam.evaluation.trajectory.alignment import align
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
@@ -271,34 +271,45 @@ def _leaving(measured: Measured, panels: Mapping[str, Sequence[FloatArray]], sig
     return "".join([*notes, " A double click shows all."] if notes else notes)
 
 
-def drift_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
-    """Drift by segment length, KITTI's and the short one; None without."""
-    short, kitti = drift_series(sequence)
-    layout = {
-        "xaxis": {"title": {"text": "segment length [m]"}, "type": "category"},
-        "yaxis": {"rangemode": "tozero"},
-        "hovermode": "x unified",
-    }
-    panels = []
-    for part in (kitti, short):
-        if not part.lengths_m:
-            continue
-        titles = (f"Translation drift, {part.over} [%]", f"Rotation drift, {part.over} [° per {part.per_m} m]")
-        for number, title in enumerate(titles):
-            curves = {name: np.array(part.of(name)[number], dtype=np.float64) for name in part.by_method}
-            traces = [
-                line_trace(
-                    name, styles[name], [*map(str, part.lengths_m)], curve,
-                    mode="lines+markers", marker=styles[name].marker, hovertemplate="%{y:.3f}",
-                )
-                for name, curve in curves.items()
-            ]  # fmt: skip
-            panels.append(Panel(title, traces, layout, 250, needs_log(list(curves.values()))))
+def drift_figures(sequence: SequenceComparison, styles: Styles) -> list[Figure | None]:
+    """Drift by segment length, KITTI's and the short one, and KITTI's by the speed over the segment; None without."""
+    short, kitti, by_speed = drift_series(sequence)
     caption = (
         "Mean translation error in percent of the segment length and mean rotation error per 100 m (segments of 100 to"
         " 800 m, as the KITTI development kit computes it) or per 10 m (segments of 5 to 100 m)."
     )
-    return Figure("Drift by segment length", caption, panels, list(short.by_method)) if panels else None
+    speed_caption = "Mean errors over all segments of 100 to 800 m that were driven within 2 m/s of the speed."
+    return [
+        _drift_figure("Drift by segment length", caption, [kitti, short], "segment length [m]", short, styles),
+        _drift_figure("Drift by speed", speed_caption, [by_speed], "speed over the segment [m/s]", by_speed, styles),
+    ]
+
+
+def _drift_figure(
+    title: str, caption: str, parts: Sequence[DriftSeries], x_label: str, named: DriftSeries, styles: Styles
+) -> Figure | None:
+    """Translation and rotation of each part; the legend has the methods of `named`."""
+    layout = {
+        "xaxis": {"title": {"text": x_label}, "type": "category"},
+        "yaxis": {"rangemode": "tozero"},
+        "hovermode": "x unified",
+    }
+    panels = []
+    for part in parts:
+        if not part.places:
+            continue
+        titles = (f"Translation drift{part.over} [%]", f"Rotation drift{part.over} [° per {part.per_m} m]")
+        for number, panel_title in enumerate(titles):
+            curves = {name: np.array(part.of(name)[number], dtype=np.float64) for name in part.by_method}
+            traces = [
+                line_trace(
+                    name, styles[name], [*map(str, part.places)], curve,
+                    mode="lines+markers", marker=styles[name].marker, hovertemplate="%{y:.3f}",
+                )
+                for name, curve in curves.items()
+            ]  # fmt: skip
+            panels.append(Panel(panel_title, traces, layout, 250, needs_log(list(curves.values()))))
+    return Figure(title, caption, panels, list(named.by_method)) if panels else None
 
 
 def map_figure(sequence: SequenceComparison) -> Figure | None:

@@ -75,7 +75,7 @@ def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Ta
         accuracy.trajectory_figure(sequence, styles),
         accuracy.error_figure(sequence, styles),
         accuracy.deviation_figure(sequence, styles),
-        accuracy.drift_figure(sequence, styles),
+        *accuracy.drift_figures(sequence, styles),
         *tables["drift"],
         accuracy.map_figure(sequence),
         *tables["map"],

@@ -42,31 +42,38 @@ _MOST_INTERVALS = 40
 
 @dataclass(frozen=True)
 class DriftSeries:
-    """Drift of the measured methods over segment lengths, as far as any of them has one."""
+    """Drift of the measured methods over segment lengths, or over speeds, as far as any of them has one."""
 
-    over: str  # the lengths in words
+    title: str  # of the table
+    over: str  # the lengths, behind the title of a plot
+    unit: str  # of the places
     per_m: int  # length that the rotation is given over
-    lengths_m: Sequence[int]
+    places: Sequence[int]  # lengths or speeds
     by_method: Mapping[str, Mapping[int, Drift | None]]
 
     def of(self, name: str) -> tuple[list[float | None], list[float | None]]:
-        """Translation in percent and rotation in degrees of a method at all lengths."""
-        found = [self.by_method.get(name, {}).get(length) for length in self.lengths_m]
+        """Translation in percent and rotation in degrees of a method at all places."""
+        found = [self.by_method.get(name, {}).get(place) for place in self.places]
         rotations = [None if drift is None else drift.rotation_deg_per_m * self.per_m for drift in found]
         return [None if drift is None else drift.translation_percent for drift in found], rotations
 
 
 def drift_series(sequence: SequenceComparison) -> list[DriftSeries]:
-    """Over short segments, and over KITTI's; a series without any drift has no length."""
+    """Over short segments, over KITTI's, and of these by speed; a series without any drift has no place."""
     measured = {method.name: metrics for method, metrics in sequence.measured}
+    kitti = {name: metrics.kitti for name, metrics in measured.items() if metrics.kitti is not None}
     short = {name: metrics.segments for name, metrics in measured.items()}
-    kitti = {name: metrics.kitti.by_length for name, metrics in measured.items() if metrics.kitti is not None}
+    lengths = {name: drift.by_length for name, drift in kitti.items()}
+    speeds = {name: drift.by_speed for name, drift in kitti.items()}
+    title = "drift over segments of"
+    series = [
+        DriftSeries(f"{title} 5 to 100 m", ", 5 to 100 m", "m", 10, SHORT_LENGTHS_M, short),
+        DriftSeries(f"{title} 100 to 800 m (KITTI)", ", 100 to 800 m", "m", 100, KITTI_LENGTHS_M, lengths),
+        DriftSeries(f"{title} 100 to 800 m by speed", "", "m/s", 100, sorted({*chain(*speeds.values())}), speeds),
+    ]
     return [
-        DriftSeries(over, per_m, [m for m in lengths if any(drifts.get(m) for drifts in of.values())], of)
-        for over, per_m, lengths, of in (
-            ("5 to 100 m", 10, SHORT_LENGTHS_M, short),
-            ("100 to 800 m", 100, KITTI_LENGTHS_M, kitti),
-        )
+        replace(one, places=[place for place in one.places if any(of.get(place) for of in one.by_method.values())])
+        for one in series
     ]
 
 
@@ -101,16 +108,15 @@ def _drift_table(sequence: SequenceComparison, series: DriftSeries) -> Table:
     """Two decimals over KITTI's lengths, three over short ones, as papers print them."""
     digits = 2 if series.per_m == 100 else 3
     columns = [
-        TableColumn(heading, f"{length} m", digits=digits, lower_is_better=True)
+        TableColumn(heading, f"{place} {series.unit}", digits=digits, lower_is_better=True)
         for heading in ("translation [%]", f"rotation [deg/{series.per_m} m]")
-        for length in series.lengths_m
+        for place in series.places
     ]
     rows = [
         TableRow(m.name, [TableCell(value, ranked=m.status in WHOLE) for value in chain(*series.of(m.name))])
         for m in sequence.methods
     ]
-    kitti = " (KITTI)" if series.per_m == 100 else ""
-    return Table(f"{sequence.sequence}: drift over segments of {series.over}{kitti}", columns, rows)
+    return Table(f"{sequence.sequence}: {series.title}", columns, rows, folded=series.unit == "m/s")
 
 
 def _map_table(sequence: SequenceComparison) -> Table:

@@ -347,7 +347,9 @@ def _trajectory(metrics: TrajectoryMetrics) -> Iterator[str]:
         yield _row(label, f"{_number(metres, 'm'):>12}{_number(degrees, 'deg'):>14}    {how}")
     if metrics.kitti is not None:
         lengths = {f"{m} m": drift for m, drift in metrics.kitti.by_length.items()}
+        speeds = {f"{3.6 * v:.0f} km/h": drift for v, drift in metrics.kitti.by_speed.items()}
         yield from _drifts("KITTI DRIFT", {"all": metrics.kitti.overall, **lengths}, 100)
+        yield from _drifts("BY SPEED", speeds, 100)
     yield from _drifts("SHORT SEGMENTS", {f"{m} m": drift for m, drift in metrics.segments.items()}, 10)
     yield from ("",) if metrics.plugins else ()
     yield from (_row(f"{name} ", text) for name, text in metrics.plugin_lines())

@@ -204,7 +204,8 @@ def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: C
     path = file_of(piece, config, cache)
     try:
         kept = PreparedRecording(**read_tensor_file(path, _KIND)[0])
-    except (InputError, TypeError):  # not there yet, or damaged: made again
+        kept.require(len(piece), config.images)
+    except (InputError, TypeError, ValueError):  # not there yet, or damaged: made again
         made = _prepare(piece, config, count)
         write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **_key(piece, config)})
         return made

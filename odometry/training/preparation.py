@@ -43,6 +43,17 @@ class PreparedRecording:
     def __len__(self) -> int:
         return len(self.points)
 
+    def require(self, scans: int, images: ImageConfig) -> None:
+        """Raise ValueError for shapes that `prepare` cannot have made of `scans` scans; some may be left out."""
+        count, size = len(self.points), (images.rows, images.columns)
+        shapes = {
+            "points": (count, 3, *size), "normals": (count, 3, *size), "offsets": (count, *size),
+            "interval_s": (count - 1,), "T_prev_curr": (count - 1, 4, 4), "valid": (count - 1,),
+        }  # fmt: skip
+        found = {name: tuple(tensor.shape) for name, tensor in vars(self).items()}
+        if found != shapes or not 2 <= count <= scans:
+            raise ValueError(f"expected tensors of the shapes {shapes}, got {found}")
+
 
 def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:
     """Images of all scans, and each aligned with the one before; ValueError where there are fewer than two scans."""

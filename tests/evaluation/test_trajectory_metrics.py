@@ -55,8 +55,10 @@ def test_json_has_the_promised_keys_and_no_nan(random_drive, noisy):
     assert set(written["association"]) == {"matched", "estimate", "reference"}
     assert set(written["trajectory"]) == {"length_m", "ate_rmse_m", "ate_rotation_rmse_deg", *rpe, "end_error_m"}
     kitti, segments = written["kitti"], written["segments"]
-    assert set(kitti) == drift | {"by_length"}
+    assert set(kitti) == drift | {"by_length", "by_speed"}
     assert {m: set(part) for m, part in kitti["by_length"].items()} == {str(m): drift for m in range(100, 900, 100)}
+    assert list(kitti["by_speed"]) == [str(mps) for mps in range(2, 26, 2)]
+    assert [mps for mps, part in kitti["by_speed"].items() if part] == ["8", "10", "12"]
     assert {m: set(part) for m, part in segments.items()} == {str(m): short for m in (5, 10, 25, 40, 60, 100)}
     assert written["map"] is None
     json.dumps(written, allow_nan=False)
@@ -260,3 +262,12 @@ def test_a_constant_yaw_rate_is_found_per_metre(straight_drive):
         # The chord leaves the tangent by length^2 * curvature / 2.
         deviation_percent = 100.0 * length_m * np.deg2rad(0.01) / 2.0
         assert part.translation_percent == pytest.approx(deviation_percent, rel=0.11)
+
+
+def test_speed_is_taken_from_the_stamps(straight_drive):
+    reference = straight_drive(400, (0.0, 0.0, 0.0, 1.01, 0.0, 0.0))
+    drift = kitti_drift(associate(reference, reference))
+    assert {speed for speed, part in drift.by_speed.items() if part} == {10, 12}
+    slower = Trajectory(2.0 * reference.stamps, reference.T_world_lidar)
+    drift = kitti_drift(associate(slower, slower))
+    assert {speed for speed, part in drift.by_speed.items() if part} == {4, 6}

@@ -234,10 +234,19 @@ def test_nothing_is_prepared_behind_a_link(room_folder, tmp_path):
     assert not any((tmp_path / "outside").iterdir())
 
 
-def test_prepared_recordings_that_do_not_fit_are_made_anew(kept):
+@pytest.mark.parametrize(
+    "forge",
+    [
+        lambda tensors: tensors.pop("valid"),
+        lambda tensors: tensors.update({n: tensors[n][..., ::2] for n in ("points", "normals", "offsets")}),
+        lambda tensors: tensors.update({name: torch.cat([one, one]) for name, one in tensors.items()}),
+    ],
+    ids=["missing", "other image", "long"],
+)
+def test_prepared_recordings_that_do_not_fit_are_made_anew(kept, forge):
     (file,) = kept[2].iterdir()
     tensors, content = read_tensor_file(file, training_data._KIND)
-    tensors.pop("valid")
+    forge(tensors)
     write_tensor_file(file, training_data._KIND, tensors, content)
     assert_as_kept(kept)
 
