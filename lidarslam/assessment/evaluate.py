@@ -52,6 +52,7 @@ from lidarslam.mapping.global_map.point_cloud import COLOURS
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 
+_SUFFIXES = (".ply", ".rrd")
 _DRAWN_POINTS = 200_000
 
 
@@ -63,6 +64,7 @@ class MapEvaluation:
     alignment: MapAlignment  # of the map with it
     comparison: MapComparison  # the errors, in numbers and point by point
     entropy: MapEntropy | None  # of the map by itself; None when it is too sparse
+    positions: FloatArray  # (K, 3) of the sensor, in the reference's frame
     max_range_m: float  # range of the sensor
 
     @property
@@ -176,7 +178,7 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         RunDirectory(out.parent).write_json(out.name, evaluation.to_json())
     if compared is not None:
         for path in request.errors:
-            write_errors(path, compared.comparison.map_errors, request.errors_clip_m)
+            write_errors(path, compared.comparison, compared.positions, request.errors_clip_m)
     if request.report and estimate.run is not None and request.out is None:
         from lidarslam.viewer.run_report import leave_report  # loads the pictures
 
@@ -232,7 +234,7 @@ def evaluate_map(
     aligned = transform_points(alignment.T_reference_map, points)
     comparison = compare_maps(aligned, reference.points, positions, max_range_m, request.spacing_m)
     label = f"{reference.path}{'' if reference.truth is None else ', the exact map of the simulation'}"
-    return MapEvaluation(label, alignment, comparison, map_entropy(points), max_range_m)
+    return MapEvaluation(label, alignment, comparison, map_entropy(points), positions, max_range_m)
 
 
 def _along_trajectory(
@@ -281,14 +283,25 @@ def _align(
 def check_error_files(paths: Sequence[Path]) -> None:
     """Refuse files that cannot be written later."""
     for path in paths:
-        if path.suffix.lower() != ".ply":
-            raise OutputError(f"{path}: the errors are written as .ply; name such a file")
+        if path.suffix.lower() not in _SUFFIXES:
+            raise OutputError(f"{path}: the errors can be written as {' or '.join(_SUFFIXES)}; name such a file")
         if not path.parent.is_dir():
             raise OutputError(f"{path}: there is no folder {path.parent}; make it first")
 
 
-def write_errors(path: Path, errors: CloudErrors, clip_m: float) -> None:
-    """Write the map in the reference's frame, in double precision, with its distances from the reference as colours."""
+def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, clip_m: float) -> None:
+    """Write the map coloured by its distance from the reference, in the reference's frame.
+
+    A .ply file holds the points in double precision, with colours and distances. A .rrd file, for Rerun, also holds
+    the reference coloured by its distance from the map, and the sensor's path (K, 3).
+    """
+    if path.suffix.lower() == ".rrd":
+        from lidarslam.viewer.rerun_recording import save
+        from lidarslam.viewer.rerun_scenes import show_errors
+
+        save(show_errors(comparison, positions, clip_m), path)
+        return
+    errors = comparison.map_errors
     columns: Columns = dict(zip("xyz", errors.points.T, strict=True))
     columns |= zip(COLOURS, error_colours(errors.distances_m, clip_m).T, strict=True)
     columns[DISTANCE_FIELD] = errors.distances_m.astype(np.float32)

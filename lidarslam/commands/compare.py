@@ -60,7 +60,7 @@ _SECONDS = click.FloatRange(min=0.0)
     type=POSITIVE,
     help="Distance from the path up to which the map should be complete, m.  [default: the range of the run's map]",
 )
-@click.option("--errors", type=PATH, multiple=True, metavar="FILE", help="Save the map coloured by error, as .ply.")
+@click.option("--errors", type=PATH, multiple=True, metavar="FILE", help="Save the map coloured by error: .ply, .rrd.")
 @click.option("--errors-clip", "errors_clip_m", type=POSITIVE, default=0.5, help="Error of the brightest colour, m.")
 @click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.")
 @opt.gate_options(with_method=False)

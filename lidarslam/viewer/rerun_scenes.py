@@ -1,4 +1,4 @@
-"""What is shown in Rerun: finished runs, and the raw scans of a recording."""
+"""What is shown in Rerun: finished runs, the raw scans of a recording, errors of a map."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -18,7 +18,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
-from lidarslam.evaluation.report.drawing import viridis
+from lidarslam.evaluation.map.metrics import MapComparison
+from lidarslam.evaluation.report.drawing import error_colours, viridis
 from lidarslam.evaluation.trajectory.alignment import align, common_instants
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
@@ -206,3 +207,38 @@ def _layout_of_scans(has_truth: bool) -> rrb.Blueprint:
         views.append(on_path)
     panel = rrb.TimePanel(timeline=rec.TIME, play_state="playing", loop_mode="all", state="collapsed")
     return rrb.Blueprint(rrb.Horizontal(*views), panel, collapse_panels=True)
+
+
+def show_errors(comparison: MapComparison, positions: FloatArray, clip_m: float) -> Show:
+    """A map coloured by its distance to the reference, and the reference by that to the map.
+
+    The clouds are shown about their middle, because the viewer counts in single precision, with the path (K, 3) of the
+    sensor in the reference's frame; `clip_m` is the distance of the brightest colour.
+    """
+    points = comparison.reference_errors.points
+    middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
+    clouds = {
+        "map_to_reference": (comparison.map_errors, "Map: distance to the reference"),
+        "reference_to_map": (comparison.reference_errors, "Reference: distance to the map"),
+    }
+
+    def log(recording: rr.RecordingStream) -> None:
+        for entity, (errors, _) in clouds.items():
+            colours = error_colours(errors.distances_m, clip_m)
+            cloud = rr.Points3D(errors.points - middle, colors=colours, radii=rec.MAP_RADIUS)
+            recording.log(f"world/{entity}", cloud, static=True)
+        line = rr.LineStrips3D([positions - middle], colors=[rec.REFERENCE_COLOUR], radii=rec.PATH_RADIUS)
+        recording.log("world/path", line, static=True)
+        origin = ", ".join(f"{m:.0f}" for m in middle)
+        text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"
+        recording.log("legend", rr.TextDocument(text), static=True)
+
+    views = [
+        rrb.Spatial3DView(
+            origin="/world", name=title, contents=["/world/path", f"/world/{entity}"], background=BACKGROUND
+        )
+        for entity, (_, title) in clouds.items()
+    ]
+    legend = rrb.TextDocumentView(origin="/legend", name="Colours")
+    layout = rrb.Vertical(rrb.Horizontal(*views), legend, row_shares=[8, 1])
+    return Show("map errors", rrb.Blueprint(layout, collapse_panels=True), log)

@@ -155,17 +155,21 @@ def test_a_kitti_estimate_meets_the_truth_in_the_cameras_frame(tmp_path):
 
 
 def test_errors_are_written_as_coloured_points(run, tmp_path):
-    ply = tmp_path / "errors.ply"
-    evaluation = evaluate(EvaluateRequest(run, errors=[ply], refine=False))
+    ply, rrd = tmp_path / "errors.ply", tmp_path / "errors.rrd"
+    evaluation = evaluate(EvaluateRequest(run, errors=[ply, rrd], refine=False))
     vertices = read_ply(ply)
     np.testing.assert_allclose(vertices["distance_m"], evaluation.map.comparison.map_errors.distances_m, rtol=1e-6)
     assert vertices.dtype["x"] == np.float64
+    from rerun.chunk import RrdReader
+
+    entities = {chunk.entity_path for chunk in RrdReader(rrd).stream()}
+    assert {"/world/map_to_reference", "/world/reference_to_map", "/world/path", "/legend"} <= entities
 
 
 @pytest.mark.parametrize(
     ("change", "kind", "message"),
     [
-        ({"errors": "x.txt"}, OutputError, r"written as \.ply"),
+        ({"errors": "x.txt"}, OutputError, r"\.ply or \.rrd"),
         ({"errors": "none/x.ply"}, OutputError, "there is no folder"),
         ({"reference_map": "none.ply"}, InputError, "no such file"),
         ({"reference": "none.tum"}, InputError, "no such file"),
