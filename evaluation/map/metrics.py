@@ -53,6 +53,12 @@ class CloudErrors:
 
     points: FloatArray  # (N, 3) the thinned cloud, in the reference's frame
     distances_m: FloatArray  # (N,) to the nearest point of the other
+    considered: NDArray[np.bool_] | None = None  # (N,) whether the point lies where both clouds can have one; None: all
+
+    @property
+    def considered_m(self) -> FloatArray:
+        """Distances of the points that are considered."""
+        return self.distances_m if self.considered is None else self.distances_m[self.considered]
 
     def thinned(self, most: int) -> "CloudErrors":
         """At most so many of the points, for drawing."""
@@ -66,6 +72,7 @@ class MapComparison:
 
     metrics: MapMetrics  # the errors in one number each
     map_errors: CloudErrors  # the map's points and their distances to the reference
+    reference_errors: CloudErrors  # the reference's points and their distances to the map
     # median distance between neighbouring points of the thinned map; None for fewer than two points
     map_gap_m: float | None
 
@@ -92,34 +99,36 @@ def compare_maps(
     in_range = np.ones(len(reference), dtype=np.bool_)
     if positions is not None and np.isfinite(max_range_m):
         in_range = np.isfinite(_distances(reference, positions - origin, max_range_m))
-    to_reference, to_map = _distances(mapped, reference), _distances(reference, mapped)
-    metrics = _metrics(to_reference, to_map, to_reference[_in_box(mapped, reference)], to_map[in_range])
-    return MapComparison(metrics, CloudErrors(mapped + origin, to_reference), median_gap_m(mapped, _GAP_SAMPLES))
+    map_errors = CloudErrors(mapped + origin, _distances(mapped, reference), _in_box(mapped, reference))
+    reference_errors = CloudErrors(reference + origin, _distances(reference, mapped), in_range)
+    metrics = _metrics(map_errors, reference_errors)
+    return MapComparison(metrics, map_errors, reference_errors, median_gap_m(mapped, _GAP_SAMPLES))
 
 
-def _metrics(to_reference: FloatArray, to_map: FloatArray, in_box: FloatArray, in_range: FloatArray) -> MapMetrics:
-    """From the distances of both clouds' points, of all and of those where both clouds can have one."""
+def _metrics(mapped: CloudErrors, reference: CloudErrors) -> MapMetrics:
     # A side without points leaves the other side's distances infinite: nothing can be computed then.
-    empty = not len(to_reference) or not len(to_map)
-    accuracy, completeness = (None if empty or not len(of) else float(of.mean()) for of in (in_box, in_range))
+    empty = not len(mapped.points) or not len(reference.points)
+    accuracy, completeness = (
+        None if empty or not len(of.considered_m) else float(of.considered_m.mean()) for of in (mapped, reference)
+    )
     chamfer = None if accuracy is None or completeness is None else 0.5 * (accuracy + completeness)
     return MapMetrics(
         accuracy_mean_m=accuracy,
         completeness_mean_m=completeness,
         chamfer_m=chamfer,
-        f_score_percent={m: None if chamfer is None else _f_score(in_box, in_range, m) for m in F_SCORE_THRESHOLDS_M},
-        coverage_percent={m: None if empty else 100.0 * _share(to_map, m) for m in SUBT_TOLERANCES_M},
-        deviation_percent={m: None if empty else 100.0 - 100.0 * _share(to_reference, m) for m in SUBT_TOLERANCES_M},
+        f_score_percent={m: None if chamfer is None else _f_score(mapped, reference, m) for m in F_SCORE_THRESHOLDS_M},
+        coverage_percent={m: None if empty else _percent(reference, m) for m in SUBT_TOLERANCES_M},
+        deviation_percent={m: None if empty else 100.0 - _percent(mapped, m) for m in SUBT_TOLERANCES_M},
     )
 
 
-def _f_score(in_box: FloatArray, in_range: FloatArray, threshold_m: float) -> float:
-    precision, recall = _share(in_box, threshold_m), _share(in_range, threshold_m)
+def _f_score(mapped: CloudErrors, reference: CloudErrors, threshold_m: float) -> float:
+    precision, recall = (float(np.mean(of.considered_m <= threshold_m)) for of in (mapped, reference))
     return 200.0 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-def _share(distances_m: FloatArray, tolerance_m: float) -> float:
-    return float(np.mean(distances_m <= tolerance_m))
+def _percent(errors: CloudErrors, tolerance_m: float) -> float:
+    return 100.0 * float(np.mean(errors.distances_m <= tolerance_m))
 
 
 def _distances(points: FloatArray, others: FloatArray, bound_m: float = np.inf) -> FloatArray:
