@@ -22,7 +22,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from lidarslam.compare.comparison import Narrator, compare
+from lidarslam.compare.comparison import compare
 from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.core.tasks import Where
 from lidarslam.simulation.record import RecordRequest, record
@@ -126,7 +126,6 @@ def main() -> None:
             with cluster(starts, kill_after) as address:
                 yield Where(cluster=address)
 
-        quiet = Narrator(lambda _: nullcontext(lambda *_: None), lambda _: None)
         third = options.recordings * len(methods) // 3
         ways: dict[str, Callable[[Path], Any]] = {
             "1 job": lambda _: nullcontext(Where()),
@@ -134,7 +133,7 @@ def main() -> None:
             "cluster of 2 nodes": on_cluster,
             "one of them killed": lambda starts: on_cluster(starts, third),
         }
-        compare(CompareRequest(folder / "warm", entries[:1], methods), quiet)
+        compare(CompareRequest(folder / "warm", entries[:1], methods), lambda _: None)
         print("| | wall time, s | of one job | runs started | run again | same files | figures |")
         print("|---|---:|---:|---:|---|---|---:|")
         first, is_same = None, True
@@ -143,7 +142,7 @@ def main() -> None:
             command = (sys.executable, str(folder / "noted.py"), str(noted))
             with where(noted) as chosen:
                 begun = time.perf_counter()
-                compare(CompareRequest(out, entries, methods, where=chosen), quiet, command)
+                compare(CompareRequest(out, entries, methods, where=chosen), lambda _: None, command)
                 wall_s = time.perf_counter() - begun
             starts, files, errors = started(noted), contents(out), figures(out)
             first = first or (wall_s, files, errors)

@@ -136,7 +136,7 @@ class TrainingConfig(Settings):
         description="pseudo-labels of recordings: alignment of consecutive scans, or mapping without a network",
     )
     steps: int = Field(12_000, ge=1, le=10**9, description="of the optimizer")
-    batch: int = Field(16, ge=1, le=10**4, description="pairs per step and process")
+    batch: int = Field(16, ge=1, le=10**4, description="pairs per step")
     learning_rate: float = Field(1e-3, ge=1e-9, le=1.0, description="the highest, after the warm-up")
     warmup_steps: int = Field(300, ge=0, le=10**9, description="in which the learning rate rises")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="of weights, pairs and augmentation")

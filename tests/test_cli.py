@@ -54,9 +54,8 @@ def test_weights_are_those_of_the_learned_odometry(recording, tmp_path):
         (["info", "no/such/place"], 1, "no such file or folder"),
         (["info", "{recording}", "--set", "reader.name=ros"], 1, "no reader is called 'ros'; there are: evalio, kitti"),
         (["info", ""], 2, "the path is empty"),
-        (["view", "{recording}", "--picture", "{out}.png", "--video", "{out}.gif"], 2, "exclude one another"),
-        (["view", "{recording}", "--colour", "error"], 2, "--colour belongs to --picture and --video"),
-        (["view", "{recording}", "--video", "{out}.avi"], 1, r"must end in .gif or .mp4"),
+        (["view", "{recording}", "--picture", "{out}.png", "--web"], 2, "exclude one another"),
+        (["view", "{recording}", "--oblique"], 2, "--oblique belongs to --picture"),
         (["view", "{out}", "--step", "2"], 2, "--step belongs to a recording"),
         (["view", "{out}", "--reader", "rosbag"], 2, "--reader belongs to a recording"),
         (["view", "{out}.rrd", "{out}"], 2, "is shown alone"),
@@ -131,7 +130,7 @@ def test_merge_exits_as_run_does_and_says_who_is_left_out(
 
 
 @pytest.mark.long
-def test_view_writes_a_recording_and_pictures_also_coloured_by_error(recording, tmp_path):
+def test_view_writes_a_recording_and_pictures(recording, tmp_path):
     from rerun.chunk import RrdReader
 
     run = tmp_path / "run"
@@ -141,13 +140,11 @@ def test_view_writes_a_recording_and_pictures_also_coloured_by_error(recording, 
     first, second = r"/world/run\ \(1\)", r"/world/run\ \(2\)"
     assert {f"{first}/map", f"{first}/trajectory", f"{second}/map", "/world/ground\\ truth"} <= entities
     assert lidarslam("view", recording, "--picture", tmp_path / "none.png").exit_code == 1
-    by_error = ("--colour", "error", "--picture")
-    succeeds("view", run, *by_error, tmp_path / "error.png")  # the recording has ground truth
-    assert (tmp_path / "error.png").read_bytes() != (run / "map.png").read_bytes()
-    assert "--colour is of one run, and these are 2" in lidarslam("view", run, run, *by_error, "x.png").stderr
+    succeeds("view", run, run, "--picture", tmp_path / "both.png")
+    assert (tmp_path / "both.png").read_bytes() != (run / "map.png").read_bytes()
     errors = tmp_path / "errors.ply"
     succeeds("evaluate", run, "--reference-map", run / "map.ply", "--errors", errors)
-    assert str(tmp_path / "apart" / "errors.ply.png") in succeeds("view", errors, *by_error, tmp_path / "apart")
+    assert str(tmp_path / "apart" / "errors.ply.png") in succeeds("view", errors, "--picture", tmp_path / "apart")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a full disk at hand")

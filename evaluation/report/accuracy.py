@@ -327,27 +327,6 @@ def map_figure(sequence: SequenceComparison) -> Figure | None:
     )
 
 
-def entropy_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
-    """Mean map entropy, which needs no reference; None where there is a reference map, or no map."""
-    entropies = {m.name: m.map_entropy for m in sequence.methods if m.map_entropy is not None}
-    if not entropies or any(method.map_metrics is not None for method in sequence.methods):
-        return None
-    points = [
-        line_trace(
-            name, styles[name], np.array([entropy]), [plot_text(name)],
-            mode="markers", marker={**styles[name].marker, "size": 12}, hovertemplate="%{x:.3f}",
-        )
-        for name, entropy in entropies.items()
-    ]  # fmt: skip
-    layout = {"xaxis": {"zeroline": False}, "yaxis": {"autorange": "reversed"}, "hovermode": "closest"}
-    panel = Panel("Mean map entropy", points, layout, 70 + 30 * len(points))
-    caption = (
-        "Mean entropy of the points within 0.3 m of each map point (Droeschel et al., ICRA 2014); lower is crisper."
-        " It needs no reference; a method that lost tracking may have a crisp map of a part."
-    )
-    return Figure("Map quality without a reference", caption, [panel], list(entropies))
-
-
 def raster(errors: CloudErrors, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
     """Median distance (rows, columns) of the points in each cell; NaN where there is none."""
     from scipy.stats import binned_statistic_2d  # takes longer to load than the rest of a page

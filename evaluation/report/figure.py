@@ -113,22 +113,6 @@ def line_trace(name: str, style: Style, x: ArrayLike, y: ArrayLike, **more: Any)
     return go.Scatter(x=x, y=y, name=plot_text(name), **given)
 
 
-def bar_trace(name: str, style: Style, **given: Any) -> Any:
-    """A method's horizontal bars."""
-    own = {"name": plot_text(name), "legendgroup": style.key, "marker": {"color": style.colour}}
-    return go.Bar(orientation="h", **own, **given)
-
-
-def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles) -> Panel:
-    """A horizontal bar per method."""
-    bars = [
-        bar_trace(name, styles[name], x=[value], y=[plot_text(name)], hovertemplate=f"%{{x:.4g}} {unit}")
-        for name, value in values.items()
-    ]
-    axes = {"xaxis": {"title": {"text": f"[{unit}]" if unit else ""}}, "yaxis": {"autorange": "reversed"}}
-    return Panel(title, bars, {**axes, "hovermode": "closest", "barmode": "overlay"}, 70 + 30 * len(bars))
-
-
 def thin_curve(y: FloatArray) -> NDArray[np.intp]:
     """Rows of a curve (N,), at most `MOST_POINTS`: lowest and highest of each of equal pieces, so that peaks stay."""
     if len(y) <= MOST_POINTS:

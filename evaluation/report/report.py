@@ -3,7 +3,6 @@
 import re
 from base64 import b64encode
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from importlib.resources import files
 from itertools import groupby
@@ -21,23 +20,15 @@ _MARKDOWN_SPECIAL = re.compile(r"([\\`*_\[\]|~#$])")
 _HTML_SPECIAL = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;"})
 
 
-@dataclass(frozen=True, eq=False)
-class Section:
-    """One recording in the report: its tables and figures in order."""
-
-    sequence: SequenceComparison
-    blocks: list[Table | Figure]
-
-
 def render_html(comparison: Comparison) -> str:
     """The report as one page; see `render_page`."""
     styles = method_styles(method.name for sequence in comparison.sequences for method in sequence.methods)
-    sections = [Section(sequence, list(sequence_blocks(sequence, styles))) for sequence in comparison.sequences]
+    sections = [(sequence, list(sequence_blocks(sequence, styles))) for sequence in comparison.sequences]
     return render_page(
         "report.html.j2",
         comparison.title,
         styles,
-        [block for section in sections for block in section.blocks],
+        [block for _, blocks in sections for block in blocks],
         comparison=comparison,
         sections=sections,
         settings=_settings(comparison),
@@ -69,7 +60,7 @@ def render_page(template: str, title: str, styles: Styles, blocks: Sequence[Tabl
 def render_markdown(comparison: Comparison) -> str:
     """The tables of the report as Markdown."""
     sections = [
-        Section(sequence, [table for tables in sequence_tables(sequence).values() for table in tables])
+        (sequence, [table for tables in sequence_tables(sequence).values() for table in tables])
         for sequence in comparison.sequences
     ]
     template = _environment().get_template("report.md.j2")
@@ -79,7 +70,6 @@ def render_markdown(comparison: Comparison) -> str:
 def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table | Figure]:
     """Tables and figures of a recording, as far as there are values for them."""
     tables = sequence_tables(sequence)
-    several = len(sequence.methods) > 1
     order: list[Table | Figure | None] = [
         *tables["summary"],
         accuracy.trajectory_figure(sequence, styles),
@@ -88,12 +78,9 @@ def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Ta
         *accuracy.drift_figures(sequence, styles),
         *tables["drift"],
         accuracy.map_figure(sequence),
-        accuracy.entropy_figure(sequence, styles) if several else None,
         *tables["map"],
         execution.scan_figure(sequence, styles),
-        execution.resources_figure(sequence, styles) if several else None,
         *tables["time"],
-        execution.tracking_figure(sequence, styles) if several else None,
         *tables["tracking"],
     ]
     return (block for block in order if block is not None)

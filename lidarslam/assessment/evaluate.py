@@ -1,7 +1,7 @@
 """Evaluation of a run directory or a trajectory file: metrics.json, files of the errors, and text."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -56,24 +56,6 @@ _SUFFIXES = (".ply", ".rrd")
 _DRAWN_POINTS = 200_000
 
 
-@dataclass(frozen=True)
-class MapOptions:
-    """Options of the comparison of maps."""
-
-    # initial `T_reference_map`. "trajectory": the alignment of the trajectory with one in the reference map's world;
-    # "none": the identity; "global": global registration; or the name of a text file with the 4x4 matrix. "auto": the
-    # trajectory where it is known to be in the reference map's world, else the first of trajectory, none and global
-    # that fits.
-    alignment: str = "auto"
-    refine: bool | None = None  # whether ICP follows; None: unless the alignment is "none"
-    spacing_m: float = DEFAULT_SPACING_M  # edge of the cells that both clouds are thinned to one point in
-    max_range_m: float | None = None  # range of the sensor; None: that of the run's map
-
-    def __post_init__(self) -> None:
-        if self.alignment == GLOBAL and self.refine is False:
-            raise ConfigError("a global search is good to a metre only; let --refine follow it")
-
-
 @dataclass(frozen=True, eq=False)
 class MapEvaluation:
     """Errors of a map."""
@@ -125,13 +107,24 @@ class EvaluateRequest:
     # tolerance_s, max_gap_s: of the association in time
     tolerance_s: float = DEFAULT_TOLERANCE_S
     max_gap_s: float = DEFAULT_MAX_GAP_S
-    map_options: MapOptions = field(default_factory=MapOptions)  # of the comparison of maps
+    # initial `T_reference_map`. "trajectory": the alignment of the trajectory with one in the reference map's world;
+    # "none": the identity; "global": global registration; or the name of a text file with the 4x4 matrix. "auto": the
+    # trajectory where it is known to be in the reference map's world, else the first of trajectory, none and global
+    # that fits.
+    map_alignment: str = "auto"
+    refine: bool | None = None  # whether ICP follows; None: unless the map's alignment is "none"
+    spacing_m: float = DEFAULT_SPACING_M  # edge of the cells that both clouds are thinned to one point in
+    max_range_m: float | None = None  # range of the sensor; None: that of the run's map
     errors: Sequence[Path] = ()  # files for the map coloured by its errors
     errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
     out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
     needs_reference: bool = True  # whether it is an error that there is no reference
     write: bool = True  # whether the figures are written
     report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
+
+    def __post_init__(self) -> None:
+        if self.map_alignment == GLOBAL and self.refine is False:
+            raise ConfigError("a global search is good to a metre only; let --refine follow it")
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,21 +219,20 @@ def _evaluate_map(
             if estimate.run is not None:
                 notes.append("there is no map to compare with that of the simulation")
             return None
-    return None if reference is None else evaluate_map(estimate, metrics, reference, request.map_options)
+    return None if reference is None else evaluate_map(request, estimate, metrics, reference)
 
 
 def evaluate_map(
-    estimate: Estimate, metrics: TrajectoryMetrics | None, reference: ReferenceMap, options: MapOptions | None = None
+    request: EvaluateRequest, estimate: Estimate, metrics: TrajectoryMetrics | None, reference: ReferenceMap
 ) -> MapEvaluation:
     """Compare the map of an estimate with a reference; the metrics are its trajectory's, None without a reference."""
-    options = options or MapOptions()
     points = estimate.map_points()
     T_reference_world, positions = _along_trajectory(estimate, metrics, reference)
-    alignment = _align(points, reference, T_reference_world, options)
-    max_range_m = options.max_range_m or estimate.config.global_map.max_range_m
+    alignment = _align(request, points, reference, T_reference_world)
+    max_range_m = request.max_range_m or estimate.config.global_map.max_range_m
     positions = transform_points(alignment.T_reference_map, positions)
     aligned = transform_points(alignment.T_reference_map, points)
-    comparison = compare_maps(aligned, reference.points, positions, max_range_m, options.spacing_m)
+    comparison = compare_maps(aligned, reference.points, positions, max_range_m, request.spacing_m)
     label = f"{reference.path}{'' if reference.truth is None else ', the exact map of the simulation'}"
     return MapEvaluation(label, alignment, comparison, map_entropy(points), positions, max_range_m)
 
@@ -266,11 +258,11 @@ def _along_trajectory(
 
 
 def _align(
-    points: FloatArray, reference: ReferenceMap, T_reference_world: FloatArray | None, options: MapOptions
+    request: EvaluateRequest, points: FloatArray, reference: ReferenceMap, T_reference_world: FloatArray | None
 ) -> MapAlignment:
     by_trajectory = {} if T_reference_world is None else {"trajectory": T_reference_world}
-    as_given, search = {"none": np.eye(4)}, options.alignment == GLOBAL
-    match options.alignment:
+    as_given, search = {"none": np.eye(4)}, request.map_alignment == GLOBAL
+    match request.map_alignment:
         case "auto":
             search = reference.truth is None or not by_trajectory
             guesses = by_trajectory | as_given if search else by_trajectory
@@ -284,7 +276,7 @@ def _align(
             guesses = as_given
         case file:
             guesses = {"file": read_transform(Path(file))}
-    refine = options.alignment != "none" if options.refine is None else options.refine
+    refine = request.map_alignment != "none" if request.refine is None else request.refine
     return align_map(points, reference.points, guesses, search, refine)
 
 

@@ -73,7 +73,7 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
 
     Exit status 4 if a bound of --max or --min is not met; everything is written then too.
     """
-    from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
+    from lidarslam.assessment.evaluate import EvaluateRequest, evaluate, format_evaluation
     from lidarslam.evaluation.comparison.gates import format_gates, judge
     from lidarslam.storage.finished_run import read_summary
 
@@ -81,11 +81,7 @@ def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
     given = {name: value for name, value in options.items() if value is not None}
     if given.get("reference") and given["no_reference"]:
         raise click.UsageError("--reference and --no-reference exclude each other; choose one")
-    named = {"map_alignment": "alignment", "refine": "refine", "spacing_m": "spacing_m", "max_range_m": "max_range_m"}
-    map_options = MapOptions(**{named[name]: given.pop(name) for name in named if name in given})
-    request = EvaluateRequest(
-        run or opt.latest_run(), needs_reference=not given.pop("no_reference"), map_options=map_options, **given
-    )
+    request = EvaluateRequest(run or opt.latest_run(), needs_reference=not given.pop("no_reference"), **given)
     evaluation = evaluate(request)
     say(format_evaluation(evaluation))
     if gates:
@@ -197,6 +193,6 @@ def compare(
 @click.option("--scans", type=click.IntRange(min=20), default=400, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:
     """Simulate an office, map it, and compare with KISS-ICP."""
-    from lidarslam.compare.demo import format_demo, run_demo
+    from lidarslam.compare.demo import run_demo
 
-    say(format_demo(run_demo(out, scans, tell=note)))
+    run_demo(out, scans, say, note)

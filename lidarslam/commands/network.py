@@ -1,6 +1,5 @@
 """`lidarslam train` and `lidarslam export`: weights of the learned odometry."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +41,8 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say
 def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Train the learned odometry on recordings without labels.
 
-    Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun;
-    --jobs and --ray are for the preparation of recordings.
+    Ctrl-C ends the training with the weights so far, and --resume continues it. --jobs and --ray are for the
+    preparation of recordings.
     """
     from lidarslam.odometry.registry import require_train_extra
     from lidarslam.storage.finished_run import source_name
@@ -51,8 +50,6 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     if out is None:
         if options["resume"]:
             raise click.UsageError("--resume continues the training in --out; name it")
-        if "WORLD_SIZE" in os.environ:
-            raise click.UsageError("the processes of torchrun share a directory; name it with --out")
         out = opt.default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
     require_train_extra("training")
     where = opt.take_where(options)

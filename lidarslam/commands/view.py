@@ -25,8 +25,7 @@ _RRD = ".rrd"
     lidarslam view compared/04 --web
     lidarslam view runs/04/recording.rrd
     lidarslam view runs/04 --picture map.png
-    lidarslam view compared/04 --picture maps.png
-    lidarslam view runs/04 --video map.gif"""
+    lidarslam view compared/04 --picture maps.png"""
 )
 @click.argument("places", type=opt.PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
@@ -37,22 +36,20 @@ _RRD = ".rrd"
     metavar="FILE.png",
     help="Draw runs, or .ply files, in one picture instead; into a folder, each in one of its own, in the same frame.",
 )
-@click.option(
-    "--video", type=opt.PATH, metavar="FILE.gif", help="Turn what --picture draws once, as .gif, or .mp4 by ffmpeg."
-)
-@click.option(
-    "--colour",
-    type=click.Choice(["height", "intensity", "error", "rgb"]),
-    help="Colour of one run's map, in the picture or video; error: the path by its distance to the ground truth, or the"
-    " map that evaluate --errors wrote by that to the reference map.  [default: height]",
-)
 @click.option("--oblique", is_flag=True, help="Draw the picture obliquely instead of from above.")
 @opt.scan_options
 @opt.reader_options
 @opt.config_options
 @click.pass_context
 def view(
-    ctx: click.Context, /, places: tuple[Path, ...], web: bool, colour: Any, oblique: bool, **options: Any
+    ctx: click.Context,
+    /,
+    places: tuple[Path, ...],
+    web: bool,
+    save: Path | None,
+    picture: Path | None,
+    oblique: bool,
+    **options: Any,
 ) -> None:
     """Show runs, the scans of a recording, or a Rerun recording.
 
@@ -60,16 +57,13 @@ def view(
     ground truth if there is one.  [default: the latest run in runs]  SOURCE is a recording; --start, --stop and --step
     choose its scans. With --picture, RUN may also be a cloud (.ply or .pcd).
     """
-    save, picture, video = (options.pop(name) for name in ("save", "picture", "video"))
-    if sum([web, *(place is not None for place in (save, picture, video))]) > 1:
-        raise click.UsageError("--web, --save, --picture and --video exclude one another; choose one")
-    if (colour is not None and picture is None and video is None) or (oblique and picture is None):
-        raise click.UsageError("--colour belongs to --picture and --video, and --oblique to --picture")
+    if web + (save is not None) + (picture is not None) > 1:
+        raise click.UsageError("--web, --save and --picture exclude one another; choose one")
+    if oblique and picture is None:
+        raise click.UsageError("--oblique belongs to --picture")
     places = places or (opt.latest_run(),)
     if picture is not None:
-        _draw(_drawn(places, colour, apart=not picture.suffix), picture, colour or "height", oblique)
-    elif video is not None:
-        _film(places, video, colour)
+        _draw(places, picture, oblique)
     elif any(place.suffix.lower() == _RRD for place in places):
         if len(places) > 1 or save is not None:
             raise click.UsageError(f"a {_RRD} file is shown alone, in a window or with --web")
@@ -139,38 +133,13 @@ def _scans(source: Path, options: dict[str, Any]) -> Any:
     return show_scans(recording, source, chosen, config.viewer, show_count, note)
 
 
-def _drawn(places: tuple[Path, ...], colour: Any, apart: bool) -> list[Any]:
-    """The runs that are drawn; their type is not named because that would import scipy."""
-    from lidarslam.assessment.inputs import truth_of_run
-    from lidarslam.storage.finished_run import run_directories
-    from lidarslam.viewer.picture import load_drawn_runs, require_quantity
+def _draw(places: tuple[Path, ...], picture: Path, oblique: bool) -> None:
+    from lidarslam.viewer.picture import OBLIQUE, TOP, draw_apart, draw_runs, fit_frame, load_drawn_runs, save_picture
 
-    first = run_directories(places[0])[0]
-    runs = load_drawn_runs(places, truth_of_run(first) if colour == "error" and first.is_dir() else None)
-    if colour is not None and len(runs) > 1 and not apart:
-        raise click.UsageError(f"--colour is of one run, and these are {len(runs)}, which have a colour each")
-    for run in runs if colour is not None else ():
-        require_quantity(run, colour)
-    return runs
-
-
-def _draw(runs: list[Any], picture: Path, colour: Any, oblique: bool) -> None:
-    from lidarslam.viewer.picture import OBLIQUE, TOP, draw_apart, draw_runs, fit_frame, save_picture
-
-    frame = fit_frame(runs, OBLIQUE if oblique else TOP, quantity=colour)
+    runs = load_drawn_runs(places)
+    frame = fit_frame(runs, OBLIQUE if oblique else TOP)
     if picture.suffix:
         save_picture(picture, draw_runs(runs, frame))
         say(f"written to {picture}")
     else:
         say(f"written to {', '.join(map(str, draw_apart(runs, picture, frame)))}")
-
-
-def _film(places: tuple[Path, ...], video: Path, colour: Any) -> None:
-    from lidarslam.run.progress import show_count
-    from lidarslam.viewer.picture import check_video_file, save_video, turn_runs
-
-    check_video_file(video)
-    runs = _drawn(places, colour, apart=False)
-    with show_count("drawing") as counted:
-        save_video(video, turn_runs(runs, colour or "height", counted))
-    say(f"written to {video}")

@@ -4,17 +4,14 @@ import contextlib
 import os
 import platform
 import subprocess
-import tarfile
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from io import BytesIO
 from pathlib import Path
 
-from lidarslam.assessment.evaluate import evaluate_map
+from lidarslam.assessment.evaluate import EvaluateRequest, evaluate_map
 from lidarslam.assessment.inputs import find_reference_map, load_reference_map, read_estimate
 from lidarslam.compare import method_run
 from lidarslam.compare.method_run import Limits, MethodRun
@@ -29,7 +26,7 @@ from lidarslam.compare.plan import (
     make_recordings,
     require_data,
 )
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, only_writer
 from lidarslam.core.tasks import open_tasks, usable_cores
 from lidarslam.core.text import as_typed, command_line, count, joined
@@ -59,17 +56,6 @@ from lidarslam.storage.finished_run import COMPARISON, REPORT_HTML, REPORT_MD, r
 
 _INTERRUPTED = "the comparison was interrupted before its turn"
 
-Counter = Callable[[int, int], None]
-"""Called with the number of the scan just finished, from 1, and how many there are."""
-
-
-@dataclass(frozen=True)
-class Narrator:
-    """Progress: `counting` for the time of one method, by its name; `tell` with a line for each finished method."""
-
-    counting: Callable[[str], AbstractContextManager[Counter]]
-    tell: Callable[[str], None]
-
 
 @dataclass(frozen=True)
 class CompareOutcome:
@@ -95,7 +81,7 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
             require_data(request, benchmark)
         require_methods(request.gates, [method.name for method in request.methods])
         make_recordings(request)
-        outcome = compare(request, Narrator(show_count, tell))
+        outcome = compare(request, tell)
     say(format_comparison(outcome.comparison, request.out))
     if outcome.is_empty:
         tell("no method came to a result; the table says why")
@@ -108,11 +94,13 @@ def run_compare(request: CompareRequest, say: Callable[[str], None], tell: Calla
     return replace(outcome, gates_passed=all(gate.passed for gate in judged))
 
 
-def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] = method_run.COMMAND) -> CompareOutcome:
+def compare(
+    request: CompareRequest, tell: Callable[[str], None], command: Sequence[str] = method_run.COMMAND
+) -> CompareOutcome:
     """Run, evaluate, and write comparison.json and the report.
 
-    A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. The command is the
-    process of each method, see `run_method`.
+    A method that fails is a row; Ctrl-C ends the running method, and the results so far are written. `tell` is called
+    with a line for each finished method; the command is the process of each, see `run_method`.
     """
     from lidarslam.evaluation.report.report import render_html, render_markdown
 
@@ -121,7 +109,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
         request.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(request.out, error) from error
-    turns, directory = _Turns(request, narrator, command), RunDirectory(request.out)
+    turns, directory = _Turns(request, tell, command), RunDirectory(request.out)
     sequences: list[SequenceComparison] = []
     with only_writer(request.out):
         if not request.where.is_serial:
@@ -151,7 +139,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
 @dataclass
 class _Turns:
     request: CompareRequest
-    narrator: Narrator
+    tell: Callable[[str], None]
     command: Sequence[str]
     interrupted: bool = False
     # of those that ran side by side, by their directories
@@ -163,27 +151,29 @@ class _Turns:
         if not wanted:
             return
         scans = [len(range(len(p.recording))[p.entry.start : p.entry.stop : p.entry.step]) for p, _ in wanted]
-        where, counted = self.request.where, 0
+        counted = 0
+        for _, run in wanted:
+            (run.request.out / method_run.PROCESS).unlink(missing_ok=True)  # of an earlier comparison
 
-        def take(index: int, done: tuple[MethodResult, bytes | None]) -> None:
+        def take(index: int, result: MethodResult) -> None:
             nonlocal counted
-            (planned, run), (result, packed) = wanted[index], done
-            if packed is not None:
-                method_run.clear(run.request.out)
-                with tarfile.open(fileobj=BytesIO(packed)) as archive:
-                    archive.extractall(run.request.out, filter="data")
+            planned, run = wanted[index]
+            if not (run.request.out / method_run.PROCESS).is_file():
+                raise OutputError(
+                    f"{self.request.out}: is not shared by the nodes of the cluster; name a folder that is with --out"
+                )
             counted += scans[index]
             counter(counted, sum(scans))
             self._done[run.request.out] = result
-            self.narrator.tell(format_result(planned.name, result))
+            self.tell(format_result(planned.name, result))
 
-        command, is_remote = None if self.command == method_run.COMMAND else self.command, where.cluster is not None
-        limits, here = self.request.limits, str(Path.cwd())
-        tasks = [MethodTask(r, limits, command, here, url_of(r.request.source), is_remote) for _, r in wanted]
-        with self.narrator.counting(f"{count(len(tasks), 'run')} side by side") as counter:
+        command = None if self.command == method_run.COMMAND else self.command
+        run_one = partial(run_task, limits=self.request.limits, command=command, folder=str(Path.cwd()))
+        tasks = [(run, url_of(run.request.source)) for _, run in wanted]
+        with show_count(f"{count(len(tasks), 'run')} side by side") as counter:
             try:
-                with open_tasks(where) as executor:
-                    deque(executor.run(run_task, tasks, take), maxlen=0)
+                with open_tasks(self.request.where) as executor:
+                    deque(executor.run(run_one, tasks, take), maxlen=0)
             except KeyboardInterrupt:
                 self.interrupted = True
 
@@ -210,50 +200,26 @@ class _Turns:
         result = known or MethodResult(run.name, "not run", _INTERRUPTED)
         try:
             if known is None:
-                with self.narrator.counting(f"{planned.name} {run.name}") as counter:
+                with show_count(f"{planned.name} {run.name}") as counter:
                     result, self.interrupted = method_run.run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
-        self.narrator.tell(format_result(planned.name, result, known is not None and known.status in WHOLE))
+        self.tell(format_result(planned.name, result, known is not None and known.status in WHOLE))
         return result
 
 
-@dataclass(frozen=True)
-class MethodTask:
-    """One method on one recording, as a task."""
+def run_task(
+    task: tuple[MethodRun, str | None], limits: Limits, command: Sequence[str] | None, folder: str
+) -> MethodResult:
+    """Run a method in a folder that relative paths are relative to, on whichever machine.
 
-    run: MethodRun
-    limits: Limits
-    command: Sequence[str] | None  # the process; None: that of the machine that runs it
-    folder: str  # that relative paths are relative to
-    url: str | None  # of the source, where it was fetched
-    is_remote: bool  # whether the run directory comes back with the result: the machine may have other disks
-
-
-def run_task(task: MethodTask) -> tuple[MethodResult, bytes | None]:
-    """Run the method of a task; its result, and the run directory where it has to be brought back."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a machine without that folder has no file there either
-            stack.enter_context(contextlib.chdir(task.folder))
-        request = task.run.request
-        if task.url is not None:
-            fetch(task.url, request.source)
-        if task.is_remote:
-            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarslam-")))
-            # The last two parts are in the result.
-            request = replace(request, out=place / request.out.parent.name / request.out.name)
-        run = replace(task.run, request=request)
-        result, _ = method_run.run_method(run, task.limits, lambda *_: None, task.command or method_run.COMMAND)
-        return result, _packed(request.out) if task.is_remote else None
-
-
-def _packed(folder: Path) -> bytes:
-    """The files of a run directory; last the one that says how the process ended, which marks a whole one."""
-    packed = BytesIO()
-    with tarfile.open(fileobj=packed, mode="w") as archive:
-        for path in sorted(folder.iterdir(), key=lambda path: (path.name == method_run.PROCESS, path)):
-            archive.add(path, path.name)
-    return packed.getvalue()
+    With the method comes the URL of its source, where that was fetched. Without a command it is that of the machine.
+    """
+    run, url = task
+    with contextlib.chdir(folder if Path(folder).is_dir() else "."):  # a machine without it has no file there either
+        if url is not None:
+            fetch(url, run.request.source)
+        return method_run.run_method(run, limits, lambda *_: None, command or method_run.COMMAND)[0]
 
 
 def measure(planned: PlannedRecording, results: Sequence[MethodResult], with_maps: bool = True) -> SequenceComparison:
@@ -322,9 +288,9 @@ def _measure_maps(planned: PlannedRecording, results: Sequence[MethodResult], no
         if reference is None or result.trajectory is None:
             continue
         try:
-            compared = evaluate_map(
-                read_estimate(folders[result.name]), None if is_method else result.metrics, reference
-            )
+            request = EvaluateRequest(folders[result.name])
+            metrics = None if is_method else result.metrics
+            compared = evaluate_map(request, read_estimate(request.run), metrics, reference)
         except InputError as error:
             notes.append(f"{result.name}: no map is compared: {error}")
             continue

@@ -6,11 +6,10 @@ are compared with the true trajectory and the true map.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from lidarslam.assessment.inputs import truth_of_run
-from lidarslam.compare.comparison import CompareOutcome, Narrator, compare, format_comparison
+from lidarslam.compare.comparison import CompareOutcome, compare, format_comparison
 from lidarslam.compare.plan import CompareRequest, RecordingEntry, parse_methods
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.text import as_typed, command_line
@@ -23,22 +22,16 @@ RECORDING, REPLAY = "recording", "demo.rrd"
 METHODS = "learned+map+graph,kiss-icp,kiss-icp@scene"
 
 
-@dataclass(frozen=True)
-class Demo:
-    """A finished demonstration."""
+def run_demo(
+    out: Path, scans: int, say: Callable[[str], None], tell: Callable[[str], None] = lambda _: None
+) -> CompareOutcome:
+    """Record, run the methods, compare, draw the maps.
 
-    out: Path  # the folder that everything is in
-    outcome: CompareOutcome  # the methods compared with the truth
-    pictures: tuple[Path, ...]  # of the true map and of the methods' maps
-
-
-def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], None] = lambda _: None) -> Demo:
-    """Record, run the methods, compare, draw the maps; `tell` is called with a line for each finished method."""
+    `say` prints the table of the methods, and where to look; `tell` is called with a line for each finished method.
+    """
     source = out / RECORDING
     with show_count("recording") as counted:
-        request = RecordRequest(
-            source, "office", "vlp-16", "tracked", "upright", scans, seed, format="mcap", overwrite=True
-        )
+        request = RecordRequest(source, "office", "vlp-16", "tracked", "upright", scans, 0, "mcap", overwrite=True)
         record(request, counted)
     comparison = CompareRequest(
         out=out,
@@ -48,7 +41,7 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
         title="A tracked robot turns on the spot in an office",
         command=f"lidarslam demo --out {out} --scans {scans}",
     )
-    outcome = compare(comparison, Narrator(show_count, tell))
+    outcome = compare(comparison, tell)
     (sequence,) = outcome.comparison.sequences
     runs = [out / result.run for result in sequence.methods if result.run and result.trajectory is not None]
     if runs:
@@ -58,16 +51,13 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
         finished, truth = [load_run(run) for run in runs], truth_of_run(runs[0])
         save(show_runs(finished, truth, ViewerConfig()), out / REPLAY)
     drawn = load_drawn_runs([source, *runs])
-    return Demo(out, outcome, tuple(draw_apart(drawn, out, fit_frame(drawn))))
+    pictures = draw_apart(drawn, out, fit_frame(drawn))
+    say(f"""
+{format_comparison(outcome.comparison, out)}
+maps      {", ".join(map(str, pictures))}
+replay    {command_line(as_typed("lidarslam"), "view", str(out / REPLAY), "--web")}
 
-
-def format_demo(demo: Demo) -> str:
-    """The table of the demonstration, and where to look."""
-    return f"""
-{format_comparison(demo.outcome.comparison, demo.out)}
-maps      {", ".join(str(picture) for picture in demo.pictures)}
-replay    {command_line(as_typed("lidarslam"), "view", str(demo.out / REPLAY), "--web")}
-
-Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that,
+Open {out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that,
 with its defaults, which suit streets, and with a range and voxels by the size of the scene (kiss-icp@scene). The
-network measures a turn whatever its size, and the map corrects the rest."""
+network measures a turn whatever its size, and the map corrects the rest.""")
+    return outcome

@@ -4,6 +4,7 @@ import hashlib
 import json
 import random
 import signal
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -251,12 +252,41 @@ def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, where: Where) -> None:
-    """Prepare the stretches into the cache, where they are not in it already.
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """Recordings to train on, how often each is drawn, and recordings to validate on."""
+
+    learned: Sequence[PreparedRecording]
+    held_out: Sequence[PreparedRecording]
+    weights: Sequence[float]
+
+
+def prepare_all(stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, where: Where) -> Recordings:
+    """All recordings, prepared into the cache where they are not in it already, and divided.
 
     InputError where a recording is unreadable, OutputError where the cache cannot be written, or is another folder on
     the nodes of a cluster. After Ctrl-C, finished recordings stay in the cache.
     """
+    learned, held_out = hold_out(stretches, config.hold_out, config.seed)
+    with handling(signal.default_int_handler):  # a training's own first Ctrl-C only notes the request
+        if not where.is_serial:
+            _prepare_side_by_side([*learned, *held_out], config, cache, where)
+        done, total = 0, sum(map(len, stretches))
+        with show_count("preparing recordings") as show:
+
+            def count(more: int) -> None:
+                nonlocal done
+                done += more
+                show(done, total)
+
+            return Recordings(
+                learned=prepared(learned, config, cache, count),
+                held_out=prepared(held_out, config, cache, count),
+                weights=draw_weights(learned),
+            )
+
+
+def _prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, where: Where) -> None:
     pieces = [piece for stretch in stretches for piece in stretch.pieces()]
     wanted = [piece for piece in pieces if not file_of(piece, config, cache).is_file()]
     done, total = 0, sum(map(len, wanted))
@@ -267,10 +297,8 @@ def prepare_side_by_side(stretches: Sequence[Stretch], config: TrainingConfig, c
         show(done, total)
 
     prepare_one = partial(_prepare_one, config=config, cache=cache.absolute())
-    at_once = handling(signal.default_int_handler)  # a training's own first Ctrl-C only notes the request
-    with show_count("preparing side by side") as show, at_once, open_tasks(where) as tasks:
-        for _ in tasks.run(prepare_one, wanted, count):
-            pass
+    with show_count("preparing side by side") as show, open_tasks(where) as tasks:
+        deque(tasks.run(prepare_one, wanted, count), maxlen=0)
     if not all(file_of(piece, config, cache).is_file() for piece in wanted):
         raise OutputError(f"{cache}: is not shared by the nodes of the cluster; name a folder that is with --prepared")
 

@@ -2,19 +2,16 @@
 
 import contextlib
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
-from torch import Generator, Tensor, distributed, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Generator, nn
 
 from lidarslam.config.settings import (
     SOURCES_SECTION,
@@ -42,7 +39,6 @@ from lidarslam.odometry.training.pairs import PairBatch, Pairs
 from lidarslam.odometry.training.preparation import PreparedRecording
 from lidarslam.pipeline.threads import prefetch
 from lidarslam.run.interruption import handling
-from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import data
 from lidarslam.train import directory as files
@@ -58,58 +54,10 @@ _LOSSES = {
 }
 
 
-class Devices:
-    """The `device` of this `process`, one of several `processes`, of which only the first, 0, writes and prints.
-
-    ConfigError where the device is not available.
-    """
-
-    def __init__(self, name: DeviceName) -> None:
-        if name == "cuda" and not torch.cuda.is_available():
-            raise ConfigError("--device cuda: PyTorch finds no such device here; leave it out, or choose cpu")
-        is_cuda = name != "cpu" and torch.cuda.is_available()
-        self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if is_cuda else torch.device("cpu")
-        self.processes = int(os.environ.get("WORLD_SIZE", "1"))
-        self.process = int(os.environ.get("RANK", "0")) if self.processes > 1 else 0
-        self.is_first = self.process == 0
-        if is_cuda:
-            torch.cuda.set_device(self.device)
-        if self.processes > 1 and not distributed.is_initialized():
-            # The first process prepares all recordings, and the others wait.
-            distributed.init_process_group("nccl" if is_cuda else "gloo", timeout=_PREPARED_WITHIN)
-
-    def shared(self, module: nn.Module) -> nn.Module:
-        """A module on the device, with gradients averaged over the processes."""
-        if self.processes == 1:
-            return module
-        # Which parameters have a gradient depends on the losses.
-        return DistributedDataParallel(module, find_unused_parameters=True)
-
-    def wait(self) -> None:
-        """Wait for all processes."""
-        if self.processes > 1:
-            distributed.barrier()
-
-    def any(self, flag: bool) -> bool:
-        """Whether it is true in any process."""
-        if self.processes == 1:
-            return flag
-        total = torch.tensor(float(flag), device=self.device)
-        distributed.all_reduce(total)
-        return bool(total > 0.0)
-
-    def close(self) -> None:
-        """Leave the other processes."""
-        if self.processes > 1 and distributed.is_initialized():
-            distributed.destroy_process_group()
-
-
 # Steps between lines of the log, and between validations.
 LOG_EVERY, VALIDATE_EVERY = 50, 500
 # Validations of a training, at most.
 _MOST_VALIDATIONS = 10
-# Longest wait of a process for the others.
-_PREPARED_WITHIN = timedelta(hours=24)
 # Largest norm of the gradient; longer ones are clipped.
 _MOST_GRADIENT = 1.0
 # Rotation and translation errors that count the same when validations are compared: a degree and five centimetres.
@@ -118,84 +66,61 @@ _ROTATION_DEG, _TRANSLATION_M = 1.0, 0.05
 _LOSS_STREAM = 7_919
 
 
-@dataclass(frozen=True, eq=False)
-class Recordings:
-    """Recordings to train on, how often each is drawn, and recordings to validate on."""
-
-    learned: Sequence[PreparedRecording]
-    held_out: Sequence[PreparedRecording]
-    weights: Sequence[float]
-
-
-class _LossModule(nn.Module):
-    """From a batch to its loss as one module, the unit that several processes can share."""
-
-    def __init__(self, network: nn.Module, config: TrainingConfig) -> None:
-        super().__init__()
-        self.network, self.config = network, config
-
-    def forward(self, batch: PairBatch, generator: Generator) -> dict[str, Tensor]:
-        """The loss and its parts."""
-        return objective(cast(PairNetwork, self.network)(batch), batch, self.config, generator)._asdict()
-
-
 @dataclass(eq=False)
 class TrainingLoop:
-    """One training in one process; only the first process validates, writes and prints."""
+    """The steps of one training."""
 
     config: TrainingConfig
     # network, optimizer: on the device
     network: nn.Module
     optimizer: torch.optim.Optimizer
     progress: files.Progress
-    devices: Devices
+    device: torch.device
     out: Path  # the directory of the training
     about: dict[str, Any]  # the data that the weights are trained on
     say: Callable[[str], None]  # prints a line
 
-    def run(self, recordings: Recordings, is_interrupted: Callable[[], bool]) -> bool:
+    def run(self, recordings: data.Recordings, is_interrupted: Callable[[], bool]) -> bool:
         """Do the remaining steps; whether all of them were done; ConfigError where the loss is no longer a number."""
-        config, progress, devices = self.config, self.progress, self.devices
-        self._module = devices.shared(_LossModule(self.network, config))
+        config, progress = self.config, self.progress
         is_new = not progress.step and progress.best is None  # or killed before its first state
-        self._log = files.TrainingLog(self.out, None if is_new else progress.step) if devices.is_first else None
+        self._log = files.TrainingLog(self.out, None if is_new else progress.step)
         surfaces, birds = config.geometric is not None, config.network.name == "correlation"
-        pairs = Pairs(recordings.learned, config.seed, surfaces, birds, recordings.weights, device=devices.device)
+        pairs = Pairs(recordings.learned, config.seed, surfaces, birds, recordings.weights, device=self.device)
         self._clock = time.perf_counter()
         if progress.best is None:
-            self._validate(recordings)
+            self._validate(recordings.held_out)
         todo = range(progress.step, config.steps)
         validate_every = max(VALIDATE_EVERY, -(-config.steps // _MOST_VALIDATIONS))
-        drawn = prefetch(pairs.batch(step, config.batch, devices.process) for step in todo)
+        drawn = prefetch(pairs.batch(step, config.batch) for step in todo)
         with contextlib.closing(cast(Any, drawn)) as batches:
             for step, batch in zip(todo, batches, strict=True):
-                if devices.any(is_interrupted()):
+                if is_interrupted():
                     break
                 self._step(step, batch)
                 is_last = progress.step == config.steps
                 if is_last or not progress.step % LOG_EVERY:
                     self._report()
                 if is_last or not progress.step % validate_every:
-                    self._validate(recordings)
+                    self._validate(recordings.held_out)
                     self._save()
-        if progress.step != config.steps and self._log is not None:
+        if progress.step != config.steps:
             self._save_weights(files.LAST_WEIGHTS, None)
             if not recordings.held_out:
                 self._save_weights(files.WEIGHTS, None)
         self._save()
-        if self._log is not None:
-            self._log.close()
+        self._log.close()
         return progress.step == config.steps
 
     def _step(self, step: int, batch: PairBatch) -> None:
         config, progress = self.config, self.progress
-        generator = Generator().manual_seed((config.seed * _LOSS_STREAM + step) * _LOSS_STREAM + self.devices.process)
+        generator = Generator().manual_seed((config.seed * _LOSS_STREAM + step) * _LOSS_STREAM)
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(step, config)
         self.optimizer.zero_grad()
-        losses: dict[str, Tensor] = self._module(batch, generator)
-        losses["total"].backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self._module.parameters(), _MOST_GRADIENT)
+        losses = objective(cast(PairNetwork, self.network)(batch), batch, config, generator)._asdict()
+        losses["total"].backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), _MOST_GRADIENT)
         self.optimizer.step()
         values = torch.stack(list(losses.values())).tolist()  # one transfer from the device
         if not all(map(math.isfinite, values)):
@@ -213,34 +138,30 @@ class TrainingLoop:
         losses = {name: value / progress.counted for name, value in progress.sums.items()}
         now = time.perf_counter()
         per_step = (now - self._clock) / progress.counted
-        speed = config.batch * self.devices.processes / per_step
+        speed = config.batch / per_step
         self._clock, progress.sums, progress.counted = now, {}, 0
-        if self._log is not None:
-            rate = {"learning_rate": learning_rate(progress.step - 1, config), "pairs_per_s": speed}
-            self._log.losses(progress.step, losses | rate)
-            left_s = per_step * (config.steps - progress.step)
-            self.say(files.format_step(progress.step, config.steps, losses, speed, left_s))
+        rate = {"learning_rate": learning_rate(progress.step - 1, config), "pairs_per_s": speed}
+        self._log.losses(progress.step, losses | rate)
+        left_s = per_step * (config.steps - progress.step)
+        self.say(files.format_step(progress.step, config.steps, losses, speed, left_s))
 
-    def _validate(self, recordings: Recordings) -> None:
+    def _validate(self, held_out: Sequence[PreparedRecording]) -> None:
         """Measure the network on the held-out recordings, and keep the best."""
-        began = time.perf_counter()
-        if self._log is not None:
-            self.network.eval()
-            progress = self.progress
-            self._save_weights(files.LAST_WEIGHTS, None)
-            if recordings.held_out:
-                result = validate(self.network, recordings.held_out, self.devices.device)
-                self._log.validation(progress.step, result)
-                # Without anything to compare with, the last is as good as any.
-                improves = progress.best is not None and score(result) < progress.best
-                if improves or not result.pairs or progress.best is None:
-                    progress.best = score(result) if result.pairs else None
-                    self._save_weights(files.WEIGHTS, result if result.pairs else None)
-                self.say(files.format_validation(progress.step, result, improves))
-            else:
-                self._save_weights(files.WEIGHTS, None)
-            self.network.train()
-        self.devices.wait()
+        began, progress = time.perf_counter(), self.progress
+        self.network.eval()
+        self._save_weights(files.LAST_WEIGHTS, None)
+        if held_out:
+            result = validate(self.network, held_out, self.device)
+            self._log.validation(progress.step, result)
+            # Without anything to compare with, the last is as good as any.
+            improves = progress.best is not None and score(result) < progress.best
+            if improves or not result.pairs or progress.best is None:
+                progress.best = score(result) if result.pairs else None
+                self._save_weights(files.WEIGHTS, result if result.pairs else None)
+            self.say(files.format_validation(progress.step, result, improves))
+        else:
+            self._save_weights(files.WEIGHTS, None)
+        self.network.train()
         self._clock += time.perf_counter() - began
 
     def _save_weights(self, name: str, result: Validation | None) -> None:
@@ -249,8 +170,7 @@ class TrainingLoop:
         save_checkpoint(self.out / name, checkpoint)
 
     def _save(self) -> None:
-        if self._log is not None:
-            files.save_state(self.out / files.STATE, self.network, self.optimizer, self.progress)
+        files.save_state(self.out / files.STATE, self.network, self.optimizer, self.progress)
 
 
 def score(result: Validation) -> float:
@@ -304,25 +224,34 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
     }
     if request.start_from is not None:
         about["from"] = str(request.start_from)
-    with contextlib.closing(Devices(request.device)) as devices, _interruption() as is_interrupted:
-        make_directory(request.out)
-        with only_writer(request.out) if devices.is_first else contextlib.nullcontext():
-            recordings = _recordings(request, config.training, stretches, devices, is_interrupted)
-            if devices.is_first:
-                remove_partial_files(request.out)  # of a training that was killed
-                files.remove_results(request.out, [] if request.resume else earlier)
-                RunDirectory(request.out).write_text(files.CONFIG, dump_yaml(config, about, SOURCES_SECTION))
-                say(_summary(recordings, stretches, devices))
-            loop, progress = _loop(request, config.training, start, devices, about, say)
-            if progress.step and devices.is_first:
-                say(f"going on after step {progress.step:,}")
-            is_complete = loop.run(recordings, is_interrupted)
-        if devices.is_first:
-            written = load_checkpoint(request.out / files.WEIGHTS).about
-            kept = written.get("validation")
-            best = kept and Validation(**{**kept, "covered_percent": tuple(kept["covered_percent"])})
-            say(files.format_outcome(request.out, progress.step, written["steps"], best, not is_complete))
+    device = _device(request.device)
+    make_directory(request.out)
+    with _interruption() as is_interrupted, only_writer(request.out):
+        cache = request.prepared or request.out / files.PREPARED
+        if request.prepared is None:
+            require_no_link([cache])
+        recordings = data.prepare_all(stretches, config.training, cache, request.where)
+        remove_partial_files(request.out)  # of a training that was killed
+        files.remove_results(request.out, [] if request.resume else earlier)
+        RunDirectory(request.out).write_text(files.CONFIG, dump_yaml(config, about, SOURCES_SECTION))
+        say(_summary(recordings, stretches, device))
+        loop = _loop(request, config.training, start, device, about, say)
+        if loop.progress.step:
+            say(f"going on after step {loop.progress.step:,}")
+        is_complete = loop.run(recordings, is_interrupted)
+    written = load_checkpoint(request.out / files.WEIGHTS).about
+    kept = written.get("validation")
+    best = kept and Validation(**{**kept, "covered_percent": tuple(kept["covered_percent"])})
+    say(files.format_outcome(request.out, loop.progress.step, written["steps"], best, not is_complete))
     return is_complete
+
+
+def _device(name: DeviceName) -> torch.device:
+    """The device that is asked for; ConfigError where it is not available."""
+    has_cuda = torch.cuda.is_available()
+    if name == "cuda" and not has_cuda:
+        raise ConfigError("--device cuda: PyTorch finds no such device here; leave it out, or choose cpu")
+    return torch.device("cuda", 0) if name != "cpu" and has_cuda else torch.device("cpu")
 
 
 def with_network_of(start: Checkpoint | None, config: TrainConfig) -> TrainConfig:
@@ -341,44 +270,10 @@ def with_network_of(start: Checkpoint | None, config: TrainConfig) -> TrainConfi
     return config.model_copy(update={"training": training})
 
 
-def _recordings(
-    request: TrainRequest, config: TrainingConfig, stretches: Sequence[data.Stretch], devices: Devices,
-    is_interrupted: Callable[[], bool],
-) -> Recordings:  # fmt: skip
-    """All recordings, prepared; the first process does that, and the others find them in the cache."""
-    cache = request.prepared or request.out / files.PREPARED
-    if request.prepared is None:
-        require_no_link([cache])
-    learned, held_out = data.hold_out(stretches, config.hold_out, config.seed)
-    done, total = 0, sum(len(stretch) for stretch in stretches)
-    if not devices.is_first:
-        devices.wait()
-    if devices.is_first and not request.where.is_serial:
-        data.prepare_side_by_side([*learned, *held_out], config, cache, request.where)
-    with show_count("preparing recordings") as show:
-
-        def count(more: int) -> None:
-            """An interruption ends the preparation; prepared recordings stay in the cache."""
-            nonlocal done
-            if is_interrupted():
-                raise KeyboardInterrupt
-            done += more
-            show(done, total)
-
-        recordings = Recordings(
-            learned=data.prepared(learned, config, cache, count),
-            held_out=data.prepared(held_out, config, cache, count),
-            weights=data.draw_weights(learned),
-        )
-    if devices.is_first:
-        devices.wait()
-    return recordings
-
-
 def _loop(
-    request: TrainRequest, config: TrainingConfig, start: Checkpoint | None, devices: Devices,
+    request: TrainRequest, config: TrainingConfig, start: Checkpoint | None, device: torch.device,
     about: dict[str, Any], say: Callable[[str], None],
-) -> tuple[TrainingLoop, files.Progress]:  # fmt: skip
+) -> TrainingLoop:  # fmt: skip
     """The training, at its beginning or where it was stopped."""
     if start is None:  # random weights, which follow from the seed alone
         with torch.random.fork_rng(devices=[]):
@@ -386,7 +281,7 @@ def _loop(
             network = make_network(config.network)
     else:
         network = network_of(start).train()
-    network = network.to(devices.device)
+    network = network.to(device)
     optimizer = make_optimizer(network, config)
     progress = files.Progress(data=about["digest"])
     state = request.out / files.STATE
@@ -401,21 +296,20 @@ def _loop(
     about = {**about, "sources": [source.name for source in request.sources]}
     if request.start_from is not None:
         about["from"] = request.start_from.name
-    return TrainingLoop(config, network, optimizer, progress, devices, request.out, about, say), progress
+    return TrainingLoop(config, network, optimizer, progress, device, request.out, about, say)
 
 
-def _summary(recordings: Recordings, stretches: Sequence[data.Stretch], devices: Devices) -> str:
+def _summary(recordings: data.Recordings, stretches: Sequence[data.Stretch], device: torch.device) -> str:
     drawn = sum(stretch.is_simulated for stretch in stretches)
     of_them = f", {drawn:,} of them simulated" if drawn else ""
     held = sum(len(recording) for recording in recordings.held_out)
     held_out = f"{held:,} more are held out for validation" if held else "none is held out for validation"
     scans = sum(len(recording) for recording in recordings.learned)
     valid = torch.cat([recording.valid for recording in recordings.learned])
-    processes = f" in {devices.processes} processes" if devices.processes > 1 else ""
     return (
         f"training on {len(stretches):,} recording{'s' if len(stretches) > 1 else ''}{of_them}: {scans:,} scans to"
         f" learn from, {held_out}; {100.0 * float(valid.float().mean()):.0f} % of consecutive scans could be"
-        f" aligned. Computing on {devices.device}{processes}"
+        f" aligned. Computing on {device}"
     )
 
 

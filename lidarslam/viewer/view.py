@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluation.report.drawing import ramp, viridis
+from lidarslam.evaluation.report.drawing import ramp
 
 WIDTH = 1600
 # Height of a picture and its margin, relative to its width.
@@ -93,29 +92,12 @@ def fit_view(
     return _fit(view_axes(turn_deg, elevation_deg), points, path, width)
 
 
-def turning_views(
-    points: FloatArray, path: FloatArray, elevation_deg: float, turns_deg: Sequence[float], width: int
-) -> list[View]:
-    """Views about the vertical through the middle of the scene, one for each turn, all of one scale; see `fit_view`."""
-    sample = points[:: max(1, len(points) // _SAMPLED)]
-    # The middle of the scene, in the world.
-    middle = np.mean([_box(np.roll(np.eye(3), -axis, axis=0), sample, path)[:, 0] for axis in range(3)], axis=1)
-    axes = [view_axes(turn_deg, elevation_deg) for turn_deg in turns_deg]
-    reach = np.max([np.abs(_box(of, sample, path) - of[:2] @ middle) for of in axes], axis=(0, 1))
-    return [_view(of, of[:2] @ middle, 2.0 * reach, width) for of in axes]
-
-
 def _fit(axes: FloatArray, points: FloatArray, path: FloatArray, width: int) -> View:
-    box = _box(axes, points, path)
-    return _view(axes, box.mean(axis=0), box[1] - box[0], width)
-
-
-def _view(axes: FloatArray, centre: FloatArray, size_m: FloatArray, width: int) -> View:
-    margin = round(_MARGIN * width)
-    tallest, lowest = round(_TALLEST * width), round(_LOWEST * width)
+    box, margin = _box(axes, points, path), round(_MARGIN * width)
+    size_m, tallest, lowest = box[1] - box[0], round(_TALLEST * width), round(_LOWEST * width)
     pixel_m = float((size_m / [width - 2 * margin, tallest - 2 * margin]).max())
     height = int(np.clip(np.ceil(size_m[1] / pixel_m) + 2 * margin, lowest, tallest))
-    return View(axes, centre, pixel_m, width, height, size_m)
+    return View(axes, box.mean(axis=0), pixel_m, width, height, size_m)
 
 
 def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:
@@ -211,17 +193,7 @@ def _eye_dome(depth: NDArray[np.float32], pixels: NDArray[np.intp], view: View, 
     return np.exp(-darkness)
 
 
-Quantity = Literal["height", "intensity", "error", "rgb"]
-
-UNKNOWN = (205, 205, 205)
-"""Where there is no value."""
 _CLIPPED = (2.0, 98.0)  # percent
-_LEVELS = np.linspace(0.0, 1.0, 256)
-_UNITS: dict[Quantity, tuple[str, str]] = {
-    "height": ("z", " m"),
-    "intensity": ("intensity", ""),
-    "error": ("error", " m"),
-}
 Colour = tuple[int, int, int]
 INK, PAPER, HALO = (20, 20, 20), (255, 255, 255), (255, 255, 255)
 START = (255, 225, 40)
@@ -231,39 +203,29 @@ _LONGEST_BAR = 0.2
 _END_WIDENING = 0.25  # of the marks of wide paths, relative to that of the paths
 _LONGEST_NAME = 32
 
-# On white paper: light ground, dark tops; dark for little light returned; pale for small errors.
-_RAMPS: dict[Quantity, NDArray[np.uint8]] = {
-    "height": ramp(_LEVELS, [(201, 209, 214), (140, 181, 199), (66, 138, 166), (41, 84, 135), (60, 28, 92)]),
-    "intensity": ramp(_LEVELS, [(45, 30, 70), (120, 50, 110), (200, 85, 80), (240, 155, 60), (250, 220, 130)]),
-    "error": viridis(_LEVELS)[::-1],
-}
+HEIGHT_COLOURS = ramp(
+    np.linspace(0.0, 1.0, 256), [(201, 209, 214), (140, 181, 199), (66, 138, 166), (41, 84, 135), (60, 28, 92)]
+)
+"""(256, 3) from low to high, on white paper: light ground, dark tops."""
 
 
-@dataclass(frozen=True, eq=False)
-class ColourScale:
-    """Values as colours: the lowest and highest 2 % are clipped; errors begin at 0."""
+@dataclass(frozen=True)
+class HeightScale:
+    """Heights as colours; the lowest and highest 2 % are clipped."""
 
-    quantity: Quantity  # any but rgb
+    # low, high: of the heights in between, metres
     low: float
     high: float
 
     @property
-    def ramp(self) -> NDArray[np.uint8]:
-        """Colours (256, 3) from the low end to the high one."""
-        return _RAMPS[self.quantity]
-
-    @property
     def ends(self) -> tuple[str, str]:
         """The labels on both sides of the scale."""
-        (label, unit), digits = _UNITS[self.quantity], 1 if self.high >= 1.0 or self.quantity == "height" else 3
-        return f"{label} {self.low:.{digits}f}", f"{self.high:.{digits}f}{unit}"
+        return f"z {self.low:.1f}", f"{self.high:.1f} m"
 
-    def colours(self, values: FloatArray) -> NDArray[np.uint8]:
-        """Colours (N, 3) of values (N,); grey where there is none."""
-        level = (values - self.low) * (255.0 / max(self.high - self.low, 1e-6))
-        colours = self.ramp[np.nan_to_num(np.clip(level, 0.0, 255.0)).astype(np.uint8)]
-        colours[np.isnan(values)] = UNKNOWN
-        return colours
+    def colours(self, heights: FloatArray) -> NDArray[np.uint8]:
+        """Colours (N, 3) of heights (N,)."""
+        level = (heights - self.low) * (255.0 / max(self.high - self.low, 1e-6))
+        return HEIGHT_COLOURS[np.clip(level, 0.0, 255.0).astype(np.uint8)]
 
 
 def levels(values: FloatArray) -> FloatArray:
@@ -274,13 +236,9 @@ def levels(values: FloatArray) -> FloatArray:
     return np.asarray(np.clip((values - low) / max(high - low, 1e-6), 0.0, 1.0))
 
 
-def fit_scale(quantity: Quantity, values: FloatArray) -> ColourScale | None:
-    """The scale that suits values (N,), NaN where there is none; None where there is none at all."""
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return None
-    low, high = np.percentile(known, _CLIPPED)
-    return ColourScale(quantity, 0.0 if quantity == "error" else float(low), float(high))
+def fit_scale(heights: FloatArray) -> HeightScale | None:
+    """The scale that suits heights (N,); None without any."""
+    return HeightScale(*map(float, np.percentile(heights, _CLIPPED))) if len(heights) else None
 
 
 @dataclass(frozen=True, eq=False)

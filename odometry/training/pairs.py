@@ -212,7 +212,7 @@ def _second_order(values: Tensor, first: Tensor, t: Tensor, cross: Tensor) -> Te
     return torch.addcmul(values, t, torch.baddbmm(first, (0.5 * t) * first, cross))
 
 
-# A prime that keeps the random streams of steps and processes apart.
+# A prime that keeps the random streams of seeds and steps apart.
 _STREAM = 1_000_003
 # Seeds of a generator are below this.
 _SEEDS = 2**63
@@ -230,9 +230,9 @@ class Pairs:
     augmentation: Augmentation = AUGMENTATION
     device: torch.device | str = "cpu"
 
-    def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
+    def batch(self, step: int, size: int) -> PairBatch:
         """The pairs of one step, on the device."""
-        seed = (self.seed * _STREAM**2 + step * _STREAM + process) % _SEEDS
+        seed = (self.seed * _STREAM**2 + step * _STREAM) % _SEEDS
         choice, generator = torch.Generator().manual_seed(seed), torch.Generator(self.device).manual_seed(seed)
         drawn = stack([self._draw(choice) for _ in range(size)]).to(torch.device(self.device))
         pairs = augmented(drawn, self.augmentation, generator)

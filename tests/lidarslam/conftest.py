@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from lidarslam.compare.comparison import Counter, Narrator
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
@@ -101,17 +100,18 @@ class Told:
         self.counts: list[tuple[str, int, int]] = []
 
     @contextmanager
-    def counting(self, name: str) -> Iterator[Counter]:
+    def counting(self, name: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda number, total: self.counts.append((name, number, total))
 
-    @property
-    def narrator(self) -> Narrator:
-        return Narrator(self.counting, self.lines.append)
+    def __call__(self, line: str) -> None:
+        self.lines.append(line)
 
 
 @pytest.fixture
-def told() -> Told:
-    return Told()
+def told(monkeypatch: pytest.MonkeyPatch) -> Told:
+    told = Told()
+    monkeypatch.setattr("lidarslam.compare.comparison.show_count", told.counting)
+    return told
 
 
 @pytest.fixture(scope="module")

@@ -56,7 +56,7 @@ def _request(recording: Path, out: Path, methods: str, **changes: Any) -> Compar
 @pytest.fixture(scope="module")
 def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     out = tmp_path_factory.mktemp("compared")
-    return out, compare(_request(recording, out, "kiss-icp@0.5,prior"), Told().narrator)
+    return out, compare(_request(recording, out, "kiss-icp@0.5,prior"), Told())
 
 
 def test_comparison_json_holds_what_the_contract_names(finished):
@@ -92,9 +92,9 @@ def test_every_method_leaves_a_run_directory_and_a_row_of_which_the_best_is_mark
 def test_what_is_finished_is_reused_and_keeps_its_time(finished, recording, told):
     out, before = finished
     with pytest.raises(OutputError, match=r"a comparison already \(comparison.json\); .* --reuse, .* --overwrite"):
-        compare(_request(recording, out, "prior"), told.narrator)
+        compare(_request(recording, out, "prior"), told)
     none = (sys.executable, "-c", "raise SystemExit('was run again')")
-    again = compare(_request(recording, out, "kiss-icp@0.5,prior", reuse=True), told.narrator, none)
+    again = compare(_request(recording, out, "kiss-icp@0.5,prior", reuse=True), told, none)
     first, second = before.comparison.sequences[0], again.comparison.sequences[0]
     assert [method.to_json() for method in second.methods] == [method.to_json() for method in first.methods]
     assert all("in an earlier comparison" in line for line in told.lines)
@@ -104,7 +104,7 @@ def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(finished,
     out = Path(shutil.copytree(finished[0], tmp_path / "out"))
     broken = (sys.executable, "-c", "import sys; sys.exit('broken')")
     changed = _request(recording, out, "prior", reuse=True, settings=("global_map.voxel_size_m=0.3",))
-    outcome = compare(changed, told.narrator, broken)
+    outcome = compare(changed, told, broken)
     (result,) = outcome.comparison.sequences[0].methods
     assert (result.status, result.message, result.trajectory) == ("failed", "broken", None)
     assert outcome.is_empty
@@ -115,7 +115,7 @@ def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(finished,
 def test_whatever_a_method_dies_of_is_its_row(recording, tmp_path, told, faults):
     names = "".join(f"kiss-icp@{number}," for number in (1, 4, 5, 6, 7))
     request = _request(recording, tmp_path, names + "prior", limits=Limits(memory_mb=1000.0))
-    outcome = compare(request, told.narrator, faults)
+    outcome = compare(request, told, faults)
     assert [(row.status, row.message) for row in outcome.comparison.sequences[0].methods] == [
         ("failed", "Aborted (signal 6)"),
         ("failed", "RuntimeError: no such thing"),
@@ -140,7 +140,7 @@ def test_ctrl_c_ends_the_method_at_work_and_writes_what_there_is(recording, tmp_
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
-    outcome = compare(_request(recording, tmp_path, "prior,kiss-icp@3,kiss-icp"), told.narrator, faults)
+    outcome = compare(_request(recording, tmp_path, "prior,kiss-icp@3,kiss-icp"), told, faults)
     assert outcome.interrupted
     assert [row.status for row in outcome.comparison.sequences[0].methods] == ["ok", "not run", "not run"]
     content = json.loads((tmp_path / "comparison.json").read_text())
@@ -152,7 +152,7 @@ def _against(reference: str, finished: Finished, recording: Path, told: Told) ->
     """The methods that were compared already, against another reference."""
     entry = RecordingEntry(recording, prior=recording / "ground_truth.tum", reference=reference)
     request = _request(recording, finished[0], "kiss-icp@0.5,prior", recordings=(entry,), reuse=True)
-    return compare(request, told.narrator).comparison.sequences[0]
+    return compare(request, told).comparison.sequences[0]
 
 
 def test_a_method_can_be_the_reference_and_has_no_errors_itself(finished, recording, told):
@@ -177,7 +177,7 @@ def test_a_file_can_be_the_reference(finished, recording, told, tmp_path, room_t
 def test_without_any_reference_there_is_still_a_table(recording, tmp_path, told, room_scans):
     bare = write_recording(tmp_path / "bare", room_scans[:3])
     entry = RecordingEntry(bare, prior=recording / "ground_truth.tum")
-    outcome = compare(_request(bare, tmp_path / "out", "prior", recordings=(entry,)), told.narrator)
+    outcome = compare(_request(bare, tmp_path / "out", "prior", recordings=(entry,)), told)
     content = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert content["reference"] is None
     assert content["methods"]["prior"]["metrics"] is None
@@ -192,7 +192,7 @@ def test_several_recordings_have_a_file_each_and_one_for_all(recording, tmp_path
     entries = [RecordingEntry(recording, prior=prior, start=start) for start in (2, 1)]
     entries.append(RecordingEntry(tmp_path / "nowhere", name="gone", prior=prior))
     request = _request(recording, tmp_path / "out", "prior", recordings=tuple(entries), skip_missing=True)
-    compare(request, told.narrator)
+    compare(request, told)
     content = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert [sequence["sequence"] for sequence in content["sequences"]] == ["room", "room-2"]
     assert [sequence["methods"]["prior"]["scans"] for sequence in content["sequences"]] == [3, 4]
@@ -209,7 +209,7 @@ def test_an_interruption_before_any_turn_is_written_for_every_recording(recordin
 
     monkeypatch.setattr("lidarslam.compare.method_run.run_method", interrupted)
     entries = (RecordingEntry(recording), RecordingEntry(recording, start=1))
-    outcome = compare(_request(recording, tmp_path, "kiss-icp", recordings=entries), told.narrator)
+    outcome = compare(_request(recording, tmp_path, "kiss-icp", recordings=entries), told)
     assert outcome.interrupted
     for name in ("room", "room-2"):
         content = json.loads((tmp_path / name / "comparison.json").read_text())
@@ -227,7 +227,7 @@ def test_mistakes_are_found_before_anything_is_run(recording, tmp_path, told):
     ]
     for methods, entries, skip, message in mistakes:
         with pytest.raises((ConfigError, InputError), match=message):
-            compare(_request(recording, out, methods, recordings=entries, skip_missing=skip), told.narrator)
+            compare(_request(recording, out, methods, recordings=entries, skip_missing=skip), told)
     assert not out.exists()
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.assessment.evaluate import EvaluateRequest, MapOptions, evaluate, format_evaluation
+from lidarslam.assessment.evaluate import EvaluateRequest, evaluate, format_evaluation
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory, format_kitti, read_transform
@@ -56,7 +56,7 @@ def run(tmp_path: Path, recording: Path, surfaces: FloatArray) -> Path:
 
 
 def test_a_simulated_recording_brings_truth_and_map(run, recording):
-    evaluation = evaluate(EvaluateRequest(run, map_options=MapOptions(refine=False)))
+    evaluation = evaluate(EvaluateRequest(run, refine=False))
     written = json.loads((run / "metrics.json").read_text())
     assert written["association"] == {"matched": 60, "estimate": 60, "reference": 60}
     assert written["trajectory"]["ate_rmse_m"] < 1e-6
@@ -80,7 +80,7 @@ def test_a_simulated_recording_brings_truth_and_map(run, recording):
 def test_every_alignment_is_told(run, tmp_path, alignment):
     np.savetxt(tmp_path / "T.txt", T_TRUTH_RUN)
     chosen = str(tmp_path / "T.txt") if alignment == "FILE" else alignment
-    evaluation = evaluate(EvaluateRequest(run, map_options=MapOptions(alignment=chosen)))
+    evaluation = evaluate(EvaluateRequest(run, map_alignment=chosen))
     found = evaluation.map.alignment
     assert found.method == ("file" if alignment == "FILE" else alignment)
     assert found.refined == (alignment != "none")
@@ -156,7 +156,7 @@ def test_a_kitti_estimate_meets_the_truth_in_the_cameras_frame(tmp_path):
 
 def test_errors_are_written_as_coloured_points(run, tmp_path):
     ply, rrd = tmp_path / "errors.ply", tmp_path / "errors.rrd"
-    evaluation = evaluate(EvaluateRequest(run, errors=[ply, rrd], map_options=MapOptions(refine=False)))
+    evaluation = evaluate(EvaluateRequest(run, errors=[ply, rrd], refine=False))
     vertices = read_ply(ply)
     np.testing.assert_allclose(vertices["distance_m"], evaluation.map.comparison.map_errors.distances_m, rtol=1e-6)
     assert vertices.dtype["x"] == np.float64
@@ -188,7 +188,7 @@ def test_mistakes_are_named(run, tmp_path, change, kind, message):
 
 def test_a_global_search_needs_icp():
     with pytest.raises(ConfigError, match="let --refine follow it"):
-        MapOptions(alignment="global", refine=False)
+        EvaluateRequest(Path(), map_alignment="global", refine=False)
 
 
 @pytest.mark.parametrize("spoil", [lambda T: T[:3], lambda T: 2.0 * T, lambda T: T[:, :3]])

@@ -7,11 +7,9 @@ import numpy as np
 import open3d as o3d
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.global_map.point_cloud import PointCloud
 from lidarslam.viewer.picture import (
@@ -21,12 +19,9 @@ from lidarslam.viewer.picture import (
     draw_apart,
     draw_runs,
     fit_frame,
-    require_quantity,
     save_picture,
-    save_video,
-    turn_runs,
 )
-from lidarslam.viewer.view import INK, START, View, draw_layer, fit_view, round_length, turning_views
+from lidarslam.viewer.view import INK, START, View, draw_layer, fit_view, round_length
 
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 WIDTH = 400
@@ -201,66 +196,3 @@ def test_pictures_of_one_frame_are_the_same_but_for_the_run(tmp_path):
     np.testing.assert_array_equal(first[row, column], second[row, column])
     with pytest.raises(InputError, match="one name"):
         draw_apart([runs[0], runs[0]], tmp_path, frame)
-
-
-def test_the_map_is_coloured_by_intensity_rgb_or_error_where_it_is_known():
-    points, left = plane(0.0), plane(0.0)[:, 0] < 0.0
-    intensity, rgb = np.where(left, 0.1, 0.9).astype(np.float32), np.where(left[:, None], (200, 0, 0), (0, 0, 200))
-    known = replace(cloud(points), attributes=PointAttributes(intensity, rgb.astype(np.uint8)))
-    run = DrawnRun("", known, line(8.0), distances_m=np.where(left, 0.0, 0.4))
-    sides = [np.array([x, 0.0, 0.0]) for x in (-5.0, 5.0)]
-    for quantity, brighter in (("intensity", 1), ("error", 0)):
-        picture = draw([run], quantity=quantity)
-        means = [near(picture, side).mean() for side in sides]
-        assert means[brighter] > means[1 - brighter] + 40, quantity
-    red, blue = (near(draw([run], quantity="rgb"), side) for side in sides)
-    assert (red[:, 0] > 100).all()
-    assert (blue[:, 2] > 100).all()
-    unknown = DrawnRun("site", cloud(points), line(0.0))
-    require_quantity(unknown, "height")
-    for quantity in ("intensity", "rgb", "error"):
-        with pytest.raises(InputError, match=f"site: cannot be coloured by {quantity}: "):
-            require_quantity(unknown, quantity)
-
-
-def test_the_path_is_coloured_by_its_error_and_grey_without_one():
-    errors_m = np.concatenate([np.zeros(150), np.full(150, 0.4), np.full(100, np.nan)])
-    run = DrawnRun("", cloud(plane(0.0)), line(0.0), errors_m=errors_m)
-    picture = draw([run], quantity="error", width=800)
-    for x, colour in ((-6.0, (253, 231, 37)), (1.0, (68, 1, 84)), (7.0, (205, 205, 205))):
-        assert is_like(near(picture, np.array([x, 0.0, 0.0]), 0), colour), x
-
-
-def test_a_video_turns_once_about_one_point_to_one_scale(tmp_path, monkeypatch):
-    pole = np.array([[3.0, 1.0, 0.0]]) + np.column_stack([np.zeros((50, 2)), np.linspace(0.0, 2.0, 50)])
-    run = DrawnRun("", cloud(np.concatenate([plane(0.0, count=50), pole])), line(0.0))
-    counted: list[tuple[int, int]] = []
-    monkeypatch.setattr("lidarslam.viewer.picture._FRAMES", 4)
-    frames = list(turn_runs([run], "height", lambda *numbers: counted.append(numbers)))
-    assert counted == [(number, 4) for number in range(1, 5)]
-    assert len({frame.shape for frame in frames}) == 1
-    assert len({frame.tobytes() for frame in frames}) == 4
-    views = turning_views(run.cloud.points, run.positions, OBLIQUE, [0.0, 90.0, 180.0], WIDTH)
-    assert len({view.pixel_m for view in views}) == 1
-    corners = np.array([[x, y, 0.0] for x in (-10.0, 10.0) for y in (-10.0, 10.0)])
-    for view in views:
-        assert (view.project(corners) > 0).all()
-        assert (view.project(corners) < [view.width, view.height]).all()
-    save_video(tmp_path / "map.gif", frames)
-    with Image.open(tmp_path / "map.gif") as video:
-        assert video.n_frames == 4
-        assert video.info["loop"] == 0
-        assert np.abs(np.asarray(video.convert("RGB")).astype(int) - frames[0]).mean() < 4.0
-
-
-def test_an_mp4_file_is_written_by_ffmpeg(tmp_path, monkeypatch):
-    program = tmp_path / "ffmpeg"
-    program.write_text('#!/bin/sh\ncat > "$(eval echo \\${$#})"\n')
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    frames = [np.full((5, 7, 3), level, dtype=np.uint8) for level in (1, 2)]
-    save_video(tmp_path / "map.mp4", frames)
-    assert (tmp_path / "map.mp4").read_bytes() == b"".join(frame[:4, :6].tobytes() for frame in frames)
-    program.write_text("#!/bin/sh\necho no such codec >&2\nexit 3\n")
-    with pytest.raises(OutputError, match="status 3: no such codec"):
-        save_video(tmp_path / "map.mp4", frames)

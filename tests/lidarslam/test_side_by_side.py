@@ -39,7 +39,7 @@ TIMED = ("process.json", "process.log", "report.html", "report.md")
 def _compare(recording: Path, out: Path, where: Where, told: Told, *command: str, **changes: Any) -> CompareOutcome:
     entry = RecordingEntry(recording, prior=recording / "ground_truth.tum")
     request = CompareRequest(out, (entry,), parse_methods(METHODS), where=where, **changes)
-    return compare(request, told.narrator, *((command,) if command else ()))
+    return compare(request, told, *((command,) if command else ()))
 
 
 def _wait_for(condition: Any, seconds: float = 60.0) -> None:

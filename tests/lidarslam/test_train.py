@@ -4,8 +4,6 @@ import csv
 import pickle
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -321,19 +319,6 @@ def test_other_recordings_or_files_are_not_gone_on_with(room_folder, tmp_path, r
     (tmp_path / "foreign" / "weights.safetensors").write_text("mine")
     with pytest.raises(OutputError, match="not those of a training"):
         execute(request(room_folder, tmp_path / "foreign", ready), print)
-
-
-@pytest.mark.slow
-def test_two_processes_train_one_network(room_folder, tmp_path, ready):
-    """The first process validates, writes and speaks; gradients are averaged, so that both have the same weights."""
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", "-m", "lidarslam"]
-    options = ["--out", str(tmp_path / "out"), "--prepared", str(ready), "--device", "cpu", *OPTIONS, "--steps", "2"]
-    command = [*torchrun, "train", str(room_folder), *options]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert result.returncode == 0, result.stderr
-    assert "Computing on cpu in 2 processes" in result.stdout
-    assert result.stdout.count("step 2/2  loss") == 1
-    assert load_checkpoint(tmp_path / "out" / "weights.safetensors").about["steps"] in (0, 2)
 
 
 @pytest.mark.slow

@@ -92,12 +92,12 @@ def test_a_pair_is_valid_if_all_motions_between_are(recording):
     assert [bool(pair_of(doubtful, *pair).valid) for pair in pairs] == [True, False, True, False, False]
 
 
-@pytest.mark.parametrize("other", [{}, {"step": 8}, {"process": 1}, {"seed": 4}])
-def test_pairs_depend_on_seed_step_and_process_alone(recording, other):
-    def batch(seed: int = 3, step: int = 7, process: int = 0) -> PairBatch:
+@pytest.mark.parametrize("other", [{}, {"step": 8}, {"seed": 4}])
+def test_pairs_depend_on_seed_and_step_alone(recording, other):
+    def batch(seed: int = 3, step: int = 7) -> PairBatch:
         pairs = Pairs([recording], seed)
         pairs.batch(9, 2)
-        return pairs.batch(step, 3, process)
+        return pairs.batch(step, 3)
 
     again, before = vars(batch(**other)), vars(Pairs([recording], 3).batch(7, 3))
     for name in ("scans", "surfaces", "birds", "T_prev_curr"):

@@ -31,7 +31,6 @@
           colorbar: { outlinewidth: 0, tickfont: { color: colour("--quiet") } },
         },
       },
-      data: { bar: [{ textfont: { color: colour("--ink") }, error_x: { color: colour("--ink"), thickness: 1.2 } }] },
     };
   }
 
