@@ -16,20 +16,14 @@ from typing import NamedTuple, cast
 from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.core.text import count, first_few
+from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.fetched import is_url
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
-from lidarslam.datasets.recording import (
-    ROSBAG1_SUFFIXES,
-    STORAGE_SUFFIXES,
-    CloudRecording,
-    Recording,
-    storage_files,
-)
-from lidarslam.datasets.sweeps import JoinedRecording
+from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, STORAGE_SUFFIXES, Recording, storage_files
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +92,7 @@ READERS: dict[str, Reader] = {
     ),
     "kitti-raw": Reader(
         f"{_HERE}.published.kitti:open_raw",
-        "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
+        "KITTI raw: a ..._drive_NNNN_sync folder",
         _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
     ),
@@ -193,9 +187,8 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
     opens = resolve_name(reader.module if ":" in reader.module else f"{reader.module}:open_recording")
-    recording, time_scale = cast(Recording, opens(source, config)), config.time_scale
-    if isinstance(recording, CloudRecording):
-        recording, time_scale = JoinedRecording(recording, config.sweep_s, time_scale), 1.0
+    recording = cast(Recording, opens(source, config))
+    time_scale = 1.0 if isinstance(recording, CloudRecording) else config.time_scale
     raised_deg = config.raised_deg(reader.elevation_deg)
     if config.mounting == "upright" and not raised_deg and time_scale == 1.0:
         return recording

@@ -259,14 +259,6 @@ def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
     assert_first_scans(recording, points, len(recording))
 
 
-@pytest.mark.parametrize(("kind", "other"), [("mcap", "bag"), ("bag", "mcap")])
-def test_a_bag_of_another_name_is_told(write_drive, tmp_path, kind, other):
-    file, _, _ = write_drive(kind)
-    renamed = shutil.copy(file, tmp_path / f"renamed.{other}")
-    with pytest.raises(InputError, match=rf"by its first bytes; name it renamed\.{kind}"):
-        open_recording(renamed)
-
-
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_messages_that_were_left_in_the_log_of_a_database_are_told(write_drive, is_whole):
     """A recorder that was killed leaves them there; there may be no others."""
