@@ -91,7 +91,7 @@ READERS: dict[str, Reader] = {
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        f"{_HERE}.published.kitti:open_raw",
+        f"{_HERE}.published.kitti:KittiRawRecording",
         "KITTI raw: a ..._drive_NNNN_sync folder",
         _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,

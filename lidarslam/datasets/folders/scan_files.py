@@ -233,23 +233,15 @@ def _ply_table(data: bytes) -> NDArray[np.void]:
     encoding = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "")
     if encoding not in _BYTE_ORDER:
         raise ValueError(f"expected the format {', '.join(_BYTE_ORDER)}, got {encoding!r}")
-    elements = _ply_elements(lines)
-    names, counts = [name for name, *_ in elements], [count for _, count, _ in elements]
-    if "vertex" not in names:
-        raise ValueError("expected an element `vertex`, found none")
-    at = names.index("vertex")
-    *others, dtype = (_ply_row_type(kinds, _BYTE_ORDER[encoding]) for _, _, kinds in elements[: at + 1])
-    before, rows, further = sum(counts[:at]), counts[at], sum(counts[at + 1 :])
+    (name, rows, kinds), *others = _ply_elements(lines) or [("", 0, [])]
+    if name != "vertex":
+        raise ValueError("expected the element `vertex` before any others")
+    dtype = _ply_row_type(kinds, _BYTE_ORDER[encoding])
     if dtype.itemsize > _WIDEST_POINT:
         raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
-    if (other := max(before, further)) > len(data):
-        raise ValueError(f"expected {other:,} other elements in {len(data):,} bytes: it is truncated")
-    if not rows and further:
+    if not rows and any(count for _, count, _ in others):
         return np.empty(0, dtype)
-    if encoding == "ascii":
-        return read_ascii_table(data[length:].split(b"\n", before)[-1], dtype, rows)
-    skipped = sum(count * kind.itemsize for count, kind in zip(counts, others, strict=False))
-    return read_binary_table(data[length + skipped :], dtype, rows)
+    return (read_ascii_table if encoding == "ascii" else read_binary_table)(data[length:], dtype, rows)
 
 
 def _ply_elements(lines: list[list[str]]) -> list[tuple[str, int, list[list[str]]]]:
@@ -285,7 +277,7 @@ def _ply_row_type(properties: list[list[str]], order: str) -> np.dtype[np.void]:
     columns = []
     for words in properties:
         if len(words) != 2 or words[0] not in _TYPES:
-            raise ValueError(f"expected properties of a plain type up to the vertices, got {' '.join(words)!r}")
+            raise ValueError(f"expected vertices with properties of a plain type, got {' '.join(words)!r}")
         columns.append((words[1], order + _TYPES[words[0]]))
     return np.dtype(columns)
 

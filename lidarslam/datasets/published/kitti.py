@@ -52,13 +52,12 @@ _SCANS, _POINTS = "data_3d_raw", "velodyne_points"
 
 
 class BinRecording(FileRecording):
-    """A folder of .bin scans: x, y, z, intensity and perhaps a ring. A reader adds the stamps, and points' times."""
+    """A folder of .bin scans: x, y, z, intensity. A reader adds the stamps, and points' times."""
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index], len(self._stored))
-        rings = rows[:, 4] if len(self._stored) > 4 else None
+        rows = read_bin(self._files[index])
         offsets = self._offsets(rows, index) if self._point_time else None
-        return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, rings, rows[:, 3])
+        return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, intensities=rows[:, 3])
 
     def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:
         raise NotImplementedError
@@ -163,22 +162,17 @@ def oxts_poses(rows: FloatArray) -> FloatArray:
     return make_transform(R, np.column_stack([east, north, rows[:, 2]]))
 
 
-def open_raw(source: Path, config: ReaderConfig) -> Recording:
-    """Open a `..._sync` drive folder."""
-    return KittiRawRecording(source.resolve(), config)
-
-
 class KittiRawRecording(BinRecording):
-    """One drive of the raw data."""
+    """One drive of the raw data: a `..._sync` folder."""
 
     reader = "kitti-raw"
     imu_name = "oxts"
     point_time = AZIMUTH_TIME
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
-        files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
-        super().__init__(drive, config, files)
-        folder = drive / "velodyne_points"
+        folder = drive.resolve() / "velodyne_points"
+        files, self._numbers = numbered_scans(folder / "data")
+        super().__init__(drive.resolve(), config, files)
         self._timing = stamps_of_rows(folder / "timestamps.txt", self._numbers, config)
         self.stamps, self._rate_is_assumed = self._timing.stamps, not self._timing.from_clock
         self._before_s, self._after_s, notes = sweep_durations(folder, self._numbers, self._timing, config)

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -159,20 +159,20 @@ class BagRecording(CloudRecording):
             held = f"its index lists {self._stored_scans} scans, it holds {count}"
             faults.leave_out(_MISSING, held, missing, is_readable=False)
 
-    def _sound_items(self) -> Iterator[BagMessage]:
+    def _of_any_sensor(self) -> Iterator[BagMessage]:
         return (message for message in self._bag.messages(self._topic) if message.damage is None)
 
-    def _of_sensor(self) -> Iterator[BagMessage]:
-        return (message for message in self._sound_items() if message.frame_id == self._frame_id)
+    def _sound_items(self) -> Iterator[BagMessage]:
+        return (message for message in self._of_any_sensor() if message.frame_id == self._frame_id)
 
     @cached_property
     def _frame_id(self) -> str:
         """The sensor that most of the first messages come from, unless another is asked for."""
-        frames = Counter(m.frame_id for m in islice(self._sound_items(), _FRAMES_LOOKED_AT))
+        frames = Counter(m.frame_id for m in islice(self._of_any_sensor(), _FRAMES_LOOKED_AT))
         wanted = self._config.frame_id
         if wanted is None:
             return max(frames, key=lambda frame: frames[frame], default="")
-        if wanted not in frames and not any(m.frame_id == wanted for m in self._sound_items()):
+        if wanted not in frames and not any(m.frame_id == wanted for m in self._of_any_sensor()):
             found = ", ".join(repr(frame) for frame in frames)
             raise InputError(
                 f"{self._source}: reader.frame_id is {wanted!r}, but {self._topic.name} begins with {found}"
@@ -184,7 +184,7 @@ class BagRecording(CloudRecording):
 
     @cached_property
     def _stamps(self) -> StampSource:
-        return find_stamp_source(self._sound_items())
+        return find_stamp_source(self._of_any_sensor())
 
     def _stamp(self, item: BagMessage) -> float:
         return self._stamps.stamp(item)
@@ -200,7 +200,7 @@ class BagRecording(CloudRecording):
     @cached_property
     def period_s(self) -> float | None:
         """The median interval of the first stamps that increase, seconds."""
-        stamps = np.array([self._stamp(message) for message in islice(self._of_sensor(), _STAMPS_LOOKED_AT)])
+        stamps = np.array([self._stamp(message) for message in islice(self._sound_items(), _STAMPS_LOOKED_AT)])
         steps = np.diff(stamps[stamps > self._stamps.before_first])
         return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else None
 
@@ -212,15 +212,9 @@ class BagRecording(CloudRecording):
             return self._config.time_unit, "absolute", TIME_UNIT
         return super()._defined_time
 
-    def _runs(self) -> Iterator[list[BagMessage]]:
+    def _runs(self) -> Iterator[tuple[BagMessage, BagMessage]]:
         apart = max(2, min(self._topic.messages, _LOOKED_AT) // _PAIRS)
-        pair: list[BagMessage] = []
-        for number, message in enumerate(islice(self._of_sensor(), _LOOKED_AT)):
-            if number % apart < 2:
-                pair.append(message)
-            if number % apart == 1:
-                yield pair
-                pair = []
+        return islice(pairwise(islice(self._sound_items(), _LOOKED_AT)), 0, None, apart)
 
 
 class OusterBag(OusterRecording):
