@@ -25,7 +25,8 @@ class CloudRecording(StoredRecording):
     """Scans whose points may have times, of which field, unit and clock are inferred from the first of them.
 
     Scans at 15 Hz and more are joined to sweeps, as far as consecutive ones see other directions; others where a
-    duration of the sweeps is set. A reader adds `_items`, `_last_stamp`, and the methods below that raise an error.
+    duration of the sweeps is set. A reader adds `_stored_scans`, `_items`, `_last_stamp`, and the methods below that
+    raise an error.
     """
 
     _has_stamps: bool = True  # whether stamps are readings of a clock, rather than made from the rate

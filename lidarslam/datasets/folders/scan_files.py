@@ -17,7 +17,7 @@ from lidarslam.core.files import read_array, reading
 from lidarslam.datasets.recording import KITTI_FIELDS
 
 # A larger number is no scan's, such as a time.
-_MOST_SCANS = 10**9
+_MOST_SCANS = 10**7
 
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 TableReader = Callable[[Path], NDArray[np.void]]
@@ -239,7 +239,9 @@ def _ply_table(data: bytes) -> NDArray[np.void]:
     dtype = _ply_row_type(kinds, _BYTE_ORDER[encoding])
     if dtype.itemsize > _WIDEST_POINT:
         raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
-    if not rows and any(count for _, count, _ in others):
+    if (further := sum(count for _, count, _ in others)) > len(data):
+        raise ValueError(f"expected {further:,} other elements in {len(data):,} bytes: it is truncated")
+    if not rows and further:
         return np.empty(0, dtype)
     return (read_ascii_table if encoding == "ascii" else read_binary_table)(data[length:], dtype, rows)
 
