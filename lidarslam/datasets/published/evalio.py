@@ -22,9 +22,10 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.catalogue import CATALOGUE
+from lidarslam.datasets.published.stamped_files import increasing
 from lidarslam.datasets.recording import Recording, StoredRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
-from lidarslam.datasets.times.stamps import increasing_poses, increasing_rows
+from lidarslam.datasets.times.stamps import increasing_rows
 
 PREFIX = "evalio:"
 MISSING_EXTRA = "evalio is not installed, which this data set needs; pip install 'lidarslam[datasets]'"
@@ -174,7 +175,7 @@ class EvalioRecording(StoredRecording):
                 return None
             stamps = np.array([stamp.to_nsec() for stamp in truth.stamps]) * 1e-9
             T_world_imu = orthonormalize(np.stack([pose.to_mat() for pose in truth.poses]))
-        return increasing_poses(stamps, T_world_imu @ self._T_imu_lidar)
+        return increasing(stamps, T_world_imu @ self._T_imu_lidar)
 
     @cached_property
     def imu(self) -> ImuSamples | None:

@@ -26,17 +26,15 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray, inverse, make_transform, orthonormalize
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
 from lidarslam.core.trajectory import Trajectory, parse_numbers, read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.folders.scan_files import numbered_scans
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.published.stamped_files import poses_of_rows, read_table
-from lidarslam.datasets.recording import FileRecording, Recording, find_sequence, first_file
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
+from lidarslam.datasets.recording import Recording, find_sequence, first_file
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
-from lidarslam.datasets.times.stamps import assumed_rate, increasing_poses, mend_stamps, read_stamps, scan_rate
+from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate
 
 _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
@@ -49,18 +47,6 @@ _ACCELERATIONS, _ANGULAR_VELOCITIES = slice(11, 14), slice(17, 20)
 _SWEEP_TOLERANCE = 0.25
 # Of KITTI-360.
 _SCANS, _POINTS = "data_3d_raw", "velodyne_points"
-
-
-class BinRecording(FileRecording):
-    """A folder of .bin scans: x, y, z, intensity. A reader adds the stamps, and points' times."""
-
-    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        rows = read_bin(self._files[index])
-        offsets = self._offsets(rows, index) if self._point_time else None
-        return Scan.from_raw(rows[:, :3], self.stamps[index], offsets, intensities=rows[:, 3])
-
-    def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:
-        raise NotImplementedError
 
 
 def open_odometry(source: Path, config: ReaderConfig) -> Recording:
@@ -233,7 +219,7 @@ class KittiRawRecording(BinRecording):
         oxts, T_lidar_imu = self.oxts, self._calibration("calib_imu_to_velo.txt")
         if oxts is None or T_lidar_imu is None:
             return None
-        truth = increasing_poses(oxts.stamps, oxts.T_enu_imu @ inverse(T_lidar_imu))
+        truth = increasing(oxts.stamps, oxts.T_enu_imu @ inverse(T_lidar_imu))
         return None if truth is None else truth.transformed(inverse(truth.T_world_lidar[0]))
 
     @cached_property
@@ -299,7 +285,7 @@ class Kitti360Recording(BinRecording):
             return None
         T_world_lidar = poses_of_rows(rows[:, 1:]) @ T_pose_lidar
         stamps = self.stamps[np.searchsorted(self._numbers, rows[:, 0])]
-        return increasing_poses(stamps, inverse(T_world_lidar[0]) @ T_world_lidar)
+        return increasing(stamps, inverse(T_world_lidar[0]) @ T_world_lidar)
 
     @cached_property
     def _T_pose_lidar(self) -> FloatArray | None:

@@ -29,7 +29,7 @@ from lidarslam.datasets.recording import (
     storage_files,
     truth_beside,
 )
-from lidarslam.datasets.ros.bag_file import BagFile, open_bag
+from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import choose_imu, read_imu
 from lidarslam.datasets.ros.bag_message import (
     CLOUD_TYPES,
@@ -41,6 +41,7 @@ from lidarslam.datasets.ros.bag_message import (
     StampSource,
     find_stamp_source,
 )
+from lidarslam.datasets.ros.split_bag import open_bag
 from lidarslam.datasets.times.stamps import in_stamp_order
 
 _STRING_TYPE = "std_msgs/msg/String"

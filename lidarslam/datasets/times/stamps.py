@@ -13,7 +13,6 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import bounded_lines
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 
@@ -134,12 +133,6 @@ def increasing_rows(stamps: FloatArray) -> FloatArray:
         kept[row] = True
         row = int(previous[row])
     return kept
-
-
-def increasing_poses(stamps: FloatArray, T_world_lidar: FloatArray) -> Trajectory | None:
-    """The poses (N, 4, 4) whose stamps (N,) increase; None if there is none."""
-    kept = increasing_rows(stamps)
-    return Trajectory(stamps[kept], T_world_lidar[kept]) if kept.any() else None
 
 
 def mend_stamps(stamps: FloatArray, numbers: FloatArray) -> tuple[FloatArray, int]:
