@@ -15,9 +15,9 @@ from rosbags.rosbag2.storage_mcap import zstd
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_file import BagFile, recover, unpacked_message
 
-from .conftest import PERIOD_NS, STAMP_NS, execute
+from .conftest import COMPRESSIONS, PERIOD_NS, STAMP_NS, execute
 
 
 def stamp_ns(index):
@@ -88,6 +88,16 @@ def test_a_bag_that_was_never_indexed_is_read_whole(write_drive, compression):
         assert f"rosbag reindex {path}" in recording.warnings[0]
 
 
+def test_a_cut_database_is_read_as_far_as_its_pages_go(write_drive):
+    file, _, points = write_drive("db3", count=40)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(0.9 * len(whole))])
+    recording = open_recording(file)
+    assert 7 <= len(recording) < 40
+    assert_first_scans(recording, points, len(recording))
+    assert "sqlite3 recovered.db3" in recording.warnings[0]
+
+
 @pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
 def test_a_bag_of_which_nothing_is_left_says_how_to_mend_it(write_drive, kind):
     file, _, _ = write_drive(kind)
@@ -130,12 +140,16 @@ def test_a_bag_without_index_is_read_up_to_a_damaged_chunk(write_drive):
 
 
 @pytest.mark.parametrize("data", ["text", 100, 4 * 10**12, 0.5])
-def test_a_database_whose_rows_are_no_messages(write_drive, data):
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_database_whose_rows_are_no_messages(write_drive, data, indexed):
     """A number must not become as many zero bytes."""
     file, _, points = write_drive("db3")
     execute(file, "UPDATE messages SET data = ? WHERE id = 4", data)
-    told = f"1 scan was left out: not readable; the first: {file}: a message is damaged: a message that is no bytes"
-    assert_all_but(open_recording(file), points, [3], told)
+    if indexed:
+        told = f"1 scan was left out: not readable; the first: {file}: a message is damaged: a message that is no bytes"
+        assert_all_but(open_recording(file), points, [3], told)
+    else:
+        assert len(list(recover(file, ".db3"))) == 5
 
 
 @pytest.mark.parametrize("length", [0, 3, 15])
@@ -257,6 +271,50 @@ def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
     recording = open_recording(half)
     assert len(recording) in (2, 3)
     assert_first_scans(recording, points, len(recording))
+
+
+def test_frames_are_unpacked_one_after_the_other(rng):
+    parts = rng.bytes(100_000), bytes(50_000)
+    packed = b"".join(map(zstd.compress, parts))
+    assert unpacked_message(packed) == b"".join(parts)
+    with pytest.raises(ValueError, match="cut short"):
+        unpacked_message(packed[:-10])
+
+
+@pytest.mark.parametrize(("kind", "compression"), COMPRESSIONS)
+@pytest.mark.parametrize("indexed", [True, False])
+def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, monkeypatch, kind, compression, indexed):
+    """A scan has some kilobytes here."""
+    monkeypatch.setattr("lidarslam.datasets.ros.bag_file.MOST_BYTES", 1_000)
+    file, source, _ = write_drive(kind, compression=compression)
+    if not indexed:
+        file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(InputError) as caught:
+        list(open_recording(source).scans())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_compressed_as_a_whole_that_unpacks_to_too_much_is_refused(write_drive, monkeypatch):
+    monkeypatch.setattr("lidarslam.datasets.ros.bag_file.MOST_BYTES", 1_000)
+    _, folder, _ = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
+    (file,) = folder.glob("*.zstd")
+    file.write_bytes(zstd.compress(bytes(10_000_000)))
+    with pytest.raises(InputError, match="unpacks to more than 100 times its size"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize("table", ["messages", "topics"])
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_whole):
+    """Its query, which is part of the file, has no end."""
+    file, folder, _ = write_drive("db3")
+    ((columns,),) = execute(file, f"SELECT group_concat(name) FROM pragma_table_info('{table}')")
+    zeros = ",".join("0" for _ in columns.split(","))
+    endless = f"endless({columns}) AS (SELECT {zeros} UNION ALL SELECT {zeros} FROM endless)"
+    execute(file, f"DROP TABLE {table}")
+    execute(file, f"CREATE VIEW {table} AS WITH RECURSIVE {endless} SELECT * FROM endless")
+    with pytest.raises(InputError, match="cannot be opened"):
+        open_recording(folder if is_whole else file)
 
 
 @pytest.mark.parametrize("is_whole", [True, False])

@@ -1,24 +1,30 @@
 """Messages of rosbag1 and rosbag2 files, by rosbags; a file whose index cannot be read is read without it.
 
-Layouts: ROS bag format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec). They are read here where there is no
-index, as after a crash of the recorder, because rosbags needs one, and `StreamReader` of mcap 1.6 loses a chunk that is
-cut off and accepts cut records.
+Layouts: ROS bag format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), rosbag2's SQLite tables. They are read
+here where there is no index, as after a crash of the recorder, because rosbags needs one, and `StreamReader` of mcap
+1.6 loses a chunk that is cut off and accepts cut records.
 """
 
+import sqlite3
 import struct
+from bz2 import BZ2Decompressor
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from functools import cached_property
-from io import BytesIO
-from itertools import chain, count
+from io import BytesIO, RawIOBase
+from itertools import chain, count, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, BinaryIO
+from urllib.parse import quote
 
+from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.rosbag1 import Reader as Rosbag1Reader
-from rosbags.rosbag1.reader import Header, RecordType, decompressors, normalize, read_uint32
+from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressors, normalize, read_uint32
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2.storage_mcap import decompress, read_exact, read_string, zstd  # type: ignore[attr-defined] # Python's, or as in Python
+from rosbags.rosbag2 import reader as rosbag2_reader
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, read_exact, read_string, zstd  # type: ignore[attr-defined] # Python's, or as in Python
 from rosbags.typesys.msg import normalize_msgtype
 
 from lidarslam.core.errors import InputError
@@ -30,6 +36,10 @@ from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 
 Recovered = tuple[str, str, int, bytes]
 """Topic, type as in ROS 2, time of recording in nanoseconds, and bytes of a message."""
+# Recorders write chunks of 1 to 16 MB, and a cloud of two million points has some 100 MB.
+MOST_BYTES = 1 << 28
+# Largest ratio of decompression of a file that is compressed as a whole; that of clouds is below twenty.
+_MOST_GROWTH = 100
 _LAST_MESSAGES_NS = 1_000_000_000
 _REPAIR = {
     ".bag": "rosbag reindex {}",
@@ -41,6 +51,59 @@ _LONGEST_RECORD = 1 << 30
 # Opcodes of MCAP.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 MCAP_MAGIC, _ROSBAG1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
+# A damaged database may hold anything for a name.
+_TOPICS = "SELECT id, name, type FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+# By the table itself, because the pages of its index are at the end.
+_ROWS = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
+
+
+def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
+    """The content of compressed frames, one after the other; ValueError where they are cut short or hold too much."""
+    frames, size = [], 0
+    while data:
+        decompressor = make()
+        frames.append(decompressor.decompress(data, MOST_BYTES + 1 - size))
+        size += len(frames[-1])
+        if size > MOST_BYTES:
+            raise ValueError(
+                f"{len(data):,} bytes unpack to more than {MOST_BYTES >> 20} MB, which no chunk or message has"
+            )
+        if not decompressor.eof:
+            raise ValueError("the compressed data are cut short")
+        data = decompressor.unused_data or b""
+    return b"".join(frames)
+
+
+def unpacked_message(data: bytes) -> bytes:
+    """A message of a rosbag2 with compression per message, or a chunk: frames of Zstandard."""
+    return unpacked(data, zstd.ZstdDecompressor)
+
+
+class _UnpackedFile(RawIOBase):
+    """A file compressed by Zstandard as a whole."""
+
+    def __init__(self, file: BinaryIO, _mode: str) -> None:
+        self._name, self._left = file.name, MOST_BYTES + _MOST_GROWTH * file.seek(0, 2)
+        file.seek(0)
+        self._file = zstd.open(file, "rb")
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            raise InputError(f"{self._name}: unpacks to more than {_MOST_GROWTH} times its size, as no recording does")
+        buffer[: len(data)] = data
+        return len(data)
+
+
+rosbag2_reader.zstd = SimpleNamespace(open=_UnpackedFile, decompress=unpacked_message)  # type: ignore[attr-defined,assignment]
+DECOMPRESSORS["lz4"] = lambda data, _: unpacked(data, LZ4FrameDecompressor)
+DECOMPRESSORS["zstd"] = lambda data, _: unpacked_message(data)
+decompressors[Compression.LZ4.value] = lambda data: unpacked(data, LZ4FrameDecompressor)
+decompressors[Compression.BZ2.value] = lambda data: unpacked(data, BZ2Decompressor)
 
 
 class BagFile:
@@ -138,7 +201,7 @@ class BagFile:
 
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         try:
-            raw = zstd.decompress(raw) if self._messages_are_compressed else raw
+            raw = unpacked_message(raw) if self._messages_are_compressed else raw
             header_ns, frame_id = read_header(raw, self.ros2)
         except Exception as error:  # of the decompressor too
             damage = f"{self.path}: a message is damaged: {reason(error)}"
@@ -170,6 +233,7 @@ class BagFile:
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
+            require_tables(self.path)
             reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
         try:
@@ -223,8 +287,9 @@ def _storages(reader: Rosbag1Reader | Rosbag2Reader) -> list[Any]:
 
 
 def recover(path: Path, suffix: str) -> Iterator[Recovered]:
-    """The messages of a `.bag` or `.mcap` file up to its first damaged place, a ValueError or the end; else none."""
-    if suffix not in (".bag", ".mcap"):
+    """The messages of a `.bag`, `.mcap` or `.db3` file up to its first damaged place, a ValueError or the end."""
+    if suffix == ".db3":
+        yield from _database(path)
         return
     records: _Rosbag1 | _Mcap = _Rosbag1() if suffix == ".bag" else _Mcap()
     with path.open("rb") as file:
@@ -308,3 +373,40 @@ def _within(content: bytes, read: Callable[[BinaryIO], Iterator[Recovered]]) -> 
 def _require_whole(data: bytes, size: int) -> None:
     if len(data) < size:
         raise ValueError(f"expected a record of {size:,} bytes, got {len(data):,}")
+
+
+def require_tables(path: Path) -> None:
+    """ValueError where messages or topics of a database (or one in a folder) are a view: its query may have no end."""
+    for file in path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []:
+        with closing(_connected(file)) as database, suppress(sqlite3.Error):  # damaged, which is found when it is read
+            for name, kind in database.execute("SELECT name, type FROM sqlite_master"):
+                if name.lower() in ("messages", "topics") and kind != "table":
+                    raise ValueError(f"its {name} are a {kind}, not a table")
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
+
+
+def _database(path: Path) -> Iterator[Recovered]:
+    require_tables(path)
+    with path.open("rb") as file:
+        header = file.read(32)
+    with closing(_connected(path)) as database:
+        # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
+        database.execute("PRAGMA writable_schema=ON")
+        topics = {number: (name, kind) for number, name, kind in database.execute(_TOPICS)}
+        # Pages that are missing at the end (sqlite.org/fileformat2.html, 1.3) SQLite may take for zeros.
+        page, pages = struct.unpack_from(">H10xI", header, 16)
+        is_cut = path.stat().st_size < pages * (page if page > 1 else 65536)
+        for row, following in pairwise(chain(_rows(database), [None])):
+            if row is None or (following is None and is_cut):
+                return
+            topic, record_ns, raw = row
+            if topic in topics and isinstance(record_ns, int) and isinstance(raw, bytes):
+                yield *topics[topic], record_ns, raw
+
+
+def _rows(database: sqlite3.Connection) -> Iterator[tuple[Any, ...]]:
+    with suppress(sqlite3.Error):  # damaged from here on
+        yield from database.execute(_ROWS)

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -115,35 +116,77 @@ def test_what_cannot_be_fetched_leaves_nothing(url: str, message: str, cache: Pa
     assert not any(cache.rglob("*"))
 
 
-class Breaking(SimpleHTTPRequestHandler):
-    """Announces a file, of which the first answers lack the end."""
+class Ranged(SimpleHTTPRequestHandler):
+    """Serves `content` from any byte on; the second answer, after one whether it is there, breaks off."""
 
     content: ClassVar[bytes] = np.random.default_rng(0).bytes(300_000)
-    is_whole: ClassVar[bool] = False
+    etag: ClassVar[str] = '"1"'
+    has_ranges: ClassVar[bool] = True
+    sent: ClassVar[list[int]] = []  # bytes of each answer
 
     def log_request(self, *_: object) -> None:
         pass
 
     def do_HEAD(self) -> None:
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(self.content)))
-        self.end_headers()
+        self._head(200, 0, len(self.content))
 
     def do_GET(self) -> None:
-        self.do_HEAD()
-        self.wfile.write(self.content if self.is_whole else self.content[:100_000])
+        first, _, last = self._range().removeprefix("bytes=").partition("-")
+        part = self.content[int(first) : int(last or len(self.content)) + 1]
+        self._head(206 if self._range() != "bytes=0-" else 200, int(first), len(part))
+        part = part[:100_000] if len(self.sent) == 1 else part
+        self.sent.append(len(part))
+        with contextlib.suppress(OSError):
+            self.wfile.write(part)
+        if len(self.sent) == 2:
+            time.sleep(0.5)  # what has arrived by then is read
         self.close_connection = True
 
+    def _range(self) -> str:
+        return self.headers.get("Range", "bytes=0-") if self.has_ranges else "bytes=0-"
 
-def test_a_download_that_broke_off_leaves_nothing(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with _serving(Breaking) as url:
-        with pytest.raises(InputError, match="cannot be fetched"):
-            fetched(f"{url}/office.bin")
-        assert not any(cache.rglob("*.*"))
-        monkeypatch.setattr(Breaking, "is_whole", True)
-        path = fetched(f"{url}/office.bin")
-    assert path.read_bytes() == Breaking.content
+    def _head(self, code: int, first: int, length: int) -> None:
+        self.send_response(code)
+        self.send_header("ETag", self.etag)
+        if self.has_ranges:
+            self.send_header("Accept-Ranges", "bytes")
+        self.send_header("Content-Length", str(length))
+        if code == 206:
+            self.send_header("Content-Range", f"bytes {first}-{first + length - 1}/{len(self.content)}")
+        self.end_headers()
+
+
+@pytest.fixture
+def breaking_server() -> Iterator[str]:
+    Ranged.sent.clear()
+    with _serving(Ranged) as url:
+        yield f"{url}/office.bin"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("changes", [False, True], ids=["the same file", "another meanwhile"])
+@pytest.mark.parametrize("has_ranges", [True, False], ids=["from the middle", "from the start alone"])
+def test_a_download_that_broke_off_is_continued(
+    breaking_server: str, changes: bool, has_ranges: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Ranged, "has_ranges", has_ranges)
+    monkeypatch.setattr("lidarslam.datasets.fetched._BLOCK_BYTES", 10_000)
+    with pytest.raises(InputError, match="cannot be fetched"):
+        fetched(breaking_server)
+    if changes:
+        monkeypatch.setattr(Ranged, "content", Ranged.content[::-1])
+        monkeypatch.setattr(Ranged, "etag", '"2"')
+    path = fetched(breaking_server)
+    assert path.read_bytes() == Ranged.content
+    assert (Ranged.sent[-1] == 300_000) == (changes or not has_ranges), "a part"
+    assert Ranged.sent[-1] >= 200_000
     assert {file.name for file in path.parent.rglob("*")} == {"lock", "office.bin", "url.txt"}
+
+
+def test_a_source_without_an_end_is_given_up(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lidarslam.datasets.fetched._MOST_BYTES", 10_000)
+    with pytest.raises(InputError, match="are fetched from no source"):
+        fetched(f"{server}/walk/")
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
