@@ -326,13 +326,9 @@ def find_sequence(source: Path, folder: Path, marker: str, wanted: str | None, n
 
     Wanted is one by its name, or the last number in it; None: the only one.
     """
-    number = int(wanted) if wanted is not None and wanted.isdecimal() else None
-
-    def fits(name: str) -> bool:
-        return wanted in (None, name) or (number is not None and _last_number(name) == number)
-
     if (source / marker).exists():
-        if not fits(name := source.resolve().name):
+        name = source.resolve().name
+        if wanted is not None and wanted.zfill(len(name)) != name:
             raise InputError(
                 f"{source}: is the {noun} {name}, not {wanted}; leave --sequence out or give the folder above"
             )
@@ -340,9 +336,17 @@ def find_sequence(source: Path, folder: Path, marker: str, wanted: str | None, n
     names = sorted(path.name for path in folder.glob("*") if (path / marker).exists())
     if not names:
         raise InputError(f"{source}: expected {marker} in it, or in folders in {folder}; found neither")
-    fitting = [name for name in names if fits(name)]
+    return folder / choose_sequence(source, names, wanted, noun)
+
+
+def choose_sequence(source: Path, names: Sequence[str], wanted: str | None, noun: str = "sequence") -> str:
+    """Of the names of a data set's sequences the only one, or the wanted one: by name, or by the last number in it."""
+    number = int(wanted) if wanted is not None and wanted.isdecimal() else None
+    fitting = [name for name in names if wanted in (None, name)] or [
+        name for name in names if number is not None and _last_number(name) == number
+    ]
     if len(fitting) == 1:
-        return folder / fitting[0]
+        return fitting[0]
     if wanted is None:
         raise InputError(f"{source}: holds {len(names):,} {noun}s; choose one with --sequence: {first_few(names, 8)}")
     raise InputError(f"{source}: has no {noun} {wanted!r}; there are: {first_few(names, 8)}")

@@ -96,6 +96,12 @@ READERS: dict[str, Reader] = {
         _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
     ),
+    "nuscenes": Reader(
+        f"{_HERE}.published.nuscenes",
+        "nuScenes: the root with v1.0-* (with --sequence)",
+        _has("v1.0-*/scene.json"),
+        True,
+    ),
     "mulran": Reader(f"{_HERE}.published.mulran", "MulRan: a sequence with a folder Ouster", _has("Ouster/")),
     "nclt": Reader(f"{_HERE}.published.nclt", "NCLT: a session with a folder velodyne_sync", _has("velodyne_sync/")),
     "rosbag": Reader(f"{_HERE}.ros.rosbag", "rosbag1 .bag; rosbag2 .db3 or .mcap; a folder of either", _is_rosbag),
