@@ -66,7 +66,6 @@ CONFINED = {
         "lidarslam.compare.peers.evalio_pipelines",
         "lidarslam.datasets.published.evalio*",
     ),
-    "pyarrow": ("lidarslam.datasets.published.argoverse2",),
     "fsspec": ("lidarslam.datasets.fetched",),
     "pyproj": ("lidarslam.exports.geo",),
     "ray": ("lidarslam.core.tasks",),

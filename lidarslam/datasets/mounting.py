@@ -19,7 +19,6 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording, RecordingInfo
-from lidarslam.datasets.sweeps import JoinedRecording
 
 # Roll, pitch, yaw in degrees of the recorded axes: the direction of the recorded z axis, as seen along x.
 _ANGLES_DEG: dict[MountingName, RollPitchYaw] = {
@@ -231,10 +230,9 @@ class MountedRecording:
 
 def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
     """The recording in its own axes as its reader opened it, and T_upright_recorded (4, 4)."""
-    recorded, T_upright_recorded = recording, np.eye(4)
     if isinstance(recording, MountedRecording):
-        recorded, T_upright_recorded = recording.recorded, recording.T_upright_recorded
-    return recorded.recorded if isinstance(recorded, JoinedRecording) else recorded, T_upright_recorded
+        return recording.recorded, recording.T_upright_recorded
+    return recording, np.eye(4)
 
 
 def elevation_of(recording: Recording) -> tuple[float, float]:

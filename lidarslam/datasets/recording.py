@@ -3,8 +3,7 @@
 import logging
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +16,10 @@ from lidarslam.core.plugins import require_library
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.core.text import first_few
 from lidarslam.core.trajectory import Trajectory, read_tum
-from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.point_table import PointField, RawCloud
-from lidarslam.datasets.times.azimuth import PointTiming, point_timing
-from lidarslam.datasets.times.point_time import LearnedTime, PointTimeModel, learn_point_time
+from lidarslam.datasets.point_table import PointField
+from lidarslam.datasets.times.point_time import PointTimeModel
 
 logger = logging.getLogger(__name__)
 
@@ -187,6 +185,10 @@ class StoredRecording:
     def __len__(self) -> int:
         raise NotImplementedError
 
+    @property
+    def _stored_scans(self) -> int:
+        return len(self)
+
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
     ) -> Iterator[Scan]:
@@ -230,7 +232,7 @@ class StoredRecording:
     def _first(self, faults: Faults) -> tuple[Any, Scan]:
         """The first readable scan, and its item; the error of the first one where none can be read."""
         first_error = None
-        for item in self._items(range(len(self)), faults):
+        for item in self._items(range(self._stored_scans), faults):
             try:
                 return item, self._read(item, faults)
             except InputError as error:
@@ -275,69 +277,6 @@ class FileRecording(StoredRecording):
 
     def _last_stamp(self, first: Scan) -> float:  # noqa: ARG002
         return float(self.stamps[-1])
-
-
-class CloudRecording(StoredRecording):
-    """Scans whose points may have times, of which field, unit and clock are inferred from the first of them.
-
-    A reader adds `__len__`, `_items`, `_last_stamp`, and the methods below that raise an error.
-    """
-
-    _has_stamps: bool = True  # whether stamps are readings of a clock, rather than made from the rate
-
-    def _decode(self, item: Any) -> RawCloud:
-        raise NotImplementedError
-
-    def _stamp(self, item: Any) -> float:
-        raise NotImplementedError
-
-    def _sound_items(self) -> Iterable[Any]:
-        """All items in their order, to infer from; those that cannot be decoded are counted when it is their turn."""
-        raise NotImplementedError
-
-    def _runs(self) -> Iterable[Iterable[Any]]:
-        """Pairs of the items of consecutive scans, spread over the recording."""
-        raise NotImplementedError
-
-    @cached_property
-    def period_s(self) -> float | None:
-        """Seconds between scans; None for a single one."""
-        raise NotImplementedError
-
-    @property
-    def _defined_time(self) -> tuple[TimeUnit, TimeReference, TimeUnit | None]:
-        """Unit and reference of the time field, and the unit by the definition of a message."""
-        return self._config.time_unit, self._config.time_reference, None
-
-    @cached_property
-    def _learned(self) -> LearnedTime:
-        if self._config.time_reference == "none":
-            return LearnedTime()
-        unit, reference, defined_unit = self._defined_time
-        period_s = self.period_s if self._has_stamps else None
-        return learn_point_time(self._readable(self._sound_items()), unit, reference, period_s, defined_unit)
-
-    def _readable(self, items: Iterable[Any]) -> Iterator[tuple[RawCloud, float | None]]:
-        """The clouds that can be decoded, with their stamps where these read a clock."""
-        for item in items:
-            with suppress(InputError):
-                yield self._decode(item), self._stamp(item) if self._has_stamps else None
-
-    @cached_property
-    def _timing(self) -> PointTiming:
-        runs = ((cloud for cloud, _ in self._readable(run)) for run in self._runs())
-        return point_timing(self._learned, runs, self.period_s, self._config.time_reference)
-
-    @cached_property
-    def _point_time(self) -> PointTimeModel | None:
-        return self._timing.model
-
-    def _read(self, item: Any, faults: Faults) -> Scan:
-        stamp = self._stamp(item)
-        return self._timing.scan(self._decode(item), stamp, faults, f"{stamp:.9f}")
-
-    def _fields(self, item: Any) -> tuple[PointField, ...]:
-        return self._decode(item).fields
 
 
 class PacketRecording(StoredRecording):

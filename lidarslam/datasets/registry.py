@@ -16,20 +16,14 @@ from typing import NamedTuple, cast
 from lidarslam.core.errors import InputError
 from lidarslam.core.plugins import PlugPoint, usable
 from lidarslam.core.text import count, first_few
+from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.fetched import is_url
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
 from lidarslam.datasets.mounting import KITTI_DEG, MountedRecording
 from lidarslam.datasets.published import evalio
 from lidarslam.datasets.published.evalio import is_of_evalio, located
-from lidarslam.datasets.recording import (
-    ROSBAG1_SUFFIXES,
-    STORAGE_SUFFIXES,
-    CloudRecording,
-    Recording,
-    storage_files,
-)
-from lidarslam.datasets.sweeps import JoinedRecording
+from lidarslam.datasets.recording import ROSBAG1_SUFFIXES, STORAGE_SUFFIXES, Recording, storage_files
 
 logger = logging.getLogger(__name__)
 
@@ -97,8 +91,8 @@ READERS: dict[str, Reader] = {
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
-        f"{_HERE}.published.kitti:open_raw",
-        "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
+        f"{_HERE}.published.kitti:KittiRawRecording",
+        "KITTI raw: a ..._drive_NNNN_sync folder",
         _has("velodyne_points/data/"),
         elevation_deg=KITTI_DEG,
     ),
@@ -107,15 +101,6 @@ READERS: dict[str, Reader] = {
         "nuScenes: the root with v1.0-* (with --sequence)",
         _has("v1.0-*/scene.json"),
         True,
-    ),
-    "argoverse-2": Reader(
-        f"{_HERE}.published.argoverse2", "Argoverse 2: the folder of a log", _has("sensors/lidar/*.feather")
-    ),
-    "apollo": Reader(
-        f"{_HERE}.published.apollo",
-        "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
-        _has("poses/gt_poses.txt", "*/poses/gt_poses.txt"),
-        takes_sequence=True,
     ),
     "mulran": Reader(f"{_HERE}.published.mulran", "MulRan: a sequence with a folder Ouster", _has("Ouster/")),
     "nclt": Reader(f"{_HERE}.published.nclt", "NCLT: a session with a folder velodyne_sync", _has("velodyne_sync/")),
@@ -208,9 +193,8 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
     opens = resolve_name(reader.module if ":" in reader.module else f"{reader.module}:open_recording")
-    recording, time_scale = cast(Recording, opens(source, config)), config.time_scale
-    if isinstance(recording, CloudRecording):
-        recording, time_scale = JoinedRecording(recording, config.sweep_s, time_scale), 1.0
+    recording = cast(Recording, opens(source, config))
+    time_scale = 1.0 if isinstance(recording, CloudRecording) else config.time_scale
     raised_deg = config.raised_deg(reader.elevation_deg)
     if config.mounting == "upright" and not raised_deg and time_scale == 1.0:
         return recording

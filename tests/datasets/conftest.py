@@ -310,12 +310,12 @@ def _ascii(table: np.ndarray) -> bytes:
     return "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in table).encode()
 
 
-def ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes = b"", faces: bool = False) -> bytes:
-    """A PLY file; other elements may come before the vertices, and a face behind them."""
+def ply_bytes(table: np.ndarray, encoding: str, faces: bool = False) -> bytes:
+    """A PLY file; a face may come behind the vertices."""
     properties = "".join(f"property {_PLY_NAMES[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names)
-    header = f"ply\nformat {encoding} 1.0\ncomment made by a test\n{before}element vertex {len(table)}\n{properties}"
+    header = f"ply\nformat {encoding} 1.0\ncomment made by a test\nelement vertex {len(table)}\n{properties}"
     header += "element face 1\nproperty list uchar int vertex_indices\n" * faces + "end_header\n"
     if encoding == "ascii":
-        return header.encode() + prefix + _ascii(table) + b"3 0 1 2\n" * faces
+        return header.encode() + _ascii(table) + b"3 0 1 2\n" * faces
     rows = table.astype(table.dtype.newbyteorder("<" if "little" in encoding else ">"))
-    return header.encode() + prefix + rows.tobytes() + (b"\3" + bytes(12)) * faces
+    return header.encode() + rows.tobytes() + (b"\3" + bytes(12)) * faces

@@ -317,14 +317,6 @@ def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_wh
         open_recording(folder if is_whole else file)
 
 
-@pytest.mark.parametrize(("kind", "other"), [("mcap", "bag"), ("bag", "mcap")])
-def test_a_bag_of_another_name_is_told(write_drive, tmp_path, kind, other):
-    file, _, _ = write_drive(kind)
-    renamed = shutil.copy(file, tmp_path / f"renamed.{other}")
-    with pytest.raises(InputError, match=rf"by its first bytes; name it renamed\.{kind}"):
-        open_recording(renamed)
-
-
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_messages_that_were_left_in_the_log_of_a_database_are_told(write_drive, is_whole):
     """A recorder that was killed leaves them there; there may be no others."""

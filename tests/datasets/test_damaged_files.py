@@ -207,6 +207,7 @@ def test_a_header_that_promises_no_points_or_other_elements_than_there_are(tmp_p
     none = whole.replace(b"POINTS 120", b"POINTS 0").replace(b"element vertex 120", b"element vertex 0")
     assert_refused(tmp_path / name, none, r"promises no points, and .* bytes follow|is truncated")
     for data in (whole, none) if name.endswith(".ply") else ():
-        for place in (b"element vertex", b"end_header"):
+        told = {b"element vertex": "`vertex` before any others", b"end_header": r"1,000,000,000,000 other .* truncated"}
+        for place, said in told.items():
             lie = data.replace(place, b"element face 1000000000000\nproperty uchar n\n" + place)
-            assert_refused(tmp_path / name, lie, r"1,000,000,000,000 other elements .* truncated")
+            assert_refused(tmp_path / name, lie, said)

@@ -16,10 +16,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.files import read_array, reading
 from lidarslam.datasets.recording import KITTI_FIELDS
 
-# No sweep is larger; reading more would fill the memory.
-_LARGEST_BYTES = 1 << 31
 # A larger number is no scan's, such as a time.
-_MOST_SCANS = 10**9
+_MOST_SCANS = 10**7
 
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 TableReader = Callable[[Path], NDArray[np.void]]
@@ -58,9 +56,7 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
 
     The number is the scan's row in the stamp and pose files, since recordings may have gaps.
     """
-    files = sorted(
-        (f for f in folder.glob(f"*{suffix}") if not f.name.startswith(".")), key=lambda f: natural_key(f.stem)
-    )
+    files = [path for path in folder.glob(f"*{suffix}") if not path.name.startswith(".")]
     if not files:
         raise InputError(f"{folder}: holds no {suffix} scan")
     for path in files:
@@ -69,23 +65,20 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
                 f"{path}: expected a name that is the scan's number, such as 000004{suffix}, at most"
                 f" {_MOST_SCANS - 1:,}; rename it or move it away"
             )
+    files.sort(key=lambda path: int(path.stem))
     if suffix == ".bin":
         _require_layout(files[0], _agreement(files[0]))
     numbers = np.array([int(path.stem) for path in files], dtype=np.intp)
-    if (np.diff(numbers) == 0).any():
-        twice = int(np.argmin(np.diff(numbers)))
-        raise InputError(f"{folder}: {files[twice].name} and {files[twice + 1].name} have the same number; remove one")
+    if not np.diff(numbers).all():
+        raise InputError(f"{folder}: two of its {suffix} files have the same number; remove one")
     return files, numbers
 
 
 def read_bytes(path: Path) -> bytes:
     """The content of a scan file."""
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(path.stat().st_mode):
             raise InputError(f"{path}: expected a file with a scan, it is none; move it away")
-        if found.st_size > _LARGEST_BYTES:
-            raise InputError(f"{path}: {found.st_size:,} bytes are no single scan; split it or move it away")
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error})") from error
@@ -223,17 +216,14 @@ def _as_table(numbers: NDArray[np.generic], names: tuple[str, ...]) -> NDArray[n
 
 def read_ply(path: Path) -> NDArray[np.void]:
     """The vertices (N,) of a PLY file, ascii or binary; other elements, such as faces, are left out."""
-    return _read_described(path, "PLY", _ply_table)
+    with reading(path, "not a readable PLY file", "copy it again or remove it"):
+        return _ply_table(read_bytes(path))
 
 
 def read_pcd(path: Path) -> NDArray[np.void]:
     """The points (N,) of a PCD file, ascii, binary or binary_compressed; organised clouds are flattened."""
-    return _read_described(path, "PCD", _pcd_table)
-
-
-def _read_described(path: Path, kind: str, read: Callable[[bytes], NDArray[np.void]]) -> NDArray[np.void]:
-    with reading(path, f"not a readable {kind} file", "copy it again or remove it"):
-        return read(read_bytes(path))
+    with reading(path, "not a readable PCD file", "copy it again or remove it"):
+        return _pcd_table(read_bytes(path))
 
 
 def _ply_table(data: bytes) -> NDArray[np.void]:
@@ -243,23 +233,17 @@ def _ply_table(data: bytes) -> NDArray[np.void]:
     encoding = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "")
     if encoding not in _BYTE_ORDER:
         raise ValueError(f"expected the format {', '.join(_BYTE_ORDER)}, got {encoding!r}")
-    elements = _ply_elements(lines)
-    names, counts = [name for name, *_ in elements], [count for _, count, _ in elements]
-    if "vertex" not in names:
-        raise ValueError("expected an element `vertex`, found none")
-    at = names.index("vertex")
-    *others, dtype = (_ply_row_type(kinds, _BYTE_ORDER[encoding]) for _, _, kinds in elements[: at + 1])
-    before, rows, further = sum(counts[:at]), counts[at], sum(counts[at + 1 :])
+    (name, rows, kinds), *others = _ply_elements(lines) or [("", 0, [])]
+    if name != "vertex":
+        raise ValueError("expected the element `vertex` before any others")
+    dtype = _ply_row_type(kinds, _BYTE_ORDER[encoding])
     if dtype.itemsize > _WIDEST_POINT:
         raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
-    if (other := max(before, further)) > len(data):
-        raise ValueError(f"expected {other:,} other elements in {len(data):,} bytes: it is truncated")
+    if (further := sum(count for _, count, _ in others)) > len(data):
+        raise ValueError(f"expected {further:,} other elements in {len(data):,} bytes: it is truncated")
     if not rows and further:
         return np.empty(0, dtype)
-    if encoding == "ascii":
-        return read_ascii_table(data[length:].split(b"\n", before)[-1], dtype, rows)
-    skipped = sum(count * kind.itemsize for count, kind in zip(counts, others, strict=False))
-    return read_binary_table(data[length + skipped :], dtype, rows)
+    return (read_ascii_table if encoding == "ascii" else read_binary_table)(data[length:], dtype, rows)
 
 
 def _ply_elements(lines: list[list[str]]) -> list[tuple[str, int, list[list[str]]]]:
@@ -295,7 +279,7 @@ def _ply_row_type(properties: list[list[str]], order: str) -> np.dtype[np.void]:
     columns = []
     for words in properties:
         if len(words) != 2 or words[0] not in _TYPES:
-            raise ValueError(f"expected properties of a plain type up to the vertices, got {' '.join(words)!r}")
+            raise ValueError(f"expected vertices with properties of a plain type, got {' '.join(words)!r}")
         columns.append((words[1], order + _TYPES[words[0]]))
     return np.dtype(columns)
 

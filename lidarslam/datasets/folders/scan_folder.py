@@ -14,12 +14,13 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
+from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key, table_reader
 from lidarslam.datasets.imu_samples import IMU_FILE, read_imu_csv
 from lidarslam.datasets.point_table import RawCloud, raw_cloud
-from lidarslam.datasets.recording import CloudRecording, FileRecording, Recording, find_truth_file, first_file
+from lidarslam.datasets.recording import FileRecording, Recording, find_truth_file, first_file
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S
 from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate, stamps_from_names
 
@@ -35,26 +36,21 @@ _LOWEST_RATE_HZ = 0.1
 
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
-    named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
-    candidates = [path for path in named if path.is_file()]
-    if not candidates:
+    """The scans, those of the most frequent format; facts and warnings about the others."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
+    if not found:
         raise InputError(f"{folder}: expected scan files ({', '.join(SCAN_SUFFIXES)}), found none")
-    counts = Counter(path.suffix.lower() for path in candidates)
+    counts = Counter(path.suffix.lower() for path in found)
     suffix = max(SCAN_SUFFIXES, key=lambda s: counts[s])  # of equals the first: a scan wins over a map
-    same = [path for path in candidates if path.suffix.lower() == suffix]
+    same = [path for path in found if path.suffix.lower() == suffix]
     numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
     files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
-    skipped = sorted(path.name for path in set(candidates) - set(files))
+    skipped = sorted(path.name for path in set(found) - set(files))
+    if not skipped:
+        return files, [], []
+    others = [f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."]
     are_scans = len(skipped) > _FEW_OTHERS * len(files) and any(c.isdecimal() for c in skipped[0])
-    gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
-    notes, warnings = list[str](), list[str]()
-    if skipped:
-        others = f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."
-        (warnings if are_scans else notes).append(others)
-    if gone:
-        no_files = "is no file" if len(gone) == 1 else "are no files"
-        warnings.append(f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}.")
-    return files, notes, warnings
+    return (files, [], others) if are_scans else (files, others, [])
 
 
 def _numbers(files: Sequence[Path]) -> NDArray[np.intp]:
@@ -74,20 +70,17 @@ def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, lis
     """The stamps, and warnings where lines and scans differ in number, or stamps were replaced."""
     lines = read_stamps(path)
     stamps, numbers = lines[np.isfinite(lines)], np.arange(len(files))
-    warnings, left = [], max(0, len(files) - len(stamps))
+    left, which = max(0, len(files) - len(stamps)), None
     if len(stamps) > len(files):
         named = [int(file.stem) for file in files if file.stem.isdecimal()]
+        which = "the first are taken"
         if len(named) == len(files) and named[-1] < len(lines):  # as in KITTI, where scans may have been omitted
             stamps, numbers, which = lines[named], np.array(named), "each takes the line of its number, from 0 on"
-        else:
-            stamps, which = stamps[: len(files)], "the first are taken"
-        warnings = [f"{path.name} has {len(lines):,} stamps for {count(len(files), 'scan')}; {which}."]
     elif left:
-        warnings = [
-            f"{path.name} has {count(len(stamps), 'stamp')} for {count(len(files), 'scan')}; those of the last {left:,}"
-            " continue at its rate."
-        ]
-        stamps = np.append(stamps, np.full(left, np.nan))
+        which = f"those of the last {left:,} continue at its rate"
+    said = f"{path.name} has {count(len(stamps) if left else len(lines), 'stamp')} for {count(len(files), 'scan')}"
+    warnings = [] if which is None else [f"{said}; {which}."]
+    stamps = np.append(stamps[: len(files)], np.full(left, np.nan))
     try:
         mended, replaced = mend_stamps(stamps, numbers.astype(np.float64))
     except ValueError:
@@ -129,8 +122,8 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         named = stamps_from_names([path.stem for path in files])
         is_named = named is not None and len(set(named)) == len(named)
         if stamp_file is not None and is_named and stamp_file.parent != folder:
-            is_of_camera = len(read_stamps(stamp_file)) != len(files)
-            stamp_file = None if is_of_camera else stamp_file
+            of_camera = len(read_stamps(stamp_file)) != len(files)
+            stamp_file = None if of_camera else stamp_file
         if stamp_file is not None:
             stamps, faults = _read_stamp_file(stamp_file, files)
             warnings += faults
@@ -142,8 +135,6 @@ class ScanFolderRecording(CloudRecording, FileRecording):
             self._has_stamps = False
             if (missing := int(numbers[-1]) + 1 - len(files)) > 0:
                 warnings.append(f"{count(missing, 'number')} missing among the names of the scans; these leave gaps.")
-            if named is not None:
-                warnings.append("The file names look like stamps, but some are equal.")
         above = places[2]
         whole = above.parent if above.name == "velodyne_points" else above
         if folder.resolve().name == "velodyne" or whole != above:
@@ -153,7 +144,7 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         super().__init__(folder, config, files)
         self.stamps = stamps
         self._truth_path, self._imu_path = find_truth_file(places), first_file(places, IMU_FILE)
-        self._folder_notes, self._folder_warnings = tuple(notes), tuple(warnings)
+        self._facts_of_source, self._folder_warnings = tuple(notes), tuple(warnings)
         self._read_table = table_reader(files)
 
     @cached_property
@@ -162,14 +153,13 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         return None if self._imu_path is None else read_imu_csv(self._imu_path)
 
     @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """The repairs of the stamps, an assumed rate, and faults of the points' times."""
+    def _faults_of_source(self) -> tuple[str, ...]:
         assumed = (assumed_rate("The scans have no stamps", self._config),) if self._rate_is_assumed else ()
-        return (*self._folder_warnings, *assumed, *self._timing.warnings)
+        return (*self._folder_warnings, *assumed)
 
-    @cached_property
-    def _notes(self) -> tuple[str, ...]:
-        return (*self._folder_notes, *self._timing.notes)
+    @property
+    def _stored_scans(self) -> int:
+        return len(self._files)
 
     def _decode(self, item: int) -> RawCloud:
         path = self._files[item]
@@ -183,11 +173,11 @@ class ScanFolderRecording(CloudRecording, FileRecording):
         return float(self.stamps[item])
 
     def _sound_items(self) -> Iterable[int]:
-        return range(len(self))
+        return range(self._stored_scans)
 
     def _runs(self) -> Iterable[Iterable[int]]:
-        starts = sorted({int(index) for index in np.linspace(0, max(0, len(self) - 2), _PAIRS)})
-        return (range(first, min(first + 2, len(self))) for first in starts)
+        starts = sorted({int(index) for index in np.linspace(0, max(0, self._stored_scans - 2), _PAIRS)})
+        return (range(first, min(first + 2, self._stored_scans)) for first in starts)
 
     @cached_property
     def period_s(self) -> float | None:
@@ -219,6 +209,6 @@ class ScanFolderRecording(CloudRecording, FileRecording):
     def _last_stamp(self, first: Scan) -> float:
         """By its points' clock, which may be better than the rate."""
         try:
-            return self._read(len(self) - 1, Faults()).stamp
+            return self._read(self._stored_scans - 1, Faults()).stamp
         except InputError:
             return super()._last_stamp(first)

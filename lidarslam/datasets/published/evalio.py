@@ -17,13 +17,13 @@ from lidarslam.core.files import reading
 from lidarslam.core.geometry import FloatArray, inverse, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.core.text import first_few
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_table import PointField
 from lidarslam.datasets.published.catalogue import CATALOGUE
-from lidarslam.datasets.recording import ImuSummary, Recording, StoredRecording
+from lidarslam.datasets.published.stamped_files import increasing
+from lidarslam.datasets.recording import Recording, StoredRecording
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows
 
@@ -94,19 +94,15 @@ def absent(source: Path) -> str | None:
     if not (folder.is_relative_to(data_folder()) or is_of_evalio(folder) or folder.name in DATA_SETS):
         return None
     known = sequences()
-    if folder.name in {*DATA_SETS, *known}:
-        return f"{source}: is a data set of evalio; name one of its sequences{_choice(folder.name, known)}"
-    data_set = folder.parent.name
-    if known and source.name not in known.get(data_set, ()):
-        there = _choice(data_set, known) or f": {', '.join(known)}"
-        return f"{source}: evalio has no {full_name(source)}; there are{there}"
+    if known and source.name not in known.get(folder.parent.name, ()):
+        return _unknown(source)
     install = "" if known else "; evalio comes with pip install 'lidarslam[datasets]'"
     return f"{source}: is not downloaded: {how_to_get(source)}{install}"
 
 
-def _choice(data_set: str, known: dict[str, tuple[str, ...]]) -> str:
-    names = [f"{PREFIX}{data_set}/{name}" for name in known.get(data_set, ())]
-    return f": {first_few(names, 6)}" if names else ""
+def _unknown(source: Path) -> str:
+    data_set = next((name for name in (source.name, source.absolute().parent.name) if name in DATA_SETS), "")
+    return f"{source}: is no sequence of evalio; there are those of `{f'lidarslam datasets {data_set}'.strip()}`"
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -114,12 +110,8 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     known = sequences()
     if not known:
         raise InputError(f"{source}: {MISSING_EXTRA}")
-    data_set = source.absolute().parent.name
-    if source.name not in known.get(data_set, ()):
-        raise InputError(
-            f"{source}: evalio has no {full_name(source)}{_choice(data_set, known)}; a folder of another data set is"
-            " read with --reader"
-        )
+    if source.name not in known.get(source.absolute().parent.name, ()):
+        raise InputError(f"{_unknown(source)}; a folder of another data set is read with --reader")
     from evalio import datasets
 
     return EvalioRecording(source.absolute(), config, datasets.get_sequence(full_name(source)))
@@ -137,7 +129,8 @@ class EvalioRecording(StoredRecording):
         self._sequence = sequence  # evalio.datasets.Dataset
         if folder.parent.name in _POSITIONS_ALONE:
             self.warnings = ("The truth has positions alone; errors of rotation against it say nothing.",)
-        lidar = sequence.lidar_params()
+        lidar, imu = sequence.lidar_params(), sequence.imu_params()
+        self.imu_name = f"{imu.brand} {imu.model}"
         self._notes = (
             f"{sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep.",
             f"The duration is that of the scans at {lidar.rate:g} Hz, the sensor's rate.",
@@ -182,8 +175,7 @@ class EvalioRecording(StoredRecording):
                 return None
             stamps = np.array([stamp.to_nsec() for stamp in truth.stamps]) * 1e-9
             T_world_imu = orthonormalize(np.stack([pose.to_mat() for pose in truth.poses]))
-        kept = increasing_rows(stamps)
-        return Trajectory(stamps[kept], T_world_imu[kept] @ self._T_imu_lidar)
+        return increasing(stamps, T_world_imu @ self._T_imu_lidar)
 
     @cached_property
     def imu(self) -> ImuSamples | None:
@@ -192,27 +184,10 @@ class EvalioRecording(StoredRecording):
             return None
         with self._reading("the IMU"):
             samples = [(one.stamp.to_nsec(), *one.gyro, *one.accel) for one in self._sequence.data_iter().imu_iter()]
-        if not samples:
-            return None
-        table = np.array(samples)
-        stamps = np.array([sample[0] for sample in samples]) * 1e-9
-        kept = increasing_rows(stamps)
-        return ImuSamples(stamps[kept], table[kept, 1:4], table[kept, 4:7], inverse(self._T_imu_lidar))
-
-    def _imu_summary(self) -> ImuSummary | None:
-        """By the index of bags; else by the samples."""
-        from evalio.datasets import RosbagIter
-
-        parameters = self._sequence.imu_params()
-        if not np.any(parameters.gravity):
-            return None
-        with self._reading("the IMU"):
-            iterator = self._sequence.data_iter()
-            if isinstance(iterator, RosbagIter):
-                number = sum(one.msgcount for one in iterator.connections_imu)
-            else:
-                number = sum(1 for _ in iterator.imu_iter())
-        return ImuSummary(f"{parameters.brand} {parameters.model}", number, float(parameters.rate), True)
+        table = np.array(samples, dtype=np.float64).reshape(-1, 7)
+        table[:, 0] *= 1e-9
+        table = table[increasing_rows(table[:, 0])]  # its units are known
+        return ImuSamples(table[:, 0], table[:, 1:4], table[:, 4:], inverse(self._T_imu_lidar)) if len(table) else None
 
     def _items(self, wanted: range, faults: Faults) -> Iterator[Scan]:
         given = 0

@@ -14,7 +14,6 @@ set's own program for compensation assumes.
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +34,7 @@ from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_of_rows, read_table
 from lidarslam.datasets.recording import Recording, find_sequence, first_file
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
-from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps, scan_rate
+from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps, scan_rate
 
 _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
@@ -64,40 +63,16 @@ class KittiOdometryRecording(BinRecording):
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(folder / "velodyne")
         super().__init__(folder, config, files)
-        self._times = self._read_times()
-        self._rate_is_assumed = not len(self._times)
-        last = int(self._numbers[-1])
-        if (folder / "times.txt").is_file() and last >= len(self._times) < 2:
-            raise InputError(
-                f"{folder / 'times.txt'}: expected {last + 1} stamps, one for every scan up to {files[-1].name}, got"
-                f" {len(self._times)}; complete it, or remove it to use the rate"
-            )
-        self.stamps = self._stamps_of(self._numbers)
+        times, last = folder / "times.txt", int(self._numbers[-1])
+        self._lines = len(read_stamps(times)) if times.is_file() else 0
+        # Of every scan up to the last one or the last line: the truth has poses of absent scans, too.
+        self._timing = stamps_of_rows(times, np.arange(max(last + 1, self._lines)), config)
+        self._rate_is_assumed, self.stamps = not self._timing.from_clock, self._timing.stamps[self._numbers]
         # Of a link, beside it or beside its target.
         wholes = (folder.absolute(), folder.resolve())
         poses = (first_file((whole.parent.parent / "poses",), f"{whole.name}.txt") for whole in wholes)
         self._pose_file = next(filter(None, poses), None) or first_file(wholes, "poses.txt")
         self._truth_path = self._pose_file if (folder / "calib.txt").is_file() else None
-
-    def _read_times(self) -> FloatArray:
-        path = self._source / "times.txt"
-        times = read_stamps(path) if path.is_file() else np.empty(0)
-        increasing = increasing_rows(times)
-        if not increasing.all():
-            raise InputError(
-                f"{path}: expected stamps that increase from line to line, those at line"
-                f" {int(np.argmin(increasing)) + 1} and perhaps others do not; mend it, or remove it to use the rate"
-            )
-        return times
-
-    def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
-        """The stamps (N,) of scans by their numbers; those beyond the last line continue at the median rate."""
-        if self._rate_is_assumed:
-            return numbers / self._config.rate_hz
-        last_line = len(self._times) - 1
-        beyond = np.maximum(numbers - last_line, 0)
-        period_s = float(np.median(np.diff(self._times))) if beyond.any() else 0.0
-        return np.asarray(self._times[np.minimum(numbers, last_line)] + period_s * beyond, dtype=np.float64)
 
     @property
     def name(self) -> str:
@@ -117,11 +92,11 @@ class KittiOdometryRecording(BinRecording):
         if self._pose_file is None or T_cam_lidar is None:
             return None
         T_cam0_cam = read_kitti_poses(self._pose_file)
-        if not self._rate_is_assumed:
-            T_cam0_cam = T_cam0_cam[: max(len(self._times), int(self._numbers[-1]) + 1)]
+        stamps = self._timing.stamps if self._timing.from_clock else np.arange(len(T_cam0_cam)) / self._config.rate_hz
+        T_cam0_cam = T_cam0_cam[: len(stamps)]
         # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
         T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
-        return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
+        return Trajectory(stamps[: len(T_cam0_cam)], T_world_lidar)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -129,9 +104,8 @@ class KittiOdometryRecording(BinRecording):
         return tuple(self._warnings())
 
     def _warnings(self) -> Iterator[str]:
-        last, lines, poses = int(self._numbers[-1]), len(self._times), 0
-        if self._rate_is_assumed:
-            yield assumed_rate("There is no times.txt", self._config)
+        last, poses = int(self._numbers[-1]), 0
+        yield from self._timing.notes
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
         if self._pose_file is not None and self._truth_path is None:
@@ -139,8 +113,9 @@ class KittiOdometryRecording(BinRecording):
         elif self._pose_file is not None:
             with suppress(InputError):  # damaged, an error of `ground_truth`
                 poses = len(read_kitti_poses(self._pose_file))
-        counts = ((lines, f"times.txt has {lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
-        if others := [said for number, said in counts if number not in (0, last + 1)]:
+        others = [f"times.txt has {self._lines} lines"] if self._lines > last + 1 else []
+        others += [f"{self._pose_file} has {poses} poses"] if poses not in (0, last + 1) else []
+        if others:
             yield (
                 f"{' and '.join(others)} for the scans up to number {last}; missing stamps continue at the rate of the"
                 " others, and what is beyond is not used."
@@ -173,33 +148,23 @@ def oxts_poses(rows: FloatArray) -> FloatArray:
     return make_transform(R, np.column_stack([east, north, rows[:, 2]]))
 
 
-def open_raw(source: Path, config: ReaderConfig) -> Recording:
-    """Open a `..._sync` drive folder."""
-    data = source / "velodyne_points" / "data"
-    if any(data.glob("*.txt")) and not any(data.glob("*.bin")):
-        raise InputError(
-            f"{source}: holds scans as text, as the unsynchronised ..._extract drives do; expected .bin scans:"
-            " use the ..._sync drive of the same number"
-        )
-    return KittiRawRecording(source.resolve(), config)
-
-
 class KittiRawRecording(BinRecording):
-    """One drive of the raw data."""
+    """One drive of the raw data: a `..._sync` folder."""
 
     reader = "kitti-raw"
     imu_name = "oxts"
     point_time = AZIMUTH_TIME
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
-        files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
-        super().__init__(drive, config, files)
-        self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config)
-        self.stamps = self._timing.stamps
-        self._rate_is_assumed = not self._timing.from_clock
+        folder = drive.resolve() / "velodyne_points"
+        files, self._numbers = numbered_scans(folder / "data")
+        super().__init__(drive.resolve(), config, files)
+        self._timing = stamps_of_rows(folder / "timestamps.txt", self._numbers, config)
+        self.stamps, self._rate_is_assumed = self._timing.stamps, not self._timing.from_clock
+        self._before_s, self._after_s, notes = sweep_durations(folder, self._numbers, self._timing, config)
         first, last = self._numbers[0], self._numbers[-1]
         gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
-        self.warnings = (*self._timing.notes, *gaps)
+        self.warnings = (*self._timing.notes, *notes, *gaps)
 
     @cached_property
     def T_cam_lidar(self) -> FloatArray | None:
@@ -244,12 +209,9 @@ class KittiRawRecording(BinRecording):
             return numbers / self._config.rate_hz
         path = self._source / "oxts" / "timestamps.txt"
         if path.is_file():
-            rows, table = numbers, read_stamps(path)
-        else:  # the stamps of the scans with the rows' numbers are used instead
-            rows = np.searchsorted(self._numbers, numbers)
-            rows = np.where(np.append(self._numbers, -1)[rows] == numbers, rows, len(self))
-            table = self.stamps
-        return np.append(table, np.nan)[np.minimum(rows, len(table))]
+            return _rows(path, numbers)
+        scans = np.searchsorted(self._numbers, numbers).clip(max=len(self) - 1)
+        return np.where(self._numbers[scans] == numbers, self.stamps[scans], np.nan)
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -273,8 +235,7 @@ class KittiRawRecording(BinRecording):
         return usable_samples(oxts.stamps, oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
     def _offsets(self, rows: NDArray[np.float32], index: int) -> FloatArray:
-        before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
-        return offsets_from_azimuth(rows, float(before_s), float(after_s))
+        return offsets_from_azimuth(rows, float(self._before_s[index]), float(self._after_s[index]))
 
     @cached_property
     def _notes(self) -> tuple[str, ...]:
@@ -306,10 +267,9 @@ class Kitti360Recording(BinRecording):
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / _POINTS / "data")
         super().__init__(drive, config, files)
-        timing = read_sweep_timing(drive / _POINTS, self._numbers, config)
-        self.stamps = timing.stamps
         # There are no files of the sweeps' starts and ends, unlike in KITTI's raw data.
-        self.warnings = tuple(note for note in timing.notes if "sweeps" not in note)
+        timing = stamps_of_rows(drive / _POINTS / "timestamps.txt", self._numbers, config)
+        self.stamps, self.warnings, self._rate_is_assumed = timing.stamps, timing.notes, not timing.from_clock
         self._sweep_s = 1.0 / (scan_rate(self.stamps) or config.rate_hz)
         self._truth_path = first_file((drive.parent.parent / "data_poses" / drive.name,), "poses.txt")
 
@@ -381,41 +341,44 @@ def read_raw_calibration(path: Path) -> FloatArray:
     return _rigid(path, read_entry(path, 9, "R").reshape(3, 3), read_entry(path, 3, "T"))
 
 
-@dataclass(frozen=True, eq=False)
-class SweepTiming:
-    """The times of N sweeps."""
+class ScanStamps(NamedTuple):
+    """The stamps of N scans."""
 
-    stamps: FloatArray  # (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras
-    # before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end
-    before_s: FloatArray
-    after_s: FloatArray
-    from_clock: bool  # whether the stamps are clock readings; else they are made from the rate
+    stamps: FloatArray  # (N,) seconds, strictly increasing
+    from_clock: bool  # whether they are clock readings; else they are made from the rate
     notes: tuple[str, ...]  # facts for the user
 
 
-def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], config: ReaderConfig) -> SweepTiming:
-    """By timestamps.txt, timestamps_start.txt and timestamps_end.txt in a `velodyne_points` folder, else by the rate.
-
-    The numbers (N,) of the scans are the rows of the files; a missing scan has a blank row.
-    """
+def stamps_of_rows(path: Path, numbers: NDArray[np.intp], config: ReaderConfig) -> ScanStamps:
+    """By a file with a row for every scan, which the numbers (N,) are, blank for a missing one; else by the rate."""
     try:
-        found = _rows(folder / "timestamps.txt", numbers)
-        stamps, replaced = mend_stamps(found, numbers.astype(np.float64))
+        stamps, replaced = mend_stamps(_rows(path, numbers), numbers.astype(np.float64))
     except ValueError:
+        missing = f"There is no {path.name} with two stamps that increase"
+        return ScanStamps(numbers / config.rate_hz, False, (assumed_rate(missing, config),))
+    said = f"{count(replaced, 'stamp')} of {path.name} interpolated: missing, repeated or backwards."
+    return ScanStamps(stamps, True, (said,) if replaced else ())
+
+
+def sweep_durations(
+    folder: Path, numbers: NDArray[np.intp], timing: ScanStamps, config: ReaderConfig
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Seconds (N,) from the start of a sweep to its stamp, and from there to its end; facts for the user.
+
+    By timestamps_start.txt and timestamps_end.txt in a `velodyne_points` folder. The laser faces forward at the stamp,
+    which triggers the cameras.
+    """
+    stamps = timing.stamps
+    if not timing.from_clock:
         half = np.full(len(numbers), 0.5 / config.rate_hz)
-        note = assumed_rate("There is no timestamps.txt with two stamps that increase", config)
-        return SweepTiming(numbers / config.rate_hz, half, half, False, (note,))
-    notes = []
-    if replaced:
-        notes.append(f"{count(replaced, 'stamp')} of timestamps.txt interpolated: missing, repeated or backwards.")
+        return half, half, ()
     period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / config.rate_hz
     start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
     before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
     after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
-    if wrong_starts or wrong_ends:
-        said = "ends of sweeps missing or implausible, and replaced: sweeps are taken to be seamless."
-        notes.append(f"{count(wrong_starts, 'start')} and {wrong_ends} {said}")
-    return SweepTiming(stamps, before_s, after_s, True, tuple(notes))
+    said = "ends of sweeps missing or implausible, and replaced: sweeps are taken to be seamless."
+    is_wrong = wrong_starts or wrong_ends
+    return before_s, after_s, (f"{count(wrong_starts, 'start')} and {wrong_ends} {said}",) if is_wrong else ()
 
 
 def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray:

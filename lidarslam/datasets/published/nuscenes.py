@@ -11,18 +11,20 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
 from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import reading
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.json_text import parse_json, read_json
 from lidarslam.core.text import stays_below
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.point_table import PointField
-from lidarslam.datasets.published.stamped_files import BinRecording, increasing, poses_wxyz
+from lidarslam.datasets.published.stamped_files import BinRecording, increasing
 from lidarslam.datasets.recording import KITTI_FIELDS, Recording, choose_sequence
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
@@ -107,7 +109,7 @@ class NuScenesRecording(BinRecording):
         if missing := next((token for token in tokens if token not in by_token), None):
             raise InputError(f"{self._version}: has no pose {missing!r}; download the tables again")
         found = [by_token[token] for token in tokens]
-        return poses_wxyz(self._version, [one["translation"] for one in found], [one["rotation"] for one in found])
+        return _poses(self._version, [one["translation"] for one in found], [one["rotation"] for one in found])
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -144,3 +146,14 @@ def _select(
                 if start < 0 or end == 0:
                     raise ValueError(f"a record has no end within {_LONGEST_RECORD:,} bytes")
                 yield parse_json(text[start:end], shape)
+
+
+def _poses(path: Path, positions: ArrayLike, quaternions: ArrayLike) -> FloatArray:
+    """Transforms (..., 4, 4) of positions (..., 3) and quaternions (..., 4) of a file, with the scalar first."""
+    try:
+        t, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+        if not (np.isfinite(t).all() and np.isfinite(q).all()):
+            raise ValueError("expected finite positions and quaternions")
+        return make_transform(Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix(), t)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: {error}; download it again") from error

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
@@ -64,14 +63,3 @@ def poses_of_rows(numbers: FloatArray) -> FloatArray:
     """Transforms (..., 4, 4) of the twelve numbers (..., 12) of their first three rows, as files round them."""
     rows = numbers.reshape(*numbers.shape[:-1], 3, 4)
     return orthonormalize(make_transform(rows[..., :3], rows[..., 3]))
-
-
-def poses_wxyz(path: Path, positions: ArrayLike, quaternions: ArrayLike) -> FloatArray:
-    """Transforms (..., 4, 4) of positions (..., 3) and quaternions (..., 4) of a file, with the scalar first."""
-    try:
-        t, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
-        if not (np.isfinite(t).all() and np.isfinite(q).all()):
-            raise ValueError("expected finite positions and quaternions")
-        return make_transform(Rotation.from_quat(np.roll(q, -1, axis=-1)).as_matrix(), t)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: {error}; download it again") from error

@@ -233,7 +233,6 @@ class BagFile:
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
-            _require_kind(self.path, self.ros2)
             require_tables(self.path)
             reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
@@ -271,15 +270,6 @@ def _left_in_log(path: Path) -> str | None:
         return None
     merge = f"sqlite3 {str(log).removesuffix('-wal')} 'PRAGMA wal_checkpoint(TRUNCATE)'"
     return f"{log}: may hold messages that are not yet in the bag, as after a crash; `{merge}` adds them"
-
-
-def _require_kind(path: Path, ros2: bool) -> None:
-    if path.is_dir():
-        return
-    magic, suffix = (_ROSBAG1_MAGIC, ".bag") if ros2 else (MCAP_MAGIC, ".mcap")
-    with path.open("rb") as file:
-        if file.read(len(magic)) == magic:
-            raise InputError(f"{path}: is a {suffix} by its first bytes; name it {path.with_suffix(suffix).name}")
 
 
 def _last(messages: Iterable[BagMessage]) -> BagMessage | None:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,13 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.plugins import require_library
 from lidarslam.core.scan import Scan
+from lidarslam.datasets.cloud_recording import CloudRecording
 from lidarslam.datasets.config import ReaderConfig, TimeReference, TimeUnit
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.packets.ouster import OusterRecording, find_metadata, frames_of_packets, packets_of, read_sensor
 from lidarslam.datasets.packets.velodyne import VelodyneCapture
 from lidarslam.datasets.point_table import RawCloud
 from lidarslam.datasets.recording import (
-    CloudRecording,
     ImuSummary,
     Recording,
     SeveralTopicsError,
@@ -85,6 +85,7 @@ class BagRecording(CloudRecording):
         self._bag = bag
         self._topic = topic
         self.topic, self.topics = topic.name, bag.topics
+        self._facts_of_source = bag.notes
         self._truth_path = truth_beside(source, self.name)
 
     @property
@@ -92,7 +93,8 @@ class BagRecording(CloudRecording):
         """The bag, and the frame of its clouds."""
         return self._bag, self._frame_id
 
-    def __len__(self) -> int:
+    @property
+    def _stored_scans(self) -> int:
         return self._topic.messages
 
     @cached_property
@@ -113,16 +115,11 @@ class BagRecording(CloudRecording):
         return None if first is None else replace(ImuSummary.of(topic.name, first), samples=topic.messages)
 
     @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """Other topics, a lost index, headers without stamps, and faults of the points' times."""
+    def _faults_of_source(self) -> tuple[str, ...]:
         others = _others_left_out(self._bag.topics, self._topic) if self._config.topic is None else None
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (others, self._bag.damage, unset, _one_part(self._source), *self._timing.warnings)
+        found = (others, self._bag.damage, unset, _one_part(self._source))
         return tuple(warning for warning in found if warning is not None)
-
-    @cached_property
-    def _notes(self) -> tuple[str, ...]:
-        return (*self._bag.notes, *self._timing.notes)
 
     def _items(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
         return in_stamp_order(self._wanted(wanted, faults), self._stamp, faults)
@@ -154,27 +151,29 @@ class BagRecording(CloudRecording):
         for count, message in enumerate(self._bag.messages(self._topic, note), 1):  # noqa: B007 - the last one counts
             yield message
         if not count:
-            lists = f"{self._source}: its index lists {len(self)} messages of {self._topic.name}, it holds none;"
+            lists = (
+                f"{self._source}: its index lists {self._stored_scans} messages of {self._topic.name}, it holds none;"
+            )
             remedy = " reindex it, or give one of its .db3 or .mcap files instead of the folder"
             raise InputError(damages[0] if damages else lists + remedy)
         if missing := sum(index >= count for index in wanted):
-            held = f"its index lists {len(self)} scans, it holds {count}"
+            held = f"its index lists {self._stored_scans} scans, it holds {count}"
             faults.leave_out(_MISSING, held, missing, is_readable=False)
 
-    def _sound_items(self) -> Iterator[BagMessage]:
+    def _of_any_sensor(self) -> Iterator[BagMessage]:
         return (message for message in self._bag.messages(self._topic) if message.damage is None)
 
-    def _of_sensor(self) -> Iterator[BagMessage]:
-        return (message for message in self._sound_items() if message.frame_id == self._frame_id)
+    def _sound_items(self) -> Iterator[BagMessage]:
+        return (message for message in self._of_any_sensor() if message.frame_id == self._frame_id)
 
     @cached_property
     def _frame_id(self) -> str:
         """The sensor that most of the first messages come from, unless another is asked for."""
-        frames = Counter(m.frame_id for m in islice(self._sound_items(), _FRAMES_LOOKED_AT))
+        frames = Counter(m.frame_id for m in islice(self._of_any_sensor(), _FRAMES_LOOKED_AT))
         wanted = self._config.frame_id
         if wanted is None:
             return max(frames, key=lambda frame: frames[frame], default="")
-        if wanted not in frames and not any(m.frame_id == wanted for m in self._sound_items()):
+        if wanted not in frames and not any(m.frame_id == wanted for m in self._of_any_sensor()):
             found = ", ".join(repr(frame) for frame in frames)
             raise InputError(
                 f"{self._source}: reader.frame_id is {wanted!r}, but {self._topic.name} begins with {found}"
@@ -186,7 +185,7 @@ class BagRecording(CloudRecording):
 
     @cached_property
     def _stamps(self) -> StampSource:
-        return find_stamp_source(self._sound_items())
+        return find_stamp_source(self._of_any_sensor())
 
     def _stamp(self, item: BagMessage) -> float:
         return self._stamps.stamp(item)
@@ -202,7 +201,7 @@ class BagRecording(CloudRecording):
     @cached_property
     def period_s(self) -> float | None:
         """The median interval of the first stamps that increase, seconds."""
-        stamps = np.array([self._stamp(message) for message in islice(self._of_sensor(), _STAMPS_LOOKED_AT)])
+        stamps = np.array([self._stamp(message) for message in islice(self._sound_items(), _STAMPS_LOOKED_AT)])
         steps = np.diff(stamps[stamps > self._stamps.before_first])
         return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else None
 
@@ -214,15 +213,9 @@ class BagRecording(CloudRecording):
             return self._config.time_unit, "absolute", TIME_UNIT
         return super()._defined_time
 
-    def _runs(self) -> Iterator[list[BagMessage]]:
+    def _runs(self) -> Iterator[tuple[BagMessage, BagMessage]]:
         apart = max(2, min(self._topic.messages, _LOOKED_AT) // _PAIRS)
-        pair: list[BagMessage] = []
-        for number, message in enumerate(islice(self._of_sensor(), _LOOKED_AT)):
-            if number % apart < 2:
-                pair.append(message)
-            if number % apart == 1:
-                yield pair
-                pair = []
+        return islice(pairwise(islice(self._sound_items(), _LOOKED_AT)), 0, None, apart)
 
 
 class OusterBag(OusterRecording):

@@ -232,34 +232,30 @@ def point_timing(
     fault = learned.warning
     if learned.model is not None:
         return PointTiming(learned.model, warnings=() if fault is None else (fault,))
-    sweep_s, note, offer = None, None, None
+    said = None
     if reference in ("auto", "azimuth") and period_s is not None:
         orders = ([sweep_order(cloud) for cloud in run] for run in runs)
-        sweep_s, note, offer = _by_azimuth(orders, period_s, reference == "azimuth")
-    if fault is not None and sweep_s is not None:
-        fault += "; the times follow from the azimuth instead."
-    elif fault is not None:
-        fault += _NO_TIMES if offer is None else "."
-    warnings = tuple(warning for warning in (fault, offer) if warning is not None)
-    return PointTiming(None if sweep_s is None else AZIMUTH_TIME, sweep_s, () if note is None else (note,), warnings)
+        said = _by_azimuth(orders, period_s, reference == "azimuth")
+    is_used, is_warning = said == _USED, said in (_OFFERED, _NO_ORDER, _TOO_SLOW)
+    if fault is not None:
+        fault += "; the times follow from the azimuth instead." if is_used else "." if is_warning else _NO_TIMES
+    warnings = tuple(warning for warning in (fault, said if is_warning else None) if warning is not None)
+    notes = () if said is None or is_warning else (said,)
+    return PointTiming(AZIMUTH_TIME, period_s, notes, warnings) if is_used else PointTiming(None, None, notes, warnings)
 
 
-def _by_azimuth(
-    runs: Iterable[list[SweepOrder | None]], period_s: float, is_asked: bool
-) -> tuple[float | None, str | None, str | None]:
-    """The duration of a sweep if the azimuth gives the times, a fact for the user, and the missing setting."""
+def _by_azimuth(runs: Iterable[list[SweepOrder | None]], period_s: float, is_asked: bool) -> str | None:
+    """Whether the azimuth gives the times, as it is told to the user: `_USED` where it does."""
     if is_asked and all(order is None for run in runs for order in run):
-        return None, None, _NO_ORDER
+        return _NO_ORDER
     if period_s >= _LONGEST_SWEEP_S:
-        return None, None, _TOO_SLOW if is_asked else None
+        return _TOO_SLOW if is_asked else None
     if is_asked:
-        return period_s, _USED, None
+        return _USED
     if not (pairs := list(_ordered_pairs(runs))):
-        return None, _UNORDERED, None
+        return _UNORDERED
     decision = are_as_measured(pairs)
-    if decision is None:
-        return None, None, _OFFERED
-    return (period_s, _USED, None) if decision else (None, _NOT_USED, None)
+    return _OFFERED if decision is None else _USED if decision else _NOT_USED
 
 
 def _ordered_pairs(runs: Iterable[list[SweepOrder | None]]) -> Iterator[tuple[SweepOrder, SweepOrder]]:

@@ -250,9 +250,12 @@ def test_what_is_not_downloaded_names_the_command(evalio_data: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("evalio:hilti_2022", r"is a data set of evalio; name one of its sequences: evalio:hilti_2022/construction_"),
-        ("evalio:hilti_2022/exp99", r"evalio has no hilti_2022/exp99; there are: evalio:hilti_2022/construction_"),
-        ("evalio:kitty/04", r"evalio has no kitty/04; there are: boreas, "),
+        ("evalio:hilti_2022", "is no sequence of evalio; there are those of `lidarslam datasets hilti_2022`"),
+        (
+            "evalio:hilti_2022/exp99",
+            "exp99: is no sequence of evalio; there are those of `lidarslam datasets hilti_2022`",
+        ),
+        ("evalio:kitty/04", "is no sequence of evalio; there are those of `lidarslam datasets`"),
     ],
 )
 def test_wrong_names(evalio_data: Path, name: str, message: str) -> None:
