@@ -61,11 +61,7 @@ CONFINED = {
     "onnxscript": ("lidarslam.odometry.network.checkpoint",),
     "ouster": ("lidarslam.datasets.packets.ouster*",),
     "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
-    "evalio": (
-        "lidarslam.api.evalio_pipeline",
-        "lidarslam.compare.peers.evalio_pipelines",
-        "lidarslam.datasets.published.evalio*",
-    ),
+    "evalio": ("lidarslam.compare.peers.evalio_pipelines", "lidarslam.datasets.published.evalio*"),
     "fsspec": ("lidarslam.datasets.fetched",),
     "pyproj": ("lidarslam.exports.geo",),
     "ray": ("lidarslam.core.tasks",),
