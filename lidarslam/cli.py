@@ -5,7 +5,6 @@ import errno
 import io
 import logging
 import os
-import resource
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,14 +20,11 @@ from lidarslam.commands.recordings import datasets, info, simulate
 from lidarslam.commands.runs import live, localise, merge, run
 from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
 from lidarslam.commands.view import view
-from lidarslam.core.errors import InputError, LidarSlamError
+from lidarslam.core.errors import LidarSlamError
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.viewer.rerun_environment import keep_rerun_to_itself, leave_if_abandoned
 
 logger = logging.getLogger(__name__)
-
-# Bytes of address space that libraries alone take.
-_LEAST_ADDRESSES = 1 << 30
 
 
 class _Group(click.Group):
@@ -44,7 +40,6 @@ class _Group(click.Group):
         _prepare_streams()
         keep_rerun_to_itself()
         try:
-            _require_surroundings()
             with ended_like_interrupted(), _usage_in_one_line():
                 return super().invoke(ctx)
         except LidarSlamError as error:
@@ -100,20 +95,6 @@ def _drop_unwritable_output() -> None:
         sys.stdout.flush()
     except OSError:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
-
-
-def _require_surroundings() -> None:
-    """Refuse to begin without a current folder, or where OpenBLAS would wait for memory forever as it is loaded."""
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        raise InputError("the current folder was removed; change to another") from None
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESSES:
-        raise InputError(
-            f"the address space is limited to {limit >> 20} MB (ulimit -v), which loaded libraries fill;"
-            f" allow {_LEAST_ADDRESSES >> 20} MB at least, and twice as much for a run"
-        )
 
 
 @click.group(

@@ -282,18 +282,3 @@ def test_environments(tmp_path, small_recording, changed):
     assert (ended.returncode, ended.stderr) == (0, "")
     assert "written to" in ended.stdout
     assert summary_of(tmp_path / "läuft")["scans"] == 6
-
-
-@pytest.mark.parametrize(
-    ("script", "said"),
-    [
-        ("cd gone && rmdir ../gone", "the current folder was removed"),
-        ("ulimit -v 1000000", "the address space is limited to"),  # OpenBLAS would wait for memory, deaf to SIGTERM
-    ],
-)
-def test_shells_in_which_nothing_can_be_done(tmp_path, script, said):
-    (tmp_path / "gone").mkdir()
-    ended = in_shell(f"{script}; exec {COMMAND} info nothing", tmp_path)
-    assert ended.returncode == 1
-    assert said in ended.stderr
-    assert ended.stderr.count("\n") == 1
