@@ -11,7 +11,6 @@ from lidarslam.config.settings import (
     CONFIGS,
     Config,
     TrainConfig,
-    YamlError,
     dump_yaml,
     headline,
     load_config,
@@ -132,7 +131,7 @@ def test_a_number_is_decimal_or_a_text(text):
     ("a: \x00", "not YAML"), ("? [a]\n: 1", "unhashable key"),
 ])  # fmt: skip
 def test_anything_else_is_an_error_in_one_line(text, message):
-    with pytest.raises(YamlError, match=message) as raised:
+    with pytest.raises(ConfigError, match=message) as raised:
         parse_yaml(text)
     assert "\n" not in str(raised.value)
 

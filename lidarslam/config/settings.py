@@ -38,18 +38,6 @@ _FLOAT = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.in
 _NUMBERS = {"tag:yaml.org,2002:int": _INT, "tag:yaml.org,2002:float": _FLOAT}
 
 
-class YamlError(ConfigError):
-    """A text that is not valid YAML; the message is one line.
-
-    Attributes:
-        is_syntax: whether only the syntax is wrong, so that it may be meant as a plain text.
-    """
-
-    def __init__(self, message: str, is_syntax: bool = False) -> None:
-        super().__init__(message)
-        self.is_syntax = is_syntax
-
-
 class _StrictLoader(yaml.SafeLoader):
     """Refuses a key that occurs twice in a section; any value that is no decimal number is a text."""
 
@@ -72,13 +60,11 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """The values of a text; YamlError where it is not YAML, asks for other objects, or a key occurs twice."""
+    """The values of a text; ConfigError where it is not YAML, asks for other objects, or a key occurs twice."""
     try:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 # a SafeLoader that refuses more
-    except yaml.YAMLError as error:
-        raise YamlError(f"not YAML: {' '.join(str(error).split())}", is_syntax=True) from error
-    except (RecursionError, ValueError, AttributeError) as error:  # too deep, or converted without a check: 2021-13-45
-        raise YamlError(f"not YAML: {error}") from error
+    except (yaml.YAMLError, RecursionError, ValueError, AttributeError) as error:  # too deep; a date such as 2021-13-45
+        raise ConfigError(f"not YAML: {' '.join(str(error).split())}") from error
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -87,11 +73,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
         with path.open("rb") as file:
             content = file.read(_LONGEST_BYTES + 1)
         if len(content) > _LONGEST_BYTES:
-            raise ConfigError(f"{path}: is longer than {_LONGEST_BYTES >> 20} MB; expected a file of settings")
+            raise ConfigError(f"is longer than {_LONGEST_BYTES >> 20} MB; expected a file of settings")
         tree = parse_yaml(content.decode("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: the file cannot be read ({one_line(str(error))})") from error
-    except YamlError as error:
+    except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     if not isinstance(tree, dict | None):
         raise ConfigError(f"{path}: expected keys and values, got a {type(tree).__name__}")
@@ -283,9 +269,7 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
         raise ConfigError(f"--set {_short(setting)}: expected key.path=value, such as {example}")
     try:
         value = parse_yaml(text)
-    except YamlError as error:
-        if not error.is_syntax:
-            raise ConfigError(f"--set {_short(setting)}: {error}") from error
+    except ConfigError:
         value = text
     _put(tree, dotted.strip(), value, f"--set {_short(setting)}")
 
