@@ -62,7 +62,6 @@ class CloudDecoder:
         self._faults = faults
         self._frame_id = config.frame_id
         self._last_ns: int | None = None
-        self._doubtful: tuple[int, int] | None = None  # stamp and publication of a first message from the future
         self._last_published_ns = self._ahead = 0  # and the number of stamps in a row ahead of it
         self._behind_ns, self._behind = 0, 0  # the last stamp behind it, and the number of increasing ones in a row
         self._has_header_stamps = True
@@ -135,30 +134,22 @@ class CloudDecoder:
         if self._frame_id is not None and frame_id != self._frame_id:
             self._faults.leave_out(_OTHER_SENSOR, f"{frame_id!r} instead of {self._frame_id!r}")
             return False
-        if self._last_ns is None:
-            return self._begins(stamp_ns, published_ns)
-        step_ns = stamp_ns - self._last_ns
-        if step_ns <= 0:
-            self._behind = self._behind + 1 if self._behind_ns < stamp_ns < self._last_ns - _BEHIND_NS else 0
+        # At the beginning the publication takes the place of a scan before; a clock that is behind it is another one.
+        last_ns = min(stamp_ns - 1, published_ns) if self._last_ns is None else self._last_ns
+        waited_ns = 0 if self._last_ns is None else max(0, published_ns - self._last_published_ns)
+        example = f"{stamp_ns / 10**9:.9f}, after {last_ns / 10**9:.9f}"
+        if stamp_ns <= last_ns:
+            self._behind = self._behind + 1 if self._behind_ns < stamp_ns < last_ns - _BEHIND_NS else 0
             self._behind_ns = stamp_ns
-            example = f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}"
             if self.is_set_back:
                 self._faults.note(_CLOCK_BEHIND, example, self._behind)
             self._faults.leave_out(_NOT_AFTER, example)
             return False
-        is_ahead = step_ns > max(0, published_ns - self._last_published_ns) + _AHEAD_NS
-        self._ahead = self._ahead + 1 if is_ahead else 0
+        self._ahead = self._ahead + 1 if stamp_ns - last_ns > waited_ns + _AHEAD_NS else 0
         if 0 < self._ahead < _CLOCK_WAS_SET:
-            self._faults.leave_out(_AHEAD, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+            self._faults.leave_out(_AHEAD, example)
             return False
         return True
-
-    def _begins(self, stamp_ns: int, published_ns: int) -> bool:
-        """Whether scans begin here; a stamp ahead of its publication is of another clock only if the next one is."""
-        before, self._doubtful = self._doubtful, (stamp_ns, published_ns)
-        if stamp_ns - published_ns < _AHEAD_NS:
-            return True
-        return before is not None and 0 < stamp_ns - before[0] < published_ns - before[1] + _AHEAD_NS
 
     def _learn(self, cloud: RawCloud, stamp: float) -> None:
         """Infer unit and reference of the time field, until they are clear."""
