@@ -428,7 +428,7 @@ class FeatureMap(LocalMap):
         for grids, is_kind in ((self._edges, is_edge), (self._planes, ~is_edge)):
             chosen = np.flatnonzero(is_kind)
             inserted = points.take(chosen, axis=0), views.take(chosen, axis=0), scan.elevations.take(chosen)
-            for_each_grid(grids, VoxelGrid.insert, *inserted)
+            for_each_grid(grids, len(chosen), VoxelGrid.insert, *inserted)
         self._count(sensor)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> FeatureMatcher:  # noqa: ARG002

@@ -25,6 +25,9 @@ _YOUNG_SCANS = 5
 _LEVEL_COSINE = 0.7
 # Cells beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.2
+# Points or cells from which a second thread gains more time than it takes to wake it.
+_WORTH_A_THREAD = 10_000
+_second_thread = ThreadPoolExecutor(1, "grid")
 
 
 class Surfaces(NamedTuple):
@@ -165,16 +168,19 @@ class LocalMap(Stateful, ABC):
         self._centre = sensor if self._centre is None else self._centre
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
             self._centre = sensor
-            for_each_grid(self.grids, type(self.grids[0]).drop_beyond, sensor, self._radius_m)
+            for_each_grid(self.grids, len(self), type(self.grids[0]).drop_beyond, sensor, self._radius_m)
         self.scans += 1
 
 
-def for_each_grid(grids: Sequence[Grid], change: Callable[..., None], *arguments: object) -> None:
-    """Change all grids of a map, the first, which has the most cells, on a thread of its own: grids share nothing."""
-    with ThreadPoolExecutor(1, "grid") as pool:
-        first = pool.submit(change, grids[0], *arguments)
-        for grid in grids[1:]:
-            change(grid, *arguments)
+def for_each_grid(grids: Sequence[Grid], amount: int, change: Callable[..., None], *arguments: object) -> None:
+    """Change all grids of a map, which share nothing, by an amount of points or cells.
+
+    The first, which has the most cells, on a second thread if the amount is large.
+    """
+    first = _second_thread.submit(change, grids[0], *arguments) if amount > _WORTH_A_THREAD else None
+    for grid in grids if first is None else grids[1:]:
+        change(grid, *arguments)
+    if first is not None:
         first.result()
 
 

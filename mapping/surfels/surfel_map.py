@@ -256,7 +256,7 @@ class SurfelMap(LocalMap):
 
         Each point counts `weight` times.
         """
-        for_each_grid(self._grids, SurfelGrid.insert, points, elevations, views, weight)
+        for_each_grid(self._grids, len(points), SurfelGrid.insert, points, elevations, views, weight)
 
     def matcher(self, sweep: Sweep, level: int = 0, is_inertial: bool = False) -> SurfelMatcher:
         return SurfelMatcher(self._grids[level:], len(sweep), is_inertial and self.is_young)
