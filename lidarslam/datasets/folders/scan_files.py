@@ -16,6 +16,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.files import read_array, reading
 from lidarslam.datasets.recording import KITTI_FIELDS
 
+# No sweep is larger; reading more would fill the memory.
+_LARGEST_BYTES = 1 << 31
 # A larger number is no scan's, such as a time.
 _MOST_SCANS = 10**7
 
@@ -77,8 +79,11 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
 def read_bytes(path: Path) -> bytes:
     """The content of a scan file."""
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
             raise InputError(f"{path}: expected a file with a scan, it is none; move it away")
+        if found.st_size > _LARGEST_BYTES:
+            raise InputError(f"{path}: {found.st_size:,} bytes are no single scan; split it or move it away")
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error})") from error

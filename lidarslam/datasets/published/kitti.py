@@ -157,6 +157,10 @@ class KittiRawRecording(BinRecording):
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         folder = drive.resolve() / "velodyne_points"
+        if any(folder.glob("data/*.txt")) and not any(folder.glob("data/*.bin")):
+            raise InputError(
+                f"{drive}: holds scans as text, as the ..._extract drives do: use the ..._sync drive of the same number"
+            )
         files, self._numbers = numbered_scans(folder / "data")
         super().__init__(drive.resolve(), config, files)
         self._timing = stamps_of_rows(folder / "timestamps.txt", self._numbers, config)
