@@ -340,11 +340,13 @@ class VoxelGrid(Stateful):
 
     def insert(self, points: FloatArray, views: NDArray[np.float32], elevations: FloatArray) -> None:
         """Insert points (N, 3) of the world, with unit views (N, 3) to the sensor, and elevations (N,), radians."""
-        add_moments(points, views, elevations, self._rows_of(points), self._sums)
+        rows = self._rows_of(points)
+        add_moments(points, views, elevations, rows, self._sums)
 
     def insert_means(self, other: "VoxelGrid") -> None:
         """Insert the voxels of another grid, with their numbers of points."""
-        np.add.at(self._sums, self._rows_of(other.means), other._sums[: len(other)])
+        rows = self._rows_of(other.means)
+        np.add.at(self._sums, rows, other._sums[: len(other)])
 
     def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the voxels farther than `radius_m` from `centre` (3,)."""

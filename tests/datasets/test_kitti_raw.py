@@ -243,7 +243,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path, rng):
     extract = tmp_path / "b" / "2011_09_26_drive_0001_extract"
     (extract / "velodyne_points" / "data").mkdir(parents=True)
     (extract / "velodyne_points" / "data" / "0000000000.txt").write_text("1 2 3 0.5\n")
-    with pytest.raises(InputError, match=r"holds no \.bin scan"):
+    with pytest.raises(InputError, match=r"use the \.\.\._sync drive"):
         open_recording(extract)
 
 
