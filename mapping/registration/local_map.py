@@ -25,9 +25,8 @@ _YOUNG_SCANS = 5
 _LEVEL_COSINE = 0.7
 # Cells beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.2
-# Points or cells from which a second thread gains more time than it takes to wake it.
+# Points or cells from which a second thread gains more time than it takes to begin.
 _WORTH_A_THREAD = 10_000
-_second_thread = ThreadPoolExecutor(1, "grid")
 
 
 class Surfaces(NamedTuple):
@@ -177,10 +176,14 @@ def for_each_grid(grids: Sequence[Grid], amount: int, change: Callable[..., None
 
     The first, which has the most cells, on a second thread if the amount is large.
     """
-    first = _second_thread.submit(change, grids[0], *arguments) if amount > _WORTH_A_THREAD else None
-    for grid in grids if first is None else grids[1:]:
-        change(grid, *arguments)
-    if first is not None:
+    if amount < _WORTH_A_THREAD:
+        for grid in grids:
+            change(grid, *arguments)
+        return
+    with ThreadPoolExecutor(1, "grid") as pool:  # kept for longer, it would not survive a fork
+        first = pool.submit(change, grids[0], *arguments)
+        for grid in grids[1:]:
+            change(grid, *arguments)
         first.result()
 
 

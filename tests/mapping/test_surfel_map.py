@@ -7,6 +7,8 @@ from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import Correspondences
 from lidarslam.mapping.registration.sampled_scan import sizes_of_cells
+from lidarslam.mapping.surfels.grid import SurfelGrid
+from lidarslam.mapping.surfels.surfel_kernels import views_of
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 from .shapes import across_x, grass_on_a_slope, insert, on_sides, surfel_map_of
@@ -45,6 +47,15 @@ def test_points_on_walls_meet_the_walls(rng):
     assert matches.thickness_m.max() < 1e-3
     side = (np.abs(np.abs(asked) - HALF) < 1e-9).argmax(axis=1)[matches.index]
     np.testing.assert_allclose(np.abs(matches.normals[np.arange(len(side)), side]), 1.0, atol=1e-9)
+
+
+def test_many_points_make_the_same_grids_as_each_grid_alone(rng):
+    points, local_map = on_sides(rng, HALF, 40_000), SurfelMap(CELLS, 100.0)
+    insert(local_map, points)
+    alone = [SurfelGrid(cell_m) for cell_m in CELLS]
+    for grid, other in zip(local_map.grids, alone, strict=True):
+        other.insert(points, np.zeros(len(points)), views_of(points, np.zeros(3)))
+        np.testing.assert_array_equal(grid.means(), other.means())
 
 
 def test_where_fine_cells_show_nothing_coarse_ones_do(rng):
