@@ -37,20 +37,26 @@ _LOWEST_RATE_HZ = 0.1
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     """The scans, those of the most frequent format; facts and warnings about the others."""
-    found = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
-    if not found:
+    named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
+    candidates = [path for path in named if path.is_file()]
+    if not candidates:
         raise InputError(f"{folder}: expected scan files ({', '.join(SCAN_SUFFIXES)}), found none")
-    counts = Counter(path.suffix.lower() for path in found)
+    counts = Counter(path.suffix.lower() for path in candidates)
     suffix = max(SCAN_SUFFIXES, key=lambda s: counts[s])  # of equals the first: a scan wins over a map
-    same = [path for path in found if path.suffix.lower() == suffix]
+    same = [path for path in candidates if path.suffix.lower() == suffix]
     numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
     files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
-    skipped = sorted(path.name for path in set(found) - set(files))
-    if not skipped:
-        return files, [], []
-    others = [f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."]
+    skipped = sorted(path.name for path in set(candidates) - set(files))
     are_scans = len(skipped) > _FEW_OTHERS * len(files) and any(c.isdecimal() for c in skipped[0])
-    return (files, [], others) if are_scans else (files, others, [])
+    gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
+    notes, warnings = list[str](), list[str]()
+    if skipped:
+        others = f"{count(len(skipped), 'other file')} not taken for scans, such as {skipped[0]}."
+        (warnings if are_scans else notes).append(others)
+    if gone:
+        no_files = "is no file" if len(gone) == 1 else "are no files"
+        warnings.append(f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}.")
+    return files, notes, warnings
 
 
 def _numbers(files: Sequence[Path]) -> NDArray[np.intp]:
