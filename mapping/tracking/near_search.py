@@ -139,6 +139,7 @@ class NearSearch:
         is_near = near.status is not Status.LOST and _apart_m(turning, near) < matcher.scan.cell_m  # the same optimum
         factor = _MUCH_BETTER if turning.unconstrained else _BETTER
         is_better = (turning.is_reliable or is_near) and turning.quality > factor * near.quality
+        is_better = is_better and not self._is_similar(turning, near)
         return replace(turning, prediction=self.prediction) if is_better else near
 
     def without_odometry(self, near: Attempt) -> Attempt:
@@ -168,6 +169,7 @@ class NearSearch:
         for other in others:
             # With a known velocity, a place that leaves a direction unconstrained is no better than the prediction.
             counts = (other.is_reliable and not other.unconstrained) or not is_known
+            counts = counts and not self._is_similar(other, near)
             if counts and other.quality > _CLEARLY_BETTER * best.quality:
                 best = other
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
@@ -268,6 +270,13 @@ class NearSearch:
         """The quality of an attempt, times the likelihood of its motion by a proven odometry."""
         prior, noise = replace(self.prior, caution=_LIKELIHOOD_CAUTION), self.state.odometry_noise
         return attempt.quality * noise.likelihood(prior, self._motion(attempt), self.matcher.config)
+
+    def _is_similar(self, other: Attempt, near: Attempt) -> bool:
+        """Whether only another attempt contradicts the odometry: a place that looks alike, as the next step of stairs.
+
+        A lost scan has not been found near the prediction, so that the odometry may be wrong.
+        """
+        return near.status is not Status.LOST and self.contradicts(other) and not self.contradicts(near)
 
     def _motion(self, attempt: Attempt) -> FloatArray:
         """(4, 4) since the last scan."""

@@ -166,3 +166,20 @@ def test_a_proven_odometry_continues_the_pose_of_a_lost_scan_with_its_own_covari
         else:
             np.testing.assert_array_equal(lost.T_world_lidar, LOWER)
             np.testing.assert_array_equal(lost.covariance, LOST_MOTION)
+
+
+@pytest.mark.parametrize("strategy", ["at_any_speed", "with_any_acceleration"])
+@pytest.mark.parametrize(("status", "state", "moved_m"), [
+    (Status.DEGRADED, PROVEN, 0.5 * FINS_M),
+    (Status.DEGRADED, TrackingState(), 0.0),
+    (Status.LOST, PROVEN, 0.0),
+])  # fmt: skip
+def test_a_better_place_that_contradicts_a_proven_odometry_counts_only_if_the_scan_is_lost(
+    in_corridor, strategy, status, state, moved_m
+):
+    between = make_transform(np.eye(3), [0.5 * FINS_M, 0.0, 0.0])
+    near = replace(registered(in_corridor, between, (0.005, 0.04, 0.04)), status=status)
+    search = NearSearch(in_corridor, replace(state, velocity_known=True), replace(AT_REST, T_prev_curr=between),
+                        near.prediction)  # fmt: skip
+    found = getattr(search, strategy)(near)
+    assert found.T_world_lidar[0, 3] == pytest.approx(moved_m, abs=0.005)
