@@ -51,8 +51,9 @@ _RANGE_NOISE_M, _COUNTED = 0.02, 2.0
 # A line or plane is as uncertain as if this many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
 # Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
-# ring, five points make planes of any direction, and these move with the rings.
-_MOST_TILT = 0.05
+# ring, five points make planes of any direction, and these move with the rings. Less, and a third of the planes in high
+# grass would go.
+_MOST_TILT = 0.1
 # Least width of a plane, a standard deviation: per distance along it from the sensor, and at most. A ring that is swept
 # a little, as by a sensor that starts to move, makes a plane that errors of attitude tilt, the more the narrower it is.
 _LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 80.0, 0.08
