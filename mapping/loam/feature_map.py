@@ -50,10 +50,10 @@ _PLANE_M, _PLANE_CELLS = 0.2, 0.5
 _RANGE_NOISE_M, _COUNTED = 0.02, 2.0
 # A line or plane is as uncertain as if this many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
-# Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
-# ring, five points make planes of any direction, and these move with the rings. Less, and a third of the planes in high
-# grass would go.
-_MOST_TILT = 0.1
+# Largest standard deviation of the direction of a line or plane, without and with rings: across the corner of a floor
+# and a wall, and along a ring or stroke, five points make planes of any direction, and these move with the sensor.
+# Planes of a single ring are rejected by `_spans_rings`; at 0.05, a third of the planes in high grass would be, too.
+_MOST_TILT, _MOST_TILT_OF_RINGS = 0.05, 0.1
 # Least width of a plane, a standard deviation: per distance along it from the sensor, and at most. A ring that is swept
 # a little, as by a sensor that starts to move, makes a plane that errors of attitude tilt, the more the narrower it is.
 _LEAST_WIDTH, _LEAST_WIDTH_M = 1.0 / 80.0, 0.08
@@ -124,6 +124,7 @@ def match_features(
     scatter = np.empty(6)
     mean, variances, axis = np.empty(3), np.empty(3), np.empty(3)
     most_off = min(_PLANE_M, _PLANE_CELLS * voxels.cell_m)
+    most_tilt = _MOST_TILT_OF_RINGS if has_rings else _MOST_TILT
     for w in range(len(unmatched)):
         ahead = points[unmatched[min(w + _PREFETCHED, len(unmatched) - 1)]]
         prefetch_around(key_at(ahead, scale), voxels.bits, voxels.table_keys, voxels.table_rows)
@@ -134,7 +135,7 @@ def match_features(
             write_eigenvalues(scatter, variances)
             if is_line and variances[2] > _LINE_RATIO * variances[1]:
                 thickness_m, tilt = _uncertainty(variances[1], variances[2], number, 2.0)
-                if tilt < _MOST_TILT:
+                if tilt < most_tilt:
                     write_eigenvector(scatter, variances[2], axis)
                     _write_line(found, n, points[n], mean, axis, thickness_m, tilt)
                     continue
@@ -144,7 +145,7 @@ def match_features(
                 cosine = _turn_to(sensor, mean, axis)
                 if (
                     cosine > _LEAST_COSINE
-                    and tilt < _MOST_TILT
+                    and tilt < most_tilt
                     and (
                         not has_rings
                         or _spans_rings(near[:count], number, voxels.sums, variances[1], cosine, sensor, mean)
