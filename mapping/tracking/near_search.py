@@ -272,9 +272,9 @@ class NearSearch:
         return attempt.quality * noise.likelihood(prior, self._motion(attempt), self.matcher.config)
 
     def _is_similar(self, other: Attempt, near: Attempt) -> bool:
-        """Whether only another attempt contradicts the odometry: a place that looks alike, as the next step of stairs.
+        """Whether of two attempts only the other contradicts the odometry: a similar place, as the next step of stairs.
 
-        A lost scan has not been found near the prediction, so that the odometry may be wrong.
+        Where the scan is lost near the prediction, the odometry may be wrong.
         """
         return near.status is not Status.LOST and self.contradicts(other) and not self.contradicts(near)
 
