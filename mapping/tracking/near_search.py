@@ -139,8 +139,9 @@ class NearSearch:
         is_near = near.status is not Status.LOST and _apart_m(turning, near) < matcher.scan.cell_m  # the same optimum
         factor = _MUCH_BETTER if turning.unconstrained else _BETTER
         is_better = (turning.is_reliable or is_near) and turning.quality > factor * near.quality
-        is_better = is_better and not self._is_similar(turning, near)
-        return replace(turning, prediction=self.prediction) if is_better else near
+        if not is_better or self._is_similar(turning, near):
+            return near
+        return replace(turning, prediction=self.prediction)
 
     def without_odometry(self, near: Attempt) -> Attempt:
         """Where the odometry is contradicted, or the scan fits poorly with it: by the last motion alone."""
@@ -169,8 +170,8 @@ class NearSearch:
         for other in others:
             # With a known velocity, a place that leaves a direction unconstrained is no better than the prediction.
             counts = (other.is_reliable and not other.unconstrained) or not is_known
-            counts = counts and not self._is_similar(other, near)
-            if counts and other.quality > _CLEARLY_BETTER * best.quality:
+            is_better = counts and other.quality > _CLEARLY_BETTER * best.quality
+            if is_better and not self._is_similar(other, near):
                 best = other
         return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
 
