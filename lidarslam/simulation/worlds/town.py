@@ -25,6 +25,8 @@ _ROWS = 6
 _SPACING_M = (95.0, 115.0)
 _SHIFT_M = 16.0
 _LEFT_OUT = 10
+# Turns that are drawn again before a network is taken to have no drive.
+_MOST_DRAWS = 10_000
 _SPEED_LIMIT_MPS = 14.0  # 50 km/h
 # The share of houses with ornaments, and of kerbs with cars and trees.
 _FULLNESS = 0.4
@@ -49,9 +51,8 @@ def town(seed: int) -> World:
 
     Within `FREE_SIDE_M` of the drive, at any height, there is only the road.
     """
-    rng = np.random.default_rng(seed)
-    nodes, streets = draw_network(rng)
-    lane = street.lane_of(nodes[draw_tour(rng, len(nodes), streets)], 1.0)
+    nodes, tour = draw_drive(np.random.default_rng(seed))
+    lane = street.lane_of(nodes[tour], 1.0)
     rng = np.random.default_rng(seed)  # what stands there does not depend on how long a tour was looked for
     course = Course.along(np.concatenate([lane, lane[:1]]))
     low = np.floor(course.points.min(axis=0) - _MARGIN_M)
@@ -75,6 +76,18 @@ def town(seed: int) -> World:
     return World("town", seed, route, *solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
 
 
+def draw_drive(rng: np.random.Generator) -> tuple[FloatArray, list[int]]:
+    """Crossings (N, 2), and those of a closed drive, once through every street in either direction, without a U-turn.
+
+    A network in two parts, or with a ring of streets at the end of another one, has no such drive: another is drawn.
+    """
+    while True:
+        nodes, streets = draw_network(rng)
+        tour = draw_tour(rng, len(nodes), streets)
+        if len(tour) == 2 * len(streets):
+            return nodes, tour
+
+
 def draw_network(rng: np.random.Generator) -> tuple[FloatArray, list[tuple[int, int]]]:
     """Crossings (N, 2), and the streets between them; no crossing is a dead end."""
     grid = np.arange(_ROWS * _ROWS).reshape(_ROWS, _ROWS)
@@ -91,7 +104,7 @@ def draw_network(rng: np.random.Generator) -> tuple[FloatArray, list[tuple[int, 
 
 
 def draw_tour(rng: np.random.Generator, crossings: int, streets: list[tuple[int, int]]) -> list[int]:
-    """The crossings along a closed drive, once through every street in either direction, without a U-turn.
+    """The crossings along a closed drive without a U-turn: through every street in both directions, if it is found.
 
     Each street is left by another one, drawn for each crossing; drawn again at random places, and mostly kept where the
     round has become longer, these choices end as a single round.
@@ -99,7 +112,9 @@ def draw_tour(rng: np.random.Generator, crossings: int, streets: list[tuple[int,
     around = [[b if a == node else a for a, b in streets if node in (a, b)] for node in range(crossings)]
     leaves = {node: _turns(rng, len(nodes)) for node, nodes in enumerate(around)}
     tour = _round(around, leaves, streets[0])
-    while len(tour) < 2 * len(streets):
+    for _ in range(_MOST_DRAWS):
+        if len(tour) == 2 * len(streets):
+            break
         node = int(rng.integers(crossings))
         tried = leaves | {node: _turns(rng, len(around[node]))}
         other = _round(around, tried, streets[0])
