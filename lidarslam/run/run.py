@@ -15,6 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.text import count
+from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
@@ -37,7 +38,15 @@ from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.odometry_gate import where_needed
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.threads import prefetch
-from lidarslam.run.calibration import Elevation, found_imu, imu_samples, open_inertial, prior_warning, with_elevations
+from lidarslam.run.calibration import (
+    Elevation,
+    found_imu,
+    imu_samples,
+    open_inertial,
+    prior_warning,
+    unused_imu,
+    with_elevations,
+)
 from lidarslam.run.checkpoints import Checkpoints, describe_computed
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
@@ -312,6 +321,9 @@ def track(
     if isinstance(odometry, ExternalOdometry):
         log.warn(odometry.warning, prior_warning(log.odometry, log.trajectory))
     log.warn(None if elevation is None else elevation.warning)
+    if any(status is not Status.OK for status in log.statuses):
+        with suppress(InputError):  # of damaged samples
+            log.warn(unused_imu(config, recording))
     tracked = TrackedScans.of(log, faults, pipeline.map, len(chosen), error)
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 

@@ -131,8 +131,8 @@ class World:
 # Each with the module of lidarslam.simulation.worlds that has a function of its name, which takes the seed.
 WORLDS = {
     "street": "street", "office": "office", "tunnel": "tunnel", "forest": "countryside", "hall": "hall",
-    "park": "countryside", "fields": "countryside", "terrace": "street", "town": "town", "corridor": "hard_places",
-    "stairs": "hard_places", "crowd": "hard_places",
+    "park": "countryside", "fields": "countryside", "ploughed": "countryside", "terrace": "street", "town": "town",
+    "corridor": "hard_places", "stairs": "hard_places", "crowd": "hard_places",
 }  # fmt: skip
 
 

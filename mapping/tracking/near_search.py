@@ -157,9 +157,10 @@ class NearSearch:
 
     def at_any_speed(self, near: Attempt) -> Attempt:
         """Where velocity or position is open, or the odometry poor: displaced; a rival is a place that fits as well."""
-        # Sparse strokes fit many places: their smoothed motion is better known.
+        # Sparse strokes fit many places: their smoothed motion is better known, as is one by an IMU, if the scan fits.
         is_sparse = not (self.matcher.scan.has_rings or self.prediction.is_inertial)
-        is_known = self.state.velocity_known or (is_sparse and self.prediction.is_smoothed)
+        is_held = near.status is Status.OK and self.prediction.is_held_within(self.matcher.scan.cell_m)
+        is_known = self.state.velocity_known or is_held or (is_sparse and self.prediction.is_smoothed)
         is_open = not is_known or self._is_open
         if not is_open and not self._is_poor(near):
             return near

@@ -20,6 +20,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, ro
 from lidarslam.core.trajectory import Trajectory, read_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
+from lidarslam.run.calibration import unused_imu
 from lidarslam.simulation.imu import MEMS_IMU, sample_imu
 
 from ..conftest import succeeds, write_recording
@@ -95,6 +96,15 @@ def test_an_imu_that_nobody_asks_for_changes_nothing(recording, tmp_path):
         succeeds(*run(source, out, "--stop", "8", odometry="constant-velocity"))
         texts.append([(out / file).read_bytes() for file in ("trajectory.tum", "map.ply", "odometry.tum")])
     assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "hints"), [([], True), (["odometry.method=imu"], False), (["mapping.method=off"], False)]
+)
+def test_a_hint_at_an_imu_that_is_there_and_not_used(recording, small_recording, settings, hints):
+    config = load_config(None, settings)
+    assert (unused_imu(config, open_recording(recording)) is not None) == hints
+    assert unused_imu(config, open_recording(small_recording)) is None
 
 
 @pytest.mark.parametrize("method", ["imu", "learned+imu"])

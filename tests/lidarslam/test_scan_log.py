@@ -105,6 +105,19 @@ def test_motions_shorter_than_their_standard_deviation_may_be_noise(sigma_m, unc
     assert summary.to_json()["unconstrained_m"] == pytest.approx(unconstrained_m)
 
 
+@pytest.mark.parametrize(("noise_m", "sigma_m"), [(0.05, 0.05), (0.05, 0.005), (0.005, 0.05)])
+def test_noise_that_lengthens_a_path_is_measured(noise_m, sigma_m):
+    """A hundred motions of ten centimetres along x; a sway that is registered well is no noise."""
+    log, rng = ScanLog(), np.random.default_rng(0)
+    for scan in range(101):
+        pose = exp([0.0, 0.0, 0.0, 0.1 * scan, *rng.normal(0.0, noise_m, 2)])
+        log.add(result(0.1 * scan, T_world_lidar=pose, covariance=np.diag([1e-6] * 4 + [sigma_m**2] * 2)))
+    summary = summarise(log, WrittenMap(0, None, 0), unreadable=0)
+    lengthened_m = summary.length_m - 10.0 if noise_m == sigma_m else 0.0
+    assert summary.to_json()["unconstrained_m"] == pytest.approx(lengthened_m, rel=0.1, abs=0.11)  # the first motion
+    assert summary.went_astray == (noise_m == sigma_m)
+
+
 @pytest.mark.parametrize("direction", ["x", "yaw"])
 @pytest.mark.parametrize(("open_scans", "unknown"), [(0, False), (1, False), (4, True)])
 def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(open_scans, unknown, direction):

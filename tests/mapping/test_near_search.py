@@ -104,6 +104,14 @@ def test_a_motion_that_is_known_has_no_rival(in_corridor, prior, sigma_m):
     assert found.unconstrained == ()
 
 
+@pytest.mark.parametrize("is_inertial", [False, True])
+def test_a_position_that_an_imu_predicts_is_not_looked_for_elsewhere(in_corridor, is_inertial):
+    near = registered(in_corridor, HERE, (0.01, 0.01, 0.01))
+    prediction = replace(near.prediction, is_inertial=is_inertial)
+    found = NearSearch(in_corridor, TrackingState(), Prior(), prediction).at_any_speed(near)
+    assert (found is near) == is_inertial
+
+
 @pytest.mark.parametrize(("prior", "sigma_m"), [(Prior(HERE), 0.35), (Prior(HERE), 0.05), (Prior(), 0.35)])
 def test_another_place_is_a_rival_where_an_odometry_leaves_the_motion_open(prior, sigma_m):
     matcher = matcher_of(partial(finned_corridor, share=0.1), 1.5)

@@ -1,5 +1,6 @@
 """Worlds along a winding way on open ground: a forest, a park, fields."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -240,6 +241,11 @@ def fields(seed: int) -> World:
     tall = np.where(distance < _ROAD_HALF_M + 2.0, 0.12, np.array([0.06, 0.22, 0.4])[kind])
     grass = outdoor.grass(rng, ground, tall, distance - _ROAD_HALF_M)
     return World("fields", seed, route, *grounds.solid.solids, (ground,), map_spacing_m=0.1, grass=grass)
+
+
+def ploughed(seed: int) -> World:
+    """The fields of that seed, without grass."""
+    return replace(fields(seed), name="ploughed", grass=None)
 
 
 def _road(rng: np.random.Generator) -> FloatArray:
