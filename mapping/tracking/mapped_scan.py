@@ -47,6 +47,8 @@ _ODOMETRY_ERROR_M_S, _ODOMETRY_ERROR_RAD_S, _ODOMETRY_REACH_S = 0.3, np.deg2rad(
 # Overlap with a map that may be too thin from which a registration counts; and its largest correction, degrees and
 # cells, where the map is of several scans at their predictions.
 _FOUNDED_OVERLAP, _AGREEING = 0.2, (np.deg2rad(3.0), 0.5)
+# An IMU that predicts a position to this constrains it where the scan does not, metres.
+_HELD_M = 0.02
 # A turn that a gyroscope measured is known to this.
 _MEASURED_TURN = np.deg2rad(5.0)
 # A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place this many
@@ -236,6 +238,16 @@ class Attempt:
                 names.add(AXES[3 + int(along.argmax())])
         return tuple(name for name in AXES if name in names)
 
+    @property
+    def uncertain(self) -> tuple[str, ...]:
+        """Those of them along which an IMU does not constrain the position, either."""
+        is_ambiguous = self.rival is not None or self.status is not Status.OK
+        if is_ambiguous or self.registration is None or not self.prediction.is_inertial:
+            return self.unconstrained
+        sigmas_m = np.sqrt(np.diag(self.registration.covariance)[3:6])
+        held = [axis for axis, sigma_m in zip(AXES[3:], sigmas_m, strict=True) if sigma_m < _HELD_M]
+        return tuple(name for name in self.unconstrained if name not in held)
+
     @cached_property
     def correction(self) -> FloatArray:
         """(6,) from the predicted pose to the registered one."""
@@ -365,7 +377,8 @@ def judge(
     if attempt.status is not Status.OK:
         return attempt.status, attempt.fit.explain(config)
     assert attempt.registration is not None
-    degenerate, (angle, distance_m) = attempt.registration.degeneracy.names, attempt.corrected_by
+    uncertain, (angle, distance_m) = attempt.uncertain, attempt.corrected_by
+    degenerate = [name for name in attempt.registration.degeneracy.names if name in uncertain]
     where = f"{np.rad2deg(angle):.0f} deg and {distance_m:.2f} m from the prediction"
     reservations = (
         (attempt.relocalised, f"relocalised in the map, {where}; {NOT_CONFIRMED}"),
@@ -375,7 +388,7 @@ def judge(
         (unexpected, "registered, but neither odometry nor last motion predicted this pose"),
         (adrift, "in a new map; its pose in the map before is unknown"),
         (degenerate, f"degenerate along {', '.join(degenerate)}: the prediction was kept"),
-        (attempt.unconstrained, f"hardly constrained along {', '.join(attempt.unconstrained)}: it may slide"),
+        (uncertain, f"hardly constrained along {', '.join(uncertain)}: it may slide"),
         (conflict, f"the odometry measures other motions along {conflict}, as amid people who walk along"),
     )
     message = next((message for applies, message in reservations if applies), "")

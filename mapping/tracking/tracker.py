@@ -266,7 +266,7 @@ class Tracker(Stateful):
             status=status,
             message=message,
             fit=attempt.fit,
-            degenerate=tuple(name for name in AXES if name in (*attempt.unconstrained, conflict)),
+            degenerate=tuple(name for name in AXES if name in (*attempt.uncertain, conflict)),
             iterations=registration.iterations,
             added=fits and not jumped and not unconfirmed,
             is_connected=not relocalised,

@@ -129,6 +129,19 @@ def test_another_place_is_a_rival_where_an_odometry_leaves_the_motion_open(prior
         assert found.unconstrained == ("x",)
 
 
+@pytest.mark.parametrize(
+    ("is_inertial", "sigma_m", "uncertain"), [(True, 0.01, ()), (True, 0.1, ("x",)), (False, 0.01, ("x",))]
+)
+def test_along_a_bare_corridor_an_imu_that_is_certain_constrains_the_position(is_inertial, sigma_m, uncertain):
+    matcher = matcher_of(partial(finned_corridor, share=0.0), 1.1)
+    near = registered(matcher, HERE, (sigma_m, 0.04, 0.04))
+    attempt = replace(near, prediction=replace(near.prediction, is_inertial=is_inertial))
+    assert attempt.unconstrained == ("x",)
+    assert attempt.uncertain == uncertain
+    status, _ = judge(attempt, False, False, False, None, MappingConfig().tracking)
+    assert status is (Status.DEGRADED if uncertain else Status.OK)
+
+
 def from_odometry(matcher: ScanMatcher, near: Attempt, T_told: FloatArray | None) -> Attempt:
     return NearSearch(matcher, TrackingState(), Prior(T_told), near.prediction).from_odometry(near)
 
