@@ -45,6 +45,8 @@ _DISPLACED_CELLS = 3.0
 # Where the velocity is known, but the position not to this many cells and not measured, those within so many standard
 # deviations, at most so many on each side.
 _OPEN_CELLS, _OPEN_SIGMAS, _MOST_DISPLACED = 3.0, 3.0, 8
+# An IMU that predicts the position to this many cells leaves no other displacement to try, if the scan fits.
+_HELD_CELLS = 0.25
 # Most points that constrain directions that few others do, by which a displacement is chosen.
 _MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells.
@@ -159,7 +161,7 @@ class NearSearch:
         """Where velocity or position is open, or the odometry poor: displaced; a rival is a place that fits as well."""
         # Sparse strokes fit many places: their smoothed motion is better known, as is one by an IMU, if the scan fits.
         is_sparse = not (self.matcher.scan.has_rings or self.prediction.is_inertial)
-        is_held = near.status is Status.OK and self.prediction.is_held_within(self.matcher.scan.cell_m)
+        is_held = near.status is Status.OK and self.prediction.is_held_within(_HELD_CELLS * self.matcher.scan.cell_m)
         is_known = self.state.velocity_known or is_held or (is_sparse and self.prediction.is_smoothed)
         is_open = not is_known or self._is_open
         if not is_open and not self._is_poor(near):
