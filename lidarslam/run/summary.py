@@ -397,7 +397,7 @@ _SHORTEST_MOTION_M = 0.02
 _MOST_ACCELERATION = 4.0
 # Scans over which the noise of positions is measured, and its least standard deviation in a motion that counts: below,
 # gaits sway as much.
-_NOISE_SCANS, _LEAST_NOISE_M = 5, 0.02
+_NOISE_SCANS, _LEAST_NOISE_M = 5, 0.04
 # A motion that is faster than those before and after it by this many m/s is a jump from or to a wrong place.
 _JUMP_MPS = 5.0
 
