@@ -255,3 +255,26 @@ def format_kitti(poses: FloatArray) -> str:
     out = StringIO()
     np.savetxt(out, poses[:, :3].reshape(-1, 12), fmt="%.9e")
     return out.getvalue()
+
+
+# Scans over which the noise of positions is measured, and its least standard deviation in a motion that counts: below,
+# gaits sway as much.
+_NOISE_SCANS, _LEAST_NOISE_M = 5, 0.04
+
+
+def lengthened_by_noise_m(positions: FloatArray, sigmas_m: FloatArray) -> FloatArray:
+    """By how much noise of the positions (N, 3) lengthens each motion between them (N - 1,), metres.
+
+    Its variance is that of the positions' second differences over a few scans, but at most that of their standard
+    deviations (N, 3), NaN where unknown: handheld and legged sensors sway, and are registered better than that.
+    """
+    moved_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    if len(positions) < _NOISE_SCANS:
+        return np.zeros_like(moved_m)
+    second = np.diff(positions, n=2, axis=0)
+    padded = np.pad((second**2).sum(axis=1) / 6.0, 1 + _NOISE_SCANS // 2, mode="edge")
+    seen = np.convolve(padded, np.full(_NOISE_SCANS, 1.0 / _NOISE_SCANS), mode="valid")
+    variances = np.minimum(seen, np.nansum(sigmas_m**2, axis=1))
+    of_motions = variances[:-1] + variances[1:]
+    shorter_m = np.sqrt(np.maximum(moved_m**2 - of_motions, 0.0))
+    return np.where(of_motions > _LEAST_NOISE_M**2, moved_m - shorter_m, 0.0)

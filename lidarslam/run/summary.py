@@ -16,7 +16,7 @@ from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state import State, Stateful
 from lidarslam.core.text import count
 from lidarslam.core.tracking import AXES, Status
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, lengthened_by_noise_m
 from lidarslam.mapping.consistency import Contradiction
 from lidarslam.mapping.global_map.global_map import TiledMap
 from lidarslam.mapping.loops.closure import LoopClosure
@@ -395,9 +395,6 @@ _WALKING_MPS = 1.5
 _SHORTEST_MOTION_M = 0.02
 # Of a vehicle, m/s^2.
 _MOST_ACCELERATION = 4.0
-# Scans over which the noise of positions is measured, and its least standard deviation in a motion that counts: below,
-# gaits sway as much.
-_NOISE_SCANS, _LEAST_NOISE_M = 5, 0.04
 # A motion that is faster than those before and after it by this many m/s is a jump from or to a wrong place.
 _JUMP_MPS = 5.0
 
@@ -431,28 +428,11 @@ def _unconstrained_m(log: ScanLog) -> float:
     before, after = np.append(speeds[:1], speeds[:-1]), np.append(speeds[1:], speeds[-1:])
     is_jump = speeds > np.maximum(before, after) + _JUMP_MPS
     lengths_m = np.where(is_noise | is_jump, whole_m, np.linalg.norm(moved * open_axes, axis=1))
-    lengths_m = np.maximum(lengths_m, _lengthened_m(log, whole_m))
+    lengths_m = np.maximum(lengths_m, lengthened_by_noise_m(log.trajectory.positions, log.table["sigmas"][:, 3:]))
     is_unknown = degenerate.all(axis=1)
     lengths_m[is_unknown] = np.maximum(lengths_m, _WALKING_MPS * np.diff(log.stamps))[is_unknown]
     lengths_m[:1] = np.maximum(lengths_m[:1], _unconfirmed_start_m(log))
     return float(lengths_m.sum())
-
-
-def _lengthened_m(log: ScanLog, whole_m: FloatArray) -> FloatArray:
-    """By how much the noise of the positions lengthens each motion of a length (N - 1,).
-
-    Its variance is that of the positions' second differences over a few scans, but at most the registrations' own:
-    handheld and legged sensors sway, and are registered better than that.
-    """
-    if len(log) < _NOISE_SCANS:
-        return np.zeros_like(whole_m)
-    second = np.diff(log.trajectory.positions, n=2, axis=0)
-    padded = np.pad((second**2).sum(axis=1) / 6.0, 1 + _NOISE_SCANS // 2, mode="edge")
-    seen = np.convolve(padded, np.full(_NOISE_SCANS, 1.0 / _NOISE_SCANS), mode="valid")
-    variances = np.minimum(seen, np.nansum(log.table["sigmas"][:, 3:] ** 2, axis=1))
-    of_motions = variances[:-1] + variances[1:]
-    shorter_m = np.sqrt(np.maximum(whole_m**2 - of_motions, 0.0))
-    return np.where(of_motions > _LEAST_NOISE_M**2, whole_m - shorter_m, 0.0)
 
 
 def _unconfirmed_start_m(log: ScanLog) -> float:
