@@ -57,7 +57,7 @@ def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
 
 def unused_imu(config: Config, recording: Recording) -> str | None:
     """A hint at an IMU in the recording that the odometry does not use; None without one."""
-    if config.odometry.uses_imu or not config.mapping.enabled or recording.imu is None:
+    if config.odometry.uses_imu or not config.mapping.enabled or recording.describe().imu is None:
         return None
     return "the recording has an IMU that is not used; --odometry learned+imu uses it"
 

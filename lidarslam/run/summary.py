@@ -476,7 +476,7 @@ def _warnings(
     if is_unconstrained(unconstrained_m, length_m):
         yield (
             f"the length of {length_m:.1f} m is uncertain by {unconstrained_m:.1f} m: hardly any surface constrains the"
-            " motion there, as in a featureless corridor or by a sparse sensor, or people walk along"
+            " motion there, as in a featureless corridor or with a sparse sensor, or people walk along"
         )
     if (wrong := time_scale_warning(scale)) is not None:
         yield wrong

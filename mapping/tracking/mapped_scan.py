@@ -240,7 +240,7 @@ class Attempt:
 
     @property
     def uncertain(self) -> tuple[str, ...]:
-        """Those of them along which an IMU does not constrain the position, either."""
+        """Names of the unconstrained axes along which no IMU constrains the position, either."""
         is_ambiguous = self.rival is not None or self.status is not Status.OK
         if is_ambiguous or self.registration is None or not self.prediction.is_inertial:
             return self.unconstrained

@@ -46,7 +46,7 @@ _DISPLACED_CELLS = 3.0
 # deviations, at most so many on each side.
 _OPEN_CELLS, _OPEN_SIGMAS, _MOST_DISPLACED = 3.0, 3.0, 8
 # An IMU that predicts the position to this many cells leaves no other displacement to try, if the scan fits.
-_HELD_CELLS = 0.25
+_CERTAIN_CELLS = 0.25
 # Most points that constrain directions that few others do, by which a displacement is chosen.
 _MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells.
@@ -161,7 +161,8 @@ class NearSearch:
         """Where velocity or position is open, or the odometry poor: displaced; a rival is a place that fits as well."""
         # Sparse strokes fit many places: their smoothed motion is better known, as is one by an IMU, if the scan fits.
         is_sparse = not (self.matcher.scan.has_rings or self.prediction.is_inertial)
-        is_held = near.status is Status.OK and self.prediction.is_held_within(_HELD_CELLS * self.matcher.scan.cell_m)
+        within_m = _CERTAIN_CELLS * self.matcher.scan.cell_m
+        is_held = near.status is Status.OK and self.prediction.is_held_within(within_m)
         is_known = self.state.velocity_known or is_held or (is_sparse and self.prediction.is_smoothed)
         is_open = not is_known or self._is_open
         if not is_open and not self._is_poor(near):
