@@ -25,7 +25,8 @@ from lidarslam.mapping.localization.place_search import (
 )
 from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
-from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, Fit, MappedScan
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.mapped_scan import NOT_CONFIRMED, MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.mapping.tracking.tracker import Tracker
 from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER

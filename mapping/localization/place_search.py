@@ -29,7 +29,7 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import complete
-from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Fit, measure_fit
+from lidarslam.mapping.tracking.fit import NO_FIT, Fit, measure_fit
 from lidarslam.mapping.tracking.scan_matcher import best_starts, positions_around, start_score
 
 # Least edge of a surfel cell in spacings of the map's points. With fewer points in and around a cell normals are

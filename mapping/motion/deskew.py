@@ -47,6 +47,13 @@ class Sweep:
         """The points (N, 3) in the LiDAR frame at the stamp, for a constant velocity (6,)."""
         return self.points if self.times is None else move(self.points, self.times, velocity)
 
+    def placed(self, velocity: FloatArray, T_world_lidar: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The compensated points (N, 3), and their places (N, 3) in the world at a pose (4, 4)."""
+        points = np.ascontiguousarray(self.compensated(velocity))
+        world = np.empty_like(points)
+        _place(points, np.ascontiguousarray(T_world_lidar), world)
+        return points, world
+
 
 def body_velocity(T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
     """Constant body velocity (6,), rotation first, of a motion (4, 4) over an interval."""
@@ -86,6 +93,14 @@ def move(points: FloatArray, t: FloatArray, velocity: FloatArray) -> FloatArray:
     moved = np.empty((len(points), 3))
     _move(np.ascontiguousarray(points), np.ascontiguousarray(t), np.ascontiguousarray(velocity), moved)
     return moved
+
+
+@compiled
+def _place(points: FloatArray, T: FloatArray, placed: FloatArray) -> None:
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        for axis in range(3):
+            placed[n, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
 
 
 @compiled

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log
-from lidarslam.core.tracking import Degeneracy, lever_scale
+from lidarslam.core.tracking import Degeneracy
 
 # Least mean constraint of a direction. Noisy normals of a corridor's walls constrain it as well: the share that their
 # uncertainty explains does not count.
 _LEAST_SHARE = 0.0005
 _NOISE_FACTOR = 1.25
-# Information of the prediction along degenerate directions: that of a tenth of a millimetre.
-DEGENERATE_INFORMATION = 1e8
 
 
 def point_to_plane_jacobian(points: FloatArray, normals: FloatArray) -> FloatArray:
@@ -80,13 +79,17 @@ def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray,
     2016), take the eigenvalues of the sum, whose threshold depends on all three.
     """
     constraint = (jacobian * weights[:, None]).T @ jacobian
-    return degenerate_directions(constraint, float(weights @ tilt**2), float(weights.sum()), lever_m)
+    return Degeneracy(open_directions(constraint, float(weights @ tilt**2), float(weights.sum()), lever_m), lever_m)
 
 
-def degenerate_directions(constraint: FloatArray, tilt: float, weight: float, lever_m: float) -> Degeneracy:
-    """As `find_degeneracy`, from the weighted sums of `J^T J` (6, 6) and of the squared tilt, and the total weight."""
+@compiled
+def open_directions(constraint: FloatArray, tilt: float, weight: float, lever_m: float) -> FloatArray:
+    """Directions (D, 6) as of `find_degeneracy`, from the weighted sums of `J^T J` (6, 6) and of the squared tilt."""
     if weight <= 0.0:
-        return Degeneracy(np.eye(6), lever_m)
-    scale = lever_scale(lever_m)
-    shares, axes = np.linalg.eigh(constraint / weight / np.outer(scale, scale))
-    return Degeneracy(axes[:, shares < max(_LEAST_SHARE, _NOISE_FACTOR * (tilt / weight))].T, lever_m)
+        return np.eye(6)
+    scaled = constraint / weight
+    scaled[:3] /= lever_m
+    scaled[:, :3] /= lever_m
+    shares, axes = np.linalg.eigh(scaled)
+    count = np.count_nonzero(shares < max(_LEAST_SHARE, _NOISE_FACTOR * (tilt / weight)))
+    return np.ascontiguousarray(axes[:, :count].T)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.mapping.motion.deskew import Sweep
@@ -66,6 +67,20 @@ class Correspondences:
         return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
 
 
+@compiled
+def _gather(found: Surfaces, most: int) -> tuple[NDArray[np.intp], FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The residuals of surfaces, at most so many per point, in the order of the fields of `Correspondences`."""
+    count = np.minimum(found.counts, most).sum()
+    index, points, normals = np.empty(count, dtype=np.intp), np.empty((count, 3)), np.empty((count, 3))
+    thickness_m, tilt, m = np.empty(count), np.empty(count), 0
+    for n in range(len(found.counts)):
+        for k in range(min(found.counts[n], most)):
+            index[m], thickness_m[m], tilt[m] = n, found.thickness_m[n, k], found.tilt[n, k]
+            points[m], normals[m] = found.points[n], found.normals[n, k]
+            m += 1
+    return index, points, normals, thickness_m, tilt
+
+
 class Matcher(ABC):
     """Finds the surfaces that N points correspond to, at one pose after another; valid until the map changes."""
 
@@ -77,11 +92,7 @@ class Matcher(ABC):
 
     def correspondences(self, most: int = 3) -> Correspondences:
         """A residual per row, in the order of the points; of each point at most so many, first the one across it."""
-        found = self.surfaces
-        index, _ = chosen = np.nonzero(np.arange(most) < found.counts[:, None])
-        return Correspondences(
-            index, found.points[index], found.normals[chosen], found.thickness_m[chosen], found.tilt[chosen]
-        )
+        return Correspondences(*_gather(self.surfaces, most))
 
 
 class LocalMap(Stateful, ABC):

@@ -5,19 +5,28 @@ robust weights. The sensor moves during a sweep, so that its velocity is estimat
 end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
 """
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled, compiled_part
-from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse, orthonormalize, transform_points
 from lidarslam.core.tracking import Degeneracy, lever_scale
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
-from lidarslam.mapping.registration.gauss_newton import DEGENERATE_INFORMATION, degenerate_directions
+from lidarslam.mapping.registration.iteration import (
+    RANGE_NOISE_M,
+    ROWS,
+    SCALE_PER_MEDIAN,
+    Iteration,
+    accumulate,
+    heavy_tailed,
+    iterate,
+    linearise,
+    median_residual_m,
+    onto_observed,
+)
 from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 
@@ -26,21 +35,11 @@ _ITERATIONS, _PATIENT_ITERATIONS = (3, 20), (10, 40)
 # Steps below these end the iteration; on a coarse level, below this share of a cell.
 _CONVERGED_ROTATION, _CONVERGED_TRANSLATION_M = np.deg2rad(0.02), 0.001
 _COARSE_CONVERGED = 0.1
-# Standard deviation of a range measurement: no surface is known better.
-_RANGE_NOISE_M = 0.02
-# Scale of the robust kernel: this many times the median residual, at least this share of a cell.
-_SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
-# Residuals beyond this, in cells, are outliers.
-_GATE = 6.0
 # The uncertainty of the prediction widens the kernel, less at each iteration.
 _NARROWING = 0.8
-# Errors of neighbouring points are correlated: this many count as one. From true errors on simulated recordings.
-_CORRELATION = 4.0
 # Share of the correspondences' information in the resulting covariance: scans have errors in common, which the balance
 # with the prediction need not allow for. From true errors on real drives.
 _INFORMATION_SHARE = 0.25
-# Degrees of freedom of the prediction's error.
-_FREEDOM = 4.0
 # A velocity that differs by less than this over the interval needs no second compensation.
 _SAME_ROTATION, _SAME_TRANSLATION_M = np.deg2rad(0.1), 0.01
 
@@ -53,11 +52,6 @@ _SUFFICIENT, _FEWEST_LARGE = 15.0, 100
 _CONTRADICTION_CELLS = 0.2
 # Factor by which small surfaces are less certain then.
 _INFLATION = 6.0
-# Columns of a linearised residual: Jacobian (6), residual, standard deviation of the surface, of the normal, seconds.
-RESIDUAL, THICKNESS, TILT, TIME = 6, 7, 8, 9
-COLUMNS = 10
-# Residuals that are added up together.
-_BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +72,7 @@ class Registration:
     @property
     def degeneracy(self) -> Degeneracy:
         """The directions along which the prediction was kept."""
-        return self.solution.system.degeneracy
+        return self.solution.degeneracy
 
     @property
     def observed(self) -> FloatArray:
@@ -109,41 +103,44 @@ def register(
     The prediction is the start, and a prior with its covariance. Begins on coarse cells for predictions that may be
     off by more than half a cell; with more iterations if patient.
     """
-    T_world_lidar, velocity, iterations = prediction.T_world_lidar, prediction.velocity, 0
+    # The compiled iteration takes contiguous arrays.
+    predicted = prediction.T_world_lidar, prediction.velocity, prediction.covariance
+    T_predicted, velocity_predicted, covariance = map(np.ascontiguousarray, predicted)
+    T_world_lidar, velocity, iterations = T_predicted, velocity_predicted, 0
     times = sweep.times if with_velocity and sweep.times is not None else np.empty(0)
     coarse, most = _PATIENT_ITERATIONS if patient else _ITERATIONS
-    unknown = prediction.covariance
+    unknown = covariance
     try:
-        prior = predicted = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
+        information = uninflated = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         inflation = uniform = np.ones(len(sweep))
         for level in range(COARSE, -1, -1) if coarse_first else (0,):
             cell_m = local_map.cells_m[level]
             matcher = local_map.matcher(sweep, level, prediction.is_inertial)
             for _ in range(coarse if level else most - iterations):
-                points = sweep.compensated(velocity)
-                matcher.match(transform_points(T_world_lidar, points), T_world_lidar)
-                system = _System.of(points, times, T_world_lidar, matcher.surfaces, inflation, cell_m, unknown)
-                if system is None:
+                points, world = sweep.placed(velocity, T_world_lidar)
+                matcher.match(world, T_world_lidar)
+                found = iterate(
+                    points, times, T_world_lidar, velocity, matcher.surfaces, inflation, cell_m, unknown,
+                    T_predicted, velocity_predicted, information,
+                )  # fmt: skip
+                if found.residuals < MIN_POINTS:
                     if level > 0:  # of a thin map
                         break
                     return None
-                away = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
-                error = np.concatenate([away, velocity - prediction.velocity])
-                solution = _solve(system, _heavy_tailed(prior, error), error)
-                T_world_lidar = T_world_lidar @ exp(solution.step[:6])
-                velocity = velocity + solution.step[6:]
+                T_world_lidar, velocity, last = found.T_world_lidar, found.velocity, found
                 iterations += 1
-                unknown = _NARROWING**iterations * solution.covariance()
-                if _has_converged(solution.step, level, cell_m, system.degeneracy.lever_m):
+                unknown = _NARROWING**iterations * found.covariance
+                if _has_converged(found.step, level, cell_m, found.lever_m):
                     if level > 0 or inflation is not uniform:
                         break
-                    found = inflation_of_small(points, T_world_lidar, matcher.surfaces, local_map)
-                    if found is None:
+                    factors = inflation_of_small(points, T_world_lidar, matcher.surfaces, local_map)
+                    if factors is None:
                         break
                     # An odometry saw the same small surfaces.
-                    inflation, unknown, prior = found, prediction.covariance, prior / _INFLATION**2
+                    inflation, unknown, information = factors, covariance, information / _INFLATION**2
         # Where no large surface observes a direction, the pose is still known by the prediction.
-        covariance = replace(solution, prior=_heavy_tailed(predicted, error)).covariance(_INFORMATION_SHARE)
+        solution = _Solution.of(last)
+        covariance = replace(solution, prior=heavy_tailed(uninflated, last.error)).covariance(_INFORMATION_SHARE)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
     T_world_lidar, error = orthonormalize(T_world_lidar), velocity - prediction.velocity
@@ -200,22 +197,16 @@ def inflation_of_small(
         return None
     inflation, counts = np.full(len(points), _INFLATION), np.zeros_like(surfaces.counts)
     inflation[large] = counts[large] = 1
-    rows, total, at_rest = np.empty((len(large), COLUMNS)), np.zeros((13, 13)), np.empty(0)
-    _, squared = linearise(points, at_rest, T_world_lidar, surfaces._replace(counts=counts), inflation, rows)
-    squared_scale = (_SCALE_PER_MEDIAN * _median_residual_m(rows)) ** 2 + _RANGE_NOISE_M**2
-    _, tilt, _ = accumulate(rows, squared_scale, _RANGE_NOISE_M, np.inf, np.zeros((3, 6, 6)), total)
+    linearised, total, at_rest = np.empty((ROWS, len(large))), np.zeros((13, 13)), np.empty(0)
+    squared = linearise(points, at_rest, T_world_lidar, surfaces._replace(counts=counts), inflation, linearised)
+    squared_scale = (SCALE_PER_MEDIAN * median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
+    _, tilt, _ = accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
     scale = lever_scale(float(np.sqrt(squared / len(large))))
     hessian = total[:6, :6] / np.outer(scale, scale)
     if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * tilt:
         return None
     step_m = np.linalg.norm(np.linalg.solve(hessian, total[:6, 12] / scale))
     return inflation if step_m > _CONTRADICTION_CELLS * local_map.cell_m else None
-
-
-def _heavy_tailed(prior: FloatArray, error: FloatArray) -> FloatArray:
-    """The information (12, 12) of a prediction that is off by an error (12,), for Student's distribution."""
-    share = (_FREEDOM + len(error)) / (_FREEDOM + float(error @ prior @ error))
-    return min(1.0, share) * prior
 
 
 def _has_converged(step: FloatArray, level: int, cell_m: float, lever_m: float) -> bool:
@@ -226,60 +217,35 @@ def _has_converged(step: FloatArray, level: int, cell_m: float, lever_m: float) 
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
-    """Normal equations (12, 12) and (12,) of pose and velocity, and the directions that they leave open."""
-
-    hessian: FloatArray
-    gradient: FloatArray
-    degeneracy: Degeneracy
-    squared_time: float  # mean square of the residuals' times
-
-    @classmethod
-    def of(
-        cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces,
-        inflation: FloatArray, cell_m: float, unknown: FloatArray,
-    ) -> "_System | None":  # fmt: skip
-        """Of points (N, 3) with times (N,), or none to keep the velocity; None where too few have a surface.
-
-        The Jacobian with the velocity is `t` times that with the pose, to first order. The kernel is as wide as the
-        covariance (12, 12) of the remaining error propagates to each residual: the few points that constrain a
-        direction are no outliers while it is unknown, however well all others fit.
-        """
-        rows = np.empty((3 * len(points), COLUMNS))
-        count, squared = linearise(points, times, np.ascontiguousarray(T_world_lidar), surfaces, inflation, rows)
-        if count < MIN_POINTS:
-            return None
-        rows, total = rows[:count], np.zeros((13, 13))
-        scale = max(_SCALE_PER_MEDIAN * _median_residual_m(rows), _LEAST_SCALE * cell_m)
-        crossed = unknown[:6, 6:]
-        of_time = np.array([unknown[:6, :6], crossed + crossed.T, unknown[6:, 6:]])
-        weight, tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, of_time, total)
-        degeneracy = degenerate_directions(total[:6, :6], tilt, weight, float(np.sqrt(squared / count)))
-        return cls(total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION, degeneracy, squared_time)
-
-
-@dataclass(frozen=True, eq=False)
 class _Solution:
-    """A Gauss-Newton step (12,), with the correspondences' normal equations and the prior's information (12, 12)."""
+    """The last Gauss-Newton step (12,), with the normal equations of the correspondences before it.
+
+    The Hessian (12, 12) and the gradient (12,) are those of pose and velocity; the prior's information is (12, 12).
+    """
 
     step: FloatArray
-    system: _System  # of the correspondences, before the step
+    hessian: FloatArray
+    gradient: FloatArray
     prior: FloatArray
+    degeneracy: Degeneracy
 
-    def covariance(self, share: float = 1.0) -> FloatArray:
+    @classmethod
+    def of(cls, last: Iteration) -> "_Solution":
+        degeneracy = Degeneracy(last.directions, last.lever_m)
+        return cls(last.step, last.hessian, last.gradient, last.prior, degeneracy)
+
+    def covariance(self, share: float) -> FloatArray:
         """(12, 12) with a share of the correspondences' information, none of it along degenerate directions."""
         observed = self.observed
-        return np.asarray(
-            np.linalg.inv(share * observed.T @ self.system.hessian @ observed + self.prior), dtype=np.float64
-        )
+        return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
 
     def measured(self, T_world_lidar: FloatArray, velocity_error: FloatArray) -> MeasuredPose:
         """The pose by the correspondences alone, from the pose (4, 4) and the velocity's error (6,) after the step.
 
         The velocity during the sweep is marginalised, with the uncertainty of its prediction.
         """
-        observed, hessian = self.observed, self.system.hessian
-        H, g = observed.T @ hessian @ observed, observed.T @ (self.system.gradient + hessian @ self.step)
+        observed, hessian = self.observed, self.hessian
+        H, g = observed.T @ hessian @ observed, observed.T @ (self.gradient + hessian @ self.step)
         known = np.linalg.inv(np.linalg.inv(self.prior)[6:, 6:])
         H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ velocity_error
         gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T
@@ -289,104 +255,4 @@ class _Solution:
     @cached_property
     def observed(self) -> FloatArray:
         """(12, 12) projector onto the directions that are not degenerate."""
-        scale, D = lever_scale(self.system.degeneracy.lever_m), self.system.degeneracy.directions
-        observed = np.zeros((12, 12))  # several times as fast as `np.kron`
-        observed[:6, :6] = observed[6:, 6:] = np.eye(6) - (D / scale).T @ (D * scale)
-        return observed
-
-
-def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
-    """One Gauss-Newton step with a prior's information (12, 12), at an error (12,) of the present state from it."""
-    held, holding = DEGENERATE_INFORMATION * system.degeneracy.projector(), np.zeros((12, 12))
-    holding[:6, :6], holding[6:, 6:] = held, held * system.squared_time
-    b = -(prior + holding) @ error - system.gradient
-    step: FloatArray = np.asarray(np.linalg.solve(system.hessian + prior + holding, b), dtype=np.float64)
-    return _Solution(step, system, prior)
-
-
-def _median_residual_m(rows: FloatArray) -> float:
-    """The upper median of the absolute residuals of rows (M, 10), in half the time of NumPy's."""
-    middle = len(rows) // 2
-    return float(np.partition(np.abs(rows[:, RESIDUAL]), middle)[middle])
-
-
-@compiled
-def linearise(
-    points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, inflation: FloatArray,
-    rows: FloatArray,
-) -> tuple[int, float]:  # fmt: skip
-    """Write a row (10,) for every residual of points (N, 3) of the LiDAR frame at a pose (4, 4).
-
-    The Jacobian is for a motion from the right, rotation first. `times` (N,) are seconds from the stamp, or empty;
-    `inflation` (N,) are factors on the standard deviation of each point's surface. Returned are the number of residuals
-    and the sum of the squared ranges of their points.
-    """
-    T, count, squared = T_world_lidar, 0, 0.0
-    for n in range(len(points)):
-        if surfaces.counts[n] == 0:
-            continue
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        s = surfaces.points[n]
-        a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3] - s[0]
-        b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3] - s[1]
-        c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3] - s[2]
-        for k in range(surfaces.counts[n]):
-            normal, row = surfaces.normals[n, k], rows[count]
-            u = T[0, 0] * normal[0] + T[1, 0] * normal[1] + T[2, 0] * normal[2]
-            v = T[0, 1] * normal[0] + T[1, 1] * normal[1] + T[2, 1] * normal[2]
-            w = T[0, 2] * normal[0] + T[1, 2] * normal[1] + T[2, 2] * normal[2]
-            row[0], row[1], row[2] = y * w - z * v, z * u - x * w, x * v - y * u
-            row[3], row[4], row[5] = u, v, w
-            row[RESIDUAL] = a * normal[0] + b * normal[1] + c * normal[2]
-            row[THICKNESS], row[TILT] = inflation[n] * surfaces.thickness_m[n, k], surfaces.tilt[n, k]
-            row[TIME] = times[n] if len(times) else 0.0
-            squared += x * x + y * y + z * z
-            count += 1
-    return count, squared
-
-
-@compiled
-def accumulate(
-    rows: FloatArray, squared_scale: float, noise_m: float, gate_m: float, unknown: FloatArray, total: FloatArray
-) -> tuple[float, float, float]:
-    """Add the weighted products of rows (M, 10) up, with Geman and McClure's weights over the variances.
-
-    The robust kernel is wider by the variance of each surface, and by the variance that the pose's covariance t seconds
-    from the stamp, a polynomial in t of coefficients (3, 6, 6), propagates to a residual. Into `total` (13, 13), zero
-    before, go the Hessian of pose and velocity, and in the last column the gradient.
-
-    Returns:
-        The sums of the weights and of the weighted squares of the normals' standard deviations, and the mean square of
-        the times.
-    """
-    block = np.empty((_BLOCK, 13))
-    weights, tilts, times = 0.0, 0.0, 0.0
-    for begin in range(0, len(rows), _BLOCK):
-        size = min(_BLOCK, len(rows) - begin)
-        for i in range(size):
-            row, out = rows[begin + i], block[i]
-            r, variance, t = row[RESIDUAL], row[THICKNESS] * row[THICKNESS], row[TIME]
-            kernel = 1.0 + r * r / (squared_scale + variance + _propagated(row, t, unknown))
-            weight = 0.0 if abs(r) > gate_m else 1.0 / (kernel * kernel * (variance + noise_m * noise_m))
-            root = math.sqrt(weight)
-            for j in range(6):
-                out[j] = root * row[j]
-                out[6 + j] = t * out[j]
-            out[12] = root * r
-            weights += weight
-            tilts += weight * row[TILT] * row[TILT]
-            times += t * t
-        total += np.dot(block[:size].T, block[:size])
-    return weights, tilts, times / max(len(rows), 1)
-
-
-@compiled_part
-def _propagated(row: FloatArray, t: float, unknown: FloatArray) -> float:
-    """The variance of a residual (10,) by the covariance of the pose t seconds from the stamp, as for `accumulate`."""
-    variance = 0.0
-    for i in range(6):
-        part = 0.0
-        for j in range(6):
-            part += row[j] * (unknown[0, i, j] + t * (unknown[1, i, j] + t * unknown[2, i, j]))
-        variance += row[i] * part
-    return variance
+        return onto_observed(self.degeneracy.directions, self.degeneracy.lever_m)

@@ -16,6 +16,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, State, Stateful
 from lidarslam.mapping.surfels.surfel_kernels import (
     OTHER,
+    Arrays,
     Cells,
     add_moments,
     belong_to_others,
@@ -142,8 +143,8 @@ class SurfelGrid(Stateful):
         return self._surfels
 
     @property
-    def arrays(self) -> tuple[Cells, FloatArray, NDArray[np.float32]]:
-        """The cells, their surfels (M, 15), and the points (M,) of each when its surfel was computed."""
+    def arrays(self) -> Arrays:
+        """For compiled loops."""
         return Cells(self.cell_m, *self._hash.slots, self._keys, self._sums), self._surfels, self._surfel_counts
 
     def means(self) -> FloatArray:

@@ -72,6 +72,10 @@ class Cells(NamedTuple):
     sums: Floats  # (M, 16) moments, and the link to the other side
 
 
+# The cells of a grid, their surfels (M, 15), and the points (M,) of each when its surfel was computed.
+Arrays = tuple[Cells, FloatArray, Floats]
+
+
 @compiled_part
 def other_side(row: int, sums: Floats) -> int:
     """Row of the other side of the cell in a row, `ABSENT` where there is none."""

@@ -25,8 +25,8 @@ from lidarslam.mapping.registration.local_map import (
 )
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
-from lidarslam.mapping.surfels.surfel_kernels import Cells, is_steep, look_up, refresh, turn_to_sensor, views_of
-from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
+from lidarslam.mapping.surfels.surfel_kernels import Arrays, is_steep, look_up, refresh, turn_to_sensor, views_of
+from lidarslam.mapping.surfels.voxel_hash import key_at, require_reach
 
 # A single ring bent around a corner spans a plane too, that of its own rays. A plane seen at a grazing angle counts
 # only when its points differ so much in height across the rings.
@@ -157,20 +157,36 @@ def _write(found: Surfaces, n: int, surfel: FloatArray, axis: int, u: float, v: 
 
 
 @compiled
-def find_planes(
-    points: FloatArray, unmatched: NDArray[np.intp], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
-    sensor: FloatArray, spread_m: FloatArray, certain_tilt: float, found: Surfaces, rows: NDArray[np.int32],
-) -> int:  # fmt: skip
-    """Look up the cells of the unmatched points in a grid, and match their planes, as of `match_planes`.
+def match_surfels(
+    points: FloatArray, T_world_lidar: FloatArray, grids: tuple[Arrays, ...], keys: NDArray[np.int64],
+    spread_m: FloatArray, certain_tilt: float, found: Surfaces,
+) -> None:  # fmt: skip
+    """Write the surfaces of those of the points (N, 3) that have left their cells in the first of some grids.
 
-    `rows` (N,) of these points' cells are written, of the sides that face the sensor (3,), or `ABSENT`.
+    `keys` (N,) of these cells are written. Planes as of `match_planes`, of the sides that face the sensor, from one
+    grid after another; where none has one, the compact object in the first.
     """
-    looked_up, at = points[unmatched], np.empty(len(unmatched), dtype=np.int32)
-    look_up(looked_up, cells, at)
-    turn_to_sensor(looked_up, sensor, cells, surfels, counts, at)
-    refresh(at, cells, surfels, counts)
-    rows[unmatched] = at
-    return match_planes(points, unmatched, rows, surfels, sensor, spread_m, certain_tilt, found)
+    sensor, unmatched, left, scale = T_world_lidar[:3, 3].copy(), np.empty(len(points), dtype=np.intp), 0, 1.0
+    scale /= grids[0][0].cell_m
+    for n in range(len(points)):
+        key = key_at(points[n], scale)
+        if key != keys[n]:
+            keys[n], found.counts[n], unmatched[left] = key, 0, n
+            left += 1
+    rows, first = np.empty(len(points), dtype=np.int32), np.empty(len(points), dtype=np.int32)
+    for g in range(len(grids)):
+        cells, surfels, counts = grids[g]
+        looked_up, at = points[unmatched[:left]], np.empty(left, dtype=np.int32)
+        look_up(looked_up, cells, at)
+        turn_to_sensor(looked_up, sensor, cells, surfels, counts, at)
+        refresh(at, cells, surfels, counts)
+        for w in range(left):
+            rows[unmatched[w]] = at[w]
+        if g == 0:
+            first[:] = rows
+        left = match_planes(points, unmatched[:left], rows, surfels, sensor, spread_m, certain_tilt, found)
+    largest_m = _COMPACT * grids[0][0].cell_m
+    match_compact(points, unmatched[:left], first, grids[0][1], T_world_lidar, largest_m, found)
 
 
 class SurfelMatcher(Matcher):
@@ -189,20 +205,8 @@ class SurfelMatcher(Matcher):
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
-        keys = point_keys(points, self._grids[0].cell_m)
-        unmatched = np.flatnonzero(keys != self._keys)
-        self._keys = keys
-        if not len(unmatched):
-            return
-        self.surfaces.counts[unmatched] = 0
-        sensor, finest = np.array(T[:3, 3]), None
-        for grid in self._grids:
-            (cells, surfels, counts), rows = grid.arrays, np.empty(len(points), dtype=np.int32)
-            given = self._spread_m, self._certain_tilt, self.surfaces, rows
-            unmatched = unmatched[: find_planes(points, unmatched, cells, surfels, counts, sensor, *given)]
-            finest = finest or (rows, surfels)
-        assert finest is not None
-        match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
+        grids = tuple(grid.arrays for grid in self._grids)
+        match_surfels(points, T, grids, self._keys, self._spread_m, self._certain_tilt, self.surfaces)
 
 
 class SurfelMap(LocalMap):

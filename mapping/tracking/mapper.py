@@ -33,7 +33,8 @@ from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import beyond_reach
 from lidarslam.mapping.tracking.budget import Budget
-from lidarslam.mapping.tracking.mapped_scan import Fit, MappedScan
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,8 @@ from lidarslam.mapping.registration.local_map import COARSE, LocalMap
 from lidarslam.mapping.registration.registration import register, with_mean_velocity
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.budget import Budget, Steps
-from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt, measure_fit, translation_information
+from lidarslam.mapping.tracking.fit import NO_FIT, measure_fit, translation_information
+from lidarslam.mapping.tracking.mapped_scan import Attempt
 
 # Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
@@ -174,7 +175,8 @@ def best_supported(points: FloatArray, starts: FloatArray, local_map: LocalMap) 
     distinct, inverse = np.unique(starts.reshape(-1, 16), axis=0, return_inverse=True)
     sums = []
     for start in distinct.reshape(-1, 4, 4):
-        sums.append(translation_information(*_distances(points, start, local_map))[:2])
+        normals, distances = _distances(points, start, local_map)
+        sums.append(translation_information(normals, distances, np.ones(len(distances)))[:2])
         yield
     information, supported = (np.array(parts)[inverse.reshape(-1)] for parts in zip(*sums, strict=True))
     mean = np.mean(information, axis=0)

@@ -17,7 +17,8 @@ from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import Budget, Steps, complete
-from lidarslam.mapping.tracking.mapped_scan import Attempt, Fit, MappedScan, best_of, judge
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.mapped_scan import Attempt, MappedScan, best_of, judge
 from lidarslam.mapping.tracking.near_search import WEAK_CAUTION, NearSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher, best_starts, turned_poses
 from lidarslam.mapping.tracking.tracking_state import TrackingState

@@ -5,16 +5,14 @@ import math
 import numpy as np
 
 from lidarslam.core.compiled import compiled, compiled_part
-from lidarslam.core.geometry import FloatArray, coefficients, exp_rows, log_translation, rotation_vector
+from lidarslam.core.compiled_motion import write_exp, write_log, write_product
+from lidarslam.core.geometry import FloatArray
 
 # Information that keeps the normal equations solvable.
 _DAMPING = 1e-3
 # No step of the motion is larger: radians and metres.
 _LARGEST_STEP = 0.3
 _UNKNOWNS = 12
-
-_coefficients, _exp_rows = compiled_part(coefficients), compiled_part(exp_rows)
-_rotation_vector, _log_translation = compiled_part(rotation_vector), compiled_part(log_translation)
 
 
 @compiled
@@ -33,8 +31,8 @@ def take_step(
         The largest part of the step of the motion, radians or metres.
     """
     away, step, moved = np.empty(6), np.empty(_UNKNOWNS), np.empty((4, 4))
-    _multiply(T, T_curr_prev, moved)
-    _log(moved, away)
+    write_product(T, T_curr_prev, moved)
+    write_log(moved, away)
     for i in range(6):
         for j in range(6):
             H[i, j] += information[i, j]
@@ -48,16 +46,11 @@ def take_step(
     for i in range(6):
         largest = max(largest, abs(step[i]))
         innovation[i] -= step[6 + i]
-    shortened, change = -_LARGEST_STEP / max(largest, _LARGEST_STEP), np.zeros((4, 4))
+    shortened, change = -_LARGEST_STEP / max(largest, _LARGEST_STEP), np.empty((4, 4))
     for i in range(6):
         step[i] *= shortened
-    a, b, c = step[0], step[1], step[2]
-    s, v, w = _coefficients(math.sqrt(a * a + b * b + c * c))
-    rows = _exp_rows(a, b, c, step[3], step[4], step[5], s, v, w)
-    for i in range(12):
-        change[i // 4, i % 4] = rows[i]
-    change[3, 3] = 1.0
-    _multiply(change, T, moved)
+    write_exp(step, change)
+    write_product(change, T, moved)
     for i in range(4):
         for j in range(4):
             T[i, j] = moved[i, j]
@@ -73,7 +66,7 @@ def write_velocities(
 
     The change of velocity is the innovation and a share of that from the last velocity (6,) to the mean one.
     """
-    _log(T, late)
+    write_log(T, late)
     for i in range(6):
         velocity = late[i] / interval_s
         change = innovation[i] + share * (velocity - last[i])
@@ -99,24 +92,3 @@ def _solve(H: FloatArray, g: FloatArray, x: FloatArray) -> None:
         for k in range(i + 1, _UNKNOWNS):
             rest -= H[k, i] * x[k]
         x[i] = rest / H[i, i]
-
-
-@compiled_part
-def _multiply(T_a_b: FloatArray, T_b_c: FloatArray, T_a_c: FloatArray) -> None:
-    for i in range(4):
-        for j in range(4):
-            total = 0.0
-            for k in range(4):
-                total += T_a_b[i, k] * T_b_c[k, j]
-            T_a_c[i, j] = total
-
-
-@compiled_part
-def _log(T: FloatArray, xi: FloatArray) -> None:
-    """Write `lidarslam.core.geometry.log` (6,)."""
-    a, b, c, angle = _rotation_vector(
-        T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2], T[2, 0], T[2, 1], T[2, 2]
-    )  # fmt: skip
-    s, v, _ = _coefficients(angle)
-    xi[0], xi[1], xi[2] = a, b, c
-    xi[3], xi[4], xi[5] = _log_translation(a, b, c, T[0, 3], T[1, 3], T[2, 3], angle, s, v)

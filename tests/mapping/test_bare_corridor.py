@@ -13,7 +13,7 @@ from lidarslam.mapping.registration.registration import register
 from lidarslam.mapping.registration.sampled_scan import SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap, constraining_points
 from lidarslam.mapping.tracking.budget import Budget
-from lidarslam.mapping.tracking.mapped_scan import Fit, measure_fit
+from lidarslam.mapping.tracking.fit import Fit, measure_fit
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 
 from .shapes import elevations_of, on_sides, surfel_map_of

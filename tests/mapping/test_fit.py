@@ -11,14 +11,8 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.mapped_scan import (
-    NO_FIT,
-    Attempt,
-    Fit,
-    directional_support,
-    measure_fit,
-    translation_information,
-)
+from lidarslam.mapping.tracking.fit import NO_FIT, Fit, directional_support, measure_fit, translation_information
+from lidarslam.mapping.tracking.mapped_scan import Attempt
 from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER, TrackingState
 
 from .shapes import across_x, on_sides, surfel_map_of
@@ -128,7 +122,7 @@ def street_normals(rng: np.random.Generator, along: int) -> FloatArray:
 
 
 def support_of(normals: FloatArray, distances: FloatArray) -> float:
-    return directional_support(*translation_information(normals, distances))[0]
+    return directional_support(*translation_information(normals, distances, np.ones(len(distances))))[0]
 
 
 def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supported(rng):
@@ -141,7 +135,7 @@ def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supporte
     assert support_of(normals, held) > 0.99
     assert support_of(normals, slid) < 0.2
     assert np.mean(slid < 1.0) > 0.9
-    _, direction = directional_support(*translation_information(normals, slid))
+    _, direction = directional_support(*translation_information(normals, slid, np.ones(len(slid))))
     assert abs(direction[0]) > 0.99
     tunnel = street_normals(rng, along=0)
     assert support_of(tunnel, np.full(len(tunnel), 0.1)) > 0.98

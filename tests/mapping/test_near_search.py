@@ -15,7 +15,8 @@ from lidarslam.mapping.motion.prediction import LOST_MOTION, MotionState, Odomet
 from lidarslam.mapping.registration.sampled_scan import SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.budget import Budget
-from lidarslam.mapping.tracking.mapped_scan import NO_FIT, Attempt, judge
+from lidarslam.mapping.tracking.fit import NO_FIT
+from lidarslam.mapping.tracking.mapped_scan import Attempt, judge
 from lidarslam.mapping.tracking.near_search import NearSearch
 from lidarslam.mapping.tracking.scan_matcher import ScanMatcher
 from lidarslam.mapping.tracking.tracker import Tracker
