@@ -23,7 +23,6 @@ from lidarslam.mapping.registration.local_map import (
     vertical_of,
 )
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan
-from lidarslam.mapping.surfels.grid import resized
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, views_of
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 from lidarslam.mapping.surfels.voxel_hash import (
@@ -31,11 +30,11 @@ from lidarslam.mapping.surfels.voxel_hash import (
     Keys,
     Rows,
     VoxelHash,
-    find_one,
+    find_around,
     key_at,
-    neighbour_key,
     point_keys,
     prefetch_around,
+    resized,
 )
 
 # Voxels whose points a plane or line is fitted to, and the least number for a line, which passes through few.
@@ -119,7 +118,7 @@ def match_features(
     points from that to the point. With `has_rings`, planes that may be those of a single ring do not count.
     """
     left, scale = 0, 1.0 / voxels.cell_m
-    around, near = np.empty(27, dtype=np.int64), np.empty(NEIGHBOURS, dtype=np.int64)
+    around, near = np.empty(27, dtype=np.int32), np.empty(NEIGHBOURS, dtype=np.int64)
     squared = np.empty(NEIGHBOURS)
     scatter = np.empty(6)
     mean, variances, axis = np.empty(3), np.empty(3), np.empty(3)
@@ -163,23 +162,19 @@ def match_features(
 
 @compiled_part
 def _nearest(
-    point: FloatArray, key: int, voxels: Voxels, around: NDArray[np.int64], near: NDArray[np.int64], squared: FloatArray
+    point: FloatArray, key: int, voxels: Voxels, around: Rows, near: NDArray[np.int64], squared: FloatArray
 ) -> int:  # fmt: skip
     """Write the rows of the nearest voxels to a point (3,), and their squared distances; return their number.
 
-    `around` (27,) holds the rows of all while their sums are prefetched.
+    `around` (27,) holds the rows of all.
     """
-    found = 0
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                row = find_one(neighbour_key(key, i, j, k), voxels.bits, voxels.table_keys, voxels.table_rows)
-                if row != ABSENT:
-                    prefetch(voxels.sums, row)
-                    around[found] = row
-                    found += 1
+    find_around(key, voxels.bits, voxels.table_keys, voxels.table_rows, around)
+    for row in around:
+        prefetch(voxels.sums, row)
     count, most = 0, len(near)
-    for row in around[:found]:
+    for row in around:
+        if row == ABSENT:
+            continue
         cell = voxels.sums[row]
         x, y, z = cell[1] / cell[0] - point[0], cell[2] / cell[0] - point[1], cell[3] / cell[0] - point[2]
         distance = x * x + y * y + z * z

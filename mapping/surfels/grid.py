@@ -6,7 +6,6 @@ has grown; surfels overlap, so that no wall is cut at a cell's border. A plane s
 same place, its other side.
 """
 
-import math
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,6 +34,7 @@ from lidarslam.mapping.surfels.voxel_hash import (
     cell_keys,
     key_cells,
     point_keys,
+    resized,
 )
 
 # Columns of a cell's sums: number of points, first and second moments about the cell's centre in units of the cell,
@@ -47,8 +47,6 @@ _SUMS, _SURFELS = 16, 15
 MEAN, NORMAL, DIRECTION, SPREADS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 ELEVATION_SPREAD, COUNT, IS_PLANE = 12, 13, 14
 
-# Bytes that the processor fetches at a time.
-_CACHE_LINE = 64
 # Points that represent a cell in a grid of another size.
 _SAMPLES = 6
 # Stray cells have less than this share of the mean number of points in a cube of this many cells. They are looked for
@@ -231,14 +229,3 @@ class SurfelGrid(Stateful):
         self._sums = resized(self._sums, capacity)
         self._surfels = resized(self._surfels, capacity)
         self._surfel_counts = resized(self._surfel_counts, capacity)
-
-
-def resized(values: NDArray[Any], capacity: int) -> NDArray[Any]:
-    """A copy with more rows, or fewer; it begins with a cache line, so that few rows lie across two."""
-    shape = (capacity, *values.shape[1:])
-    size = math.prod(shape) * values.itemsize
-    room = np.zeros(size + _CACHE_LINE, dtype=np.uint8)
-    begin = -room.ctypes.data % _CACHE_LINE
-    out: NDArray[Any] = room[begin : begin + size].view(values.dtype).reshape(shape)
-    out[: len(values)] = values[:capacity]
-    return out

@@ -24,11 +24,11 @@ from lidarslam.mapping.surfels.voxel_hash import (
     Keys,
     Rows,
     cell_of,
+    find_around,
     find_one,
     key_at,
     key_of,
     middle_of,
-    neighbour_key,
     prefetch_around,
     prefetch_slot,
 )
@@ -156,25 +156,29 @@ def add_moments(
 @compiled
 def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     """Write the rows (N,) of the cells of points (N, 3), else of the nearest around; or `ABSENT`."""
-    scale, last = 1.0 / cells.cell_m, len(points) - 1
+    scale, last, around = 1.0 / cells.cell_m, len(points) - 1, np.empty(27, dtype=np.int32)
     for n in range(len(points)):
         ahead = key_at(points[min(n + PREFETCHED, last)], scale)
         prefetch_slot(ahead, cells.bits, cells.table_keys, cells.table_rows)
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         i, j, k = cell_of(x), cell_of(y), cell_of(z)
         row = find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
-        rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
+        rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells, around)
 
 
 @compiled_part
-def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
-    """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells."""
-    nearest, least = ABSENT, np.inf
-    prefetch_around(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells, around: Rows) -> int:
+    """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells.
+
+    `around` (27,) holds the rows of all.
+    """
+    nearest, least, n = ABSENT, np.inf, -1
+    find_around(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows, around)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
-                row = find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                n += 1
+                row = around[n]
                 if row == ABSENT:
                     continue
                 count = cells.sums[row, 0]
@@ -209,7 +213,10 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
         if count == _TOGETHER or n == len(rows) - 1:
             for i in range(count):
                 prefetch(surfels, waiting[i])
-                _find_around(waiting[i], cells, around[i])
+                key = cells.keys[waiting[i]]
+                find_around(key, cells.bits, cells.table_keys, cells.table_rows, around[i])
+                for other in around[i]:
+                    prefetch(cells.sums, other)
             for i in range(count):
                 _compute(waiting[i], around[i], cells, surfels, work)
             count = 0
@@ -219,18 +226,6 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
 def is_steep(along: float, distance: float) -> bool:
     """Whether a ray of some length meets a plane at no grazing angle, from the side of its normal."""
     return along > _LEAST_SINE * distance
-
-
-@compiled_part
-def _find_around(row: int, cells: Cells, around: NDArray[np.int32]) -> None:
-    """Write the rows (27,) of a cell and its neighbours, or -1, and prefetch their sums."""
-    key, n = cells.keys[row], 0
-    for a in range(-1, 2):
-        for b in range(-1, 2):
-            for c in range(-1, 2):
-                around[n] = find_one(neighbour_key(key, a, b, c), cells.bits, cells.table_keys, cells.table_rows)
-                prefetch(cells.sums, around[n])
-                n += 1
 
 
 @compiled_part

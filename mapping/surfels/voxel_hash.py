@@ -1,8 +1,12 @@
 """Spatial hash from voxels to rows of arrays, and its compiled loops.
 
-Open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows` (2^bits,) int32."""
+Blocks of two cells along each axis are hashed: a cell and its 26 neighbours lie in eight. Open addressing with linear
+probing: `table_keys` (2^bits,) int64 of the blocks, -1 where free, and `table_rows` (2^bits, 8) int32 of their cells,
+-1 where there is none.
+"""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +27,19 @@ BITS = 21
 OFFSET = 1 << (BITS - 1)
 STRIDE_X, STRIDE_Y = 1 << (2 * BITS), 1 << BITS
 ORIGIN = OFFSET * (STRIDE_X + STRIDE_Y + 1)
+# The lowest bit of each coordinate is the place in a block.
+_PLACE = STRIDE_X | STRIDE_Y | 1
 # Fibonacci hashing: the multiplier is 2^64 over the golden ratio.
 _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
-_ABOVE_BITS = 3
 OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 # Number of elements ahead that loops prefetch.
 PREFETCHED = 16
 _STRIDES = np.array([STRIDE_X, STRIDE_Y, 1], dtype=np.int64)
 _LARGEST_LOAD = 0.4
-_FIRST_BITS = 14
+_FIRST_BITS = 12
+_CELLS = 8  # of a block
+# Bytes that the processor fetches at a time.
+_CACHE_LINE = 64
 
 
 @compiled_part
@@ -46,42 +54,67 @@ def key_of(i: int, j: int, k: int) -> int:
 
 
 @compiled_part
-def neighbour_key(key: int, i: int, j: int, k: int) -> int:
-    """Key of the cell at an offset of (i, j, k) cells from a cell or from its other side."""
-    return int((key & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k)
+def _place_of(key: int) -> int:
+    """Place of a cell in its block."""
+    return int((key >> (2 * BITS)) & 1) << 2 | int((key >> BITS) & 1) << 1 | int(key & 1)
 
 
 @compiled_part
-def _home(key: int, bits: int) -> int:
-    """First slot of a key; cells above one another share a cache line."""
-    column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
-    return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
+def _home(block: int, bits: int) -> int:
+    """First slot of a block."""
+    return int(np.int64((np.uint64(block) * _MULTIPLIER) >> np.uint64(64 - bits)))
+
+
+@compiled_part
+def _find_block(block: int, bits: int, table_keys: Keys) -> int:
+    """Slot of a block, else the free one that it would have."""
+    slot = _home(block, bits)
+    while table_keys[slot] != block and table_keys[slot] != EMPTY:
+        slot = (slot + 1) & ((1 << bits) - 1)
+    return slot
 
 
 @compiled_part
 def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
-    slot = _home(key, bits)
-    while table_keys[slot] != EMPTY:
-        if table_keys[slot] == key:
-            return int(table_rows[slot])
-        slot = (slot + 1) & ((1 << bits) - 1)
-    return ABSENT
+    """Row of a key, or `ABSENT`."""
+    return int(table_rows[_find_block(key & ~_PLACE, bits, table_keys), _place_of(key)])
+
+
+@compiled_part
+def find_around(key: int, bits: int, table_keys: Keys, table_rows: Rows, around: Rows) -> None:
+    """Write the rows (27,) of a cell, of whatever side, and its neighbours, by x, y and z; or `ABSENT`."""
+    low = int(key & FIRST_SIDE) - STRIDE_X - STRIDE_Y - 1
+    block, place = low & ~_PLACE, _place_of(low)
+    x, y, z = place >> 2, (place >> 1) & 1, place & 1
+    for i in range(2):
+        for j in range(2):
+            for k in range(2):
+                slot = _find_block(block + 2 * (i * STRIDE_X + j * STRIDE_Y + k), bits, table_keys)
+                rows = table_rows[slot]
+                # Of three cells in a row from the lower corner on, one or two are in the first block.
+                for a in range(max(0, 2 * i - x), min(3, 2 * i - x + 2)):
+                    for b in range(max(0, 2 * j - y), min(3, 2 * j - y + 2)):
+                        for c in range(max(0, 2 * k - z), min(3, 2 * k - z + 2)):
+                            at = ((x + a) & 1) << 2 | ((y + b) & 1) << 1 | ((z + c) & 1)
+                            around[9 * a + 3 * b + c] = rows[at]
 
 
 @compiled_part
 def prefetch_slot(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> None:
-    """Prefetch the first slot of a key."""
-    slot = _home(key, bits)
+    """Prefetch the first slot of a key's block."""
+    slot = _home(key & ~_PLACE, bits)
     prefetch(table_keys, slot)
     prefetch(table_rows, slot)
 
 
 @compiled_part
 def prefetch_around(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> None:
-    """Prefetch the slots of a cell and its 26 neighbours; those of cells above one another mostly share a line."""
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            prefetch_slot(neighbour_key(key, i, j, 0), bits, table_keys, table_rows)
+    """Prefetch the slots of the blocks of a cell and its 26 neighbours."""
+    low = int(key & FIRST_SIDE) - STRIDE_X - STRIDE_Y - 1
+    for i in range(2):
+        for j in range(2):
+            for k in range(2):
+                prefetch_slot(low + 2 * (i * STRIDE_X + j * STRIDE_Y + k), bits, table_keys, table_rows)
 
 
 @compiled
@@ -93,25 +126,37 @@ def find_rows(keys: Keys, bits: int, table_keys: Keys, table_rows: Rows, rows: R
 
 @compiled
 def insert_keys(
-    keys: Keys, begin: int, count: int, most: int, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows
-) -> tuple[int, int]:
-    """Write the rows of keys (N,) from `begin` on, the next ones for new keys, until the hash holds `most`.
+    keys: Keys, begin: int, count: int, blocks: int, most: int, bits: int, table_keys: Keys, table_rows: Rows,
+    rows: Rows,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Write the rows of keys (N,) from `begin` on, the next ones for new keys, until the hash holds `most` blocks.
 
-    The numbers of keys done and of rows are returned.
+    The numbers of keys done, of rows and of blocks are returned.
     """
     for n in range(begin, len(keys)):
         prefetch_slot(keys[min(n + PREFETCHED, len(keys) - 1)], bits, table_keys, table_rows)
-        slot = _home(keys[n], bits)
-        while table_keys[slot] != EMPTY and table_keys[slot] != keys[n]:
-            slot = (slot + 1) & ((1 << bits) - 1)
+        block, place = keys[n] & ~_PLACE, _place_of(keys[n])
+        slot = _find_block(block, bits, table_keys)
         if table_keys[slot] == EMPTY:
-            if count >= most:
-                return n, count
-            table_keys[slot] = keys[n]
-            table_rows[slot] = count
+            if blocks >= most:
+                return n, count, blocks
+            table_keys[slot] = block
+            blocks += 1
+        if table_rows[slot, place] == ABSENT:
+            table_rows[slot, place] = count
             count += 1
-        rows[n] = table_rows[slot]
-    return len(keys), count
+        rows[n] = table_rows[slot, place]
+    return len(keys), count, blocks
+
+
+@compiled
+def move_blocks(from_keys: Keys, from_rows: Rows, bits: int, table_keys: Keys, table_rows: Rows) -> None:
+    """Copy the blocks of another hash to an empty one."""
+    for n in range(len(from_keys)):
+        if from_keys[n] != EMPTY:
+            slot = _find_block(from_keys[n], bits, table_keys)
+            table_keys[slot] = from_keys[n]
+            table_rows[slot] = from_rows[n]
 
 
 @compiled_part
@@ -182,11 +227,23 @@ def key_steps(offsets: NDArray[np.int64]) -> Keys:
     return np.asarray(offsets @ _STRIDES, dtype=np.int64)
 
 
+def resized(values: NDArray[Any], capacity: int) -> NDArray[Any]:
+    """A copy with more rows, or fewer; it begins with a cache line, so that few rows lie across two."""
+    shape = (capacity, *values.shape[1:])
+    size = math.prod(shape) * values.itemsize
+    room = np.zeros(size + _CACHE_LINE, dtype=np.uint8)
+    begin = -room.ctypes.data % _CACHE_LINE
+    out: NDArray[Any] = room[begin : begin + size].view(values.dtype).reshape(shape)
+    out[: len(values)] = values[:capacity]
+    return out
+
+
 class VoxelHash:
-    """Open addressing with linear probing; rows are numbered in the order of their first insertion."""
+    """Rows are numbered in the order of their first insertion."""
 
     _bits: int
-    _count: int
+    _count: int  # of rows
+    _blocks: int
     _keys: Keys
     _rows: Rows
 
@@ -213,24 +270,23 @@ class VoxelHash:
         keys = np.ascontiguousarray(keys)
         while True:
             most = int(_LARGEST_LOAD * (1 << self._bits))
-            done, self._count = insert_keys(keys, done, self._count, most, *self.slots, rows)
+            done, self._count, self._blocks = insert_keys(
+                keys, done, self._count, self._blocks, most, *self.slots, rows
+            )
             if done == len(keys):
                 return rows
-            used = np.flatnonzero(self._keys != EMPTY)
-            by_row = np.empty(len(used), dtype=np.int64)
-            by_row[self._rows[used]] = self._keys[used]
+            count, blocks, from_keys, from_rows = self._count, self._blocks, self._keys, self._rows
             self._clear(self._bits + 1)
-            self.insert(by_row)
+            move_blocks(from_keys, from_rows, *self.slots)
+            self._count, self._blocks = count, blocks
 
     def rebuild(self, keys: Keys) -> None:
         """Replace the contents by unique keys (N,) in rows 0 to N-1."""
-        bits = _FIRST_BITS
-        while len(keys) > _LARGEST_LOAD * (1 << bits):
-            bits += 1
-        self._clear(bits)
+        self._clear(_FIRST_BITS)
         self.insert(keys)
 
     def _clear(self, bits: int) -> None:
-        self._bits, self._count = bits, 0
+        self._bits, self._count, self._blocks = bits, 0, 0
         self._keys = np.full(1 << bits, EMPTY, dtype=np.int64)
-        self._rows = np.zeros(1 << bits, dtype=np.int32)
+        self._rows = resized(np.empty((0, _CELLS), dtype=np.int32), 1 << bits)
+        self._rows.fill(ABSENT)
