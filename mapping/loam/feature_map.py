@@ -35,6 +35,7 @@ from lidarslam.mapping.surfels.voxel_hash import (
     point_keys,
     prefetch_around,
     resized,
+    write_new_keys,
 )
 
 # Voxels whose points a plane or line is fitted to, and the least number for a line, which passes through few.
@@ -359,10 +360,10 @@ class VoxelGrid(Stateful):
     def _rows_of(self, points: FloatArray) -> Rows:
         """Rows (N,) of the voxels of points (N, 3), which are made where there is none."""
         keys = point_keys(points, self.cell_m)
-        rows = self._hash.insert(keys)
+        known, rows = len(self), self._hash.insert(keys)
         if len(self) > len(self._keys):
             self._resize(2 * len(self))
-        self._keys[rows] = keys
+        write_new_keys(keys, rows, known, self._keys)
         return rows
 
     def _resize(self, capacity: int) -> None:

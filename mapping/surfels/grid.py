@@ -29,12 +29,14 @@ from lidarslam.mapping.surfels.voxel_hash import (
     ABSENT,
     FIRST_SIDE,
     OTHER_SIDE,
+    Keys,
     Rows,
     VoxelHash,
     cell_keys,
     key_cells,
     point_keys,
     resized,
+    write_new_keys,
 )
 
 # Columns of a cell's sums: number of points, first and second moments about the cell's centre in units of the cell,
@@ -100,18 +102,15 @@ class SurfelGrid(Stateful):
         points = np.ascontiguousarray(points)
         views = np.ascontiguousarray(views, dtype=np.float32)
         keys = point_keys(points, self.cell_m)
-        rows = self._hash.insert(keys)
-        self._reserve(len(self))
+        rows = self._rows_of(keys)
         behind = np.empty(len(points), dtype=np.bool_)
         belong_to_others(views, rows, *self.arrays, behind)
         turned = np.flatnonzero(behind)
         if len(turned):
             keys[turned] |= OTHER_SIDE
-            rows[turned] = self._hash.insert(keys[turned])
-            self._reserve(len(self))
+            rows[turned] = self._rows_of(keys[turned])
             link_sides(keys[turned], rows[turned], *self._hash.slots, self._sums)
-        seen = np.ascontiguousarray(elevations), views
-        add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums, weight)
+        add_moments(points, np.ascontiguousarray(elevations), views, rows, self.cell_m, self._sums, weight)
 
     def insert_samples(self, points: FloatArray, elevations: FloatArray, views: FloatArray) -> None:
         """Insert the `samples` of another grid; samples in one cell may be of both its sides."""
@@ -220,9 +219,13 @@ class SurfelGrid(Stateful):
         self._sums[:, OTHER] = 0.0
         link_sides(keys, np.arange(count, dtype=np.int32), *self._hash.slots, self._sums)
 
-    def _reserve(self, count: int) -> None:
-        if count > len(self._keys):
-            self._resize(max(4096, 2 * count))
+    def _rows_of(self, keys: Keys) -> Rows:
+        """Rows (N,) of keys (N,), new ones for new keys."""
+        known, rows = len(self), self._hash.insert(keys)
+        if len(self) > len(self._keys):
+            self._resize(max(4096, 2 * len(self)))
+        write_new_keys(keys, rows, known, self._keys)
+        return rows
 
     def _resize(self, capacity: int) -> None:
         self._keys = resized(self._keys, capacity)

@@ -111,8 +111,7 @@ def views_of(points: FloatArray, sensor: FloatArray) -> NDArray[np.float32]:
 
 @compiled
 def add_moments(
-    points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,
-    grid_keys: Keys, sums: Floats, weight: float,
+    points: FloatArray, elevations: FloatArray, views: Floats, rows: Rows, cell_m: float, sums: Floats, weight: float
 ) -> None:  # fmt: skip
     """Add points (N, 3) with elevations (N,) and views (N, 3) to the sums of their cells, unless these are frozen.
 
@@ -121,11 +120,8 @@ def add_moments(
     scale, w = 1.0 / cell_m, np.float32(weight)
     is_growing = np.empty(len(rows), dtype=np.bool_)
     for n in range(len(rows)):
-        ahead = rows[min(n + PREFETCHED, len(rows) - 1)]
-        prefetch(sums, ahead)
-        prefetch(grid_keys, ahead)
+        prefetch(sums, rows[min(n + PREFETCHED, len(rows) - 1)])
         is_growing[n] = sums[rows[n], 0] < _MOST_POINTS
-        grid_keys[rows[n]] = keys[n]
     for n in range(len(rows)):
         if not is_growing[n]:
             continue

@@ -150,6 +150,14 @@ def insert_keys(
 
 
 @compiled
+def write_new_keys(keys: Keys, rows: Rows, known: int, by_row: Keys) -> None:
+    """Write those of the keys (N,) in rows (N,) that are not among the first `known` to an array by row."""
+    for n in range(len(keys)):
+        if rows[n] >= known:
+            by_row[rows[n]] = keys[n]
+
+
+@compiled
 def move_blocks(from_keys: Keys, from_rows: Rows, bits: int, table_keys: Keys, table_rows: Rows) -> None:
     """Copy the blocks of another hash to an empty one."""
     for n in range(len(from_keys)):
