@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from lidarslam.core.compiled import compiled_part
 from lidarslam.core.geometry import FloatArray, coefficients, exp_rows, log_translation, rotation_vector
 
@@ -18,6 +20,13 @@ def write_product(T_a_b: FloatArray, T_b_c: FloatArray, T_a_c: FloatArray) -> No
             for k in range(4):
                 total += T_a_b[i, k] * T_b_c[k, j]
             T_a_c[i, j] = total
+
+
+@compiled_part
+def orthonormalize_nearly(T: FloatArray) -> None:
+    """Take rounding off the rotation of a nearly rigid transform: a Newton step towards the nearest rotation."""
+    R = np.ascontiguousarray(T[:3, :3])
+    T[:3, :3] = 1.5 * R - 0.5 * R @ R.T @ R
 
 
 @compiled_part

@@ -4,9 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
-from lidarslam.core.compiled_motion import write_exp, write_inverse, write_log, write_product
+from lidarslam.core.compiled_motion import orthonormalize_nearly, write_exp, write_inverse, write_log, write_product
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.registration.gauss_newton import open_directions
 from lidarslam.mapping.registration.local_map import Surfaces
@@ -38,6 +39,8 @@ class Iteration(NamedTuple):
     T_world_lidar: FloatArray  # (4, 4) after the step
     velocity: FloatArray  # (6,) after the step
     step: FloatArray  # (12,)
+    rotation: float  # radians, of the step
+    translation_m: float  # of the step
     error: FloatArray  # (12,) of the state before the step, compared with the prediction
     hessian: FloatArray  # (12, 12) of the correspondences
     gradient: FloatArray  # (12,) of the correspondences, before the step
@@ -76,7 +79,9 @@ def iterate(
     prior = heavy_tailed(information, error)
     if count < MIN_POINTS:
         none, nothing = np.zeros((12, 12)), np.zeros(12)
-        return Iteration(count, T_world_lidar, velocity, step, error, none, nothing, prior, unknown, np.eye(6), 0.0)
+        return Iteration(
+            count, T_world_lidar, velocity, step, 0.0, 0.0, error, none, nothing, prior, unknown, np.eye(6), 0.0
+        )
     scale = max(SCALE_PER_MEDIAN * median_residual_m(linearised), _LEAST_SCALE * cell_m)
     weight, tilt, squared_time = accumulate(linearised, scale * scale, _GATE * cell_m, unknown, total)
     lever_m = math.sqrt(squared_range / count)
@@ -93,10 +98,36 @@ def iterate(
     step[:] = np.linalg.solve(hessian + known, -(known @ error) - gradient)
     write_exp(step[:6], change)
     write_product(T_world_lidar, change, moved)
+    orthonormalize_nearly(moved)
     covariance = np.ascontiguousarray(np.linalg.inv(observed + prior))
+    rotation, translation_m = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
     return Iteration(
-        count, moved, velocity + step[6:], step, error, hessian, gradient, prior, covariance, directions, lever_m
-    )
+        count, moved, velocity + step[6:], step, rotation, translation_m, error, hessian, gradient, prior, covariance,
+        directions, lever_m,
+    )  # fmt: skip
+
+
+@compiled
+def step_by(
+    points: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, chosen: NDArray[np.bool_], least: float
+) -> float:
+    """The step from a pose (4, 4), without a prediction, by the chosen of points (N, 3) alone, metres.
+
+    Zero unless these constrain every direction so many times as well as the noise of their normals feigns.
+    """
+    counts = np.minimum(surfaces.counts, 1) * chosen
+    alone = Surfaces(counts, surfaces.points, surfaces.normals, surfaces.thickness_m, surfaces.tilt)
+    linearised, total, at_rest = np.empty((ROWS, counts.sum())), np.zeros((13, 13)), np.empty(0)
+    squared_range = linearise(points, at_rest, T_world_lidar, alone, np.ones(len(points)), linearised)
+    squared_scale = (SCALE_PER_MEDIAN * median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
+    _, tilt, _ = accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
+    lever_m = math.sqrt(squared_range / linearised.shape[1])
+    total[:3] /= lever_m
+    total[:, :3] /= lever_m
+    hessian = np.ascontiguousarray(total[:6, :6])
+    if np.linalg.eigvalsh(hessian)[0] < least * tilt:
+        return 0.0
+    return float(np.linalg.norm(np.linalg.solve(hessian, np.ascontiguousarray(total[:6, 12]))))
 
 
 @compiled

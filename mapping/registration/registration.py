@@ -11,22 +11,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, displacement_m, inverse, orthonormalize, transform_points
-from lidarslam.core.tracking import Degeneracy, lever_scale
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.tracking import Degeneracy
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MeasuredPose, MotionState, Prediction
-from lidarslam.mapping.registration.iteration import (
-    RANGE_NOISE_M,
-    ROWS,
-    SCALE_PER_MEDIAN,
-    Iteration,
-    accumulate,
-    heavy_tailed,
-    iterate,
-    linearise,
-    median_residual_m,
-    onto_observed,
-)
+from lidarslam.mapping.registration.iteration import Iteration, heavy_tailed, iterate, onto_observed, step_by
 from lidarslam.mapping.registration.local_map import COARSE, LocalMap, Matcher, Surfaces
 from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 
@@ -130,7 +119,7 @@ def register(
                 T_world_lidar, velocity, last = found.T_world_lidar, found.velocity, found
                 iterations += 1
                 unknown = _NARROWING**iterations * found.covariance
-                if _has_converged(found.step, level, cell_m, found.lever_m):
+                if _has_converged(found, level, cell_m):
                     if level > 0 or inflation is not uniform:
                         break
                     factors = inflation_of_small(points, T_world_lidar, matcher.surfaces, local_map)
@@ -143,7 +132,7 @@ def register(
         covariance = replace(solution, prior=heavy_tailed(uninflated, last.error)).covariance(_INFORMATION_SHARE)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
-    T_world_lidar, error = orthonormalize(T_world_lidar), velocity - prediction.velocity
+    error = velocity - velocity_predicted
     return Registration(T_world_lidar, velocity, covariance, solution, error, iterations, matcher)
 
 
@@ -195,25 +184,16 @@ def inflation_of_small(
     large = matched[are_large(local_map, world, normals, T_world_lidar[:3, 3])]
     if len(large) < _FEWEST_LARGE:
         return None
-    inflation, counts = np.full(len(points), _INFLATION), np.zeros_like(surfaces.counts)
-    inflation[large] = counts[large] = 1
-    linearised, total, at_rest = np.empty((ROWS, len(large))), np.zeros((13, 13)), np.empty(0)
-    squared = linearise(points, at_rest, T_world_lidar, surfaces._replace(counts=counts), inflation, linearised)
-    squared_scale = (SCALE_PER_MEDIAN * median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
-    _, tilt, _ = accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
-    scale = lever_scale(float(np.sqrt(squared / len(large))))
-    hessian = total[:6, :6] / np.outer(scale, scale)
-    if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * tilt:
-        return None
-    step_m = np.linalg.norm(np.linalg.solve(hessian, total[:6, 12] / scale))
-    return inflation if step_m > _CONTRADICTION_CELLS * local_map.cell_m else None
+    is_large = np.zeros(len(points), dtype=np.bool_)
+    is_large[large] = True
+    step_m = step_by(points, np.ascontiguousarray(T_world_lidar), surfaces, is_large, _SUFFICIENT)
+    return np.where(is_large, 1.0, _INFLATION) if step_m > _CONTRADICTION_CELLS * local_map.cell_m else None
 
 
-def _has_converged(step: FloatArray, level: int, cell_m: float, lever_m: float) -> bool:
+def _has_converged(last: Iteration, level: int, cell_m: float) -> bool:
     if level > 0:
-        return displacement_m(step[:6], lever_m) < _COARSE_CONVERGED * cell_m
-    rotation, translation_m = np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])
-    return bool(rotation < _CONVERGED_ROTATION and translation_m < _CONVERGED_TRANSLATION_M)
+        return last.translation_m + last.lever_m * last.rotation < _COARSE_CONVERGED * cell_m
+    return last.rotation < _CONVERGED_ROTATION and last.translation_m < _CONVERGED_TRANSLATION_M
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from lidarslam.mapping.registration.local_map import (
     vertical_of,
 )
 from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan, sizes_of_cells
-from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
+from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.surfel_kernels import Arrays, is_steep, look_up, refresh, turn_to_sensor, views_of
 from lidarslam.mapping.surfels.voxel_hash import key_at, require_reach
 
@@ -44,6 +44,8 @@ _COMPACT = 0.5
 # Standard deviation of a normal from which a coarser plane is asked for: in grass, the finest cells have normals of any
 # direction.
 _CERTAIN_TILT = 0.02
+# Columns of surfels: where the normal begins, and the least standard deviation.
+_NORMAL, _SPREAD = 3, 9
 # No cell has this key.
 _NOWHERE = -1
 # Scans between two removals of stray cells.
@@ -189,6 +191,18 @@ def match_surfels(
     match_compact(points, unmatched[:left], first, grids[0][1], T_world_lidar, largest_m, found)
 
 
+@compiled
+def planes_in(rows: NDArray[np.int32], surfels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normals (N, 3), and standard deviations (N,) along them, of the planes in cells; infinite where there is none."""
+    normals, spread_m = np.zeros((len(rows), 3)), np.full(len(rows), np.inf)
+    for n in range(len(rows)):
+        if rows[n] >= 0 and surfels[rows[n], IS_PLANE] > 0.0:
+            spread_m[n] = surfels[rows[n], _SPREAD]
+            for i in range(3):
+                normals[n, i] = surfels[rows[n], _NORMAL + i]
+    return normals, spread_m
+
+
 class SurfelMatcher(Matcher):
     """Surfels of the cells that N points lie in, of grids that do not change meanwhile, the finest first.
 
@@ -270,11 +284,8 @@ class SurfelMap(LocalMap):
         return vertical_of(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL])
 
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        grid = self._grids[COARSE]
-        rows = grid.find(points, np.array(sensor))
-        planes = grid.refreshed(rows)[rows]
-        is_plane = (rows >= 0) & (planes[:, IS_PLANE] > 0.0)
-        return planes[:, NORMAL], np.where(is_plane, planes[:, SPREADS.start], np.inf)
+        rows = self._grids[COARSE].find(points, np.array(sensor))
+        return planes_in(rows, self._grids[COARSE].refreshed(rows))
 
     def means(self) -> FloatArray:
         return self._grids[1].means()

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Shape, Stateful
 from lidarslam.core.tracking import AXES, Status
@@ -254,7 +254,7 @@ class Mapper(Stateful):
 
     def _insert(self, scan: SampledScan, state: MotionState, local_map: LocalMap) -> None:
         """Insert a scan, compensated, at its pose."""
-        points = transform_points(state.T_world_lidar, scan.sweep.compensated(state.velocity))
+        _, points = scan.sweep.placed(state.velocity, state.T_world_lidar)
         local_map.add(scan, points, state.T_world_lidar[:3, 3])
         recent = [one for one in self._recent if one.number > self._scans - self.kept_scans]
         if self.kept_scans:
