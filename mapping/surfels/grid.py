@@ -199,11 +199,12 @@ class SurfelGrid(Stateful):
 
     def _keep(self, kept: NDArray[np.intp]) -> None:
         """Keep the cells in these rows only."""
-        if len(kept) == len(self):
+        count = len(self)
+        if len(kept) == count:
             return
         for values in (self._keys, self._sums, self._surfels, self._surfel_counts):
-            values[: len(kept)] = values[kept]
-            values[len(kept) :] = 0  # new cells begin empty
+            values[: len(kept)] = values.take(kept, axis=0)
+            values[len(kept) : count] = 0  # new cells begin empty
         self._index(len(kept))
 
     def _index(self, count: int) -> None:
