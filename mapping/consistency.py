@@ -123,14 +123,17 @@ def shift_profile(
     return np.asarray(np.minimum(votes, _MOST_OF_BLOCK).sum(axis=0), dtype=np.float64)
 
 
+@compiled
 def _draw_indices(points: FloatArray) -> NDArray[np.int64]:
     """(ROWS, COLUMNS) the index of the last of the points (N, 3) in every pixel, -1 where there is none."""
-    far = np.flatnonzero(np.einsum("ij,ij->i", points, points) >= _MIN_RANGE_M**2)
-    x, y, z = points[far].T
-    column = ((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * COLUMNS).astype(np.int64) % COLUMNS
-    row = ((np.arctan2(z, np.sqrt(x * x + y * y)) + 0.5 * np.pi) / np.pi * ROWS).astype(np.int64).clip(0, ROWS - 1)
     image = np.full((ROWS, COLUMNS), -1, dtype=np.int64)
-    image[row, column] = far
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        across = math.sqrt(x * x + y * y)
+        if across * across + z * z >= _MIN_RANGE_M**2:
+            column = int((math.atan2(y, x) + math.pi) / (2.0 * math.pi) * COLUMNS) % COLUMNS
+            row = int((math.atan2(z, across) + 0.5 * math.pi) / math.pi * ROWS)
+            image[min(row, ROWS - 1), column] = n
     return image
 
 
