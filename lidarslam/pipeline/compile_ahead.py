@@ -123,20 +123,24 @@ class Part(NamedTuple):
     modules: tuple[str, ...]  # that hold its loops, below lidarslam
 
 
+_REGISTRATION = tuple(
+    f"mapping.{name}" for name in ("registration.iteration", "registration.gauss_newton", "tracking.fit")
+)
+
 # In the order in which they are compiled: the longest first.
 PARTS = {
     "surfels": Part(
         _surfels,
         (
             *(f"mapping.surfels.{name}" for name in ("voxel_hash", "surfel_kernels", "surfel_map")),
-            "mapping.registration.registration",
+            *_REGISTRATION,
         ),
     ),
     "loam": Part(
         partial(_register, "loam"),
         (
             *(f"mapping.loam.{name}" for name in ("features", "feature_map")),
-            "mapping.registration.registration",
+            *_REGISTRATION,
             "mapping.surfels.voxel_hash",
         ),
     ),

@@ -6,10 +6,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels import grid as grids
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
-from lidarslam.mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps
+from lidarslam.mapping.surfels.voxel_hash import (
+    ABSENT,
+    OTHER_SIDE,
+    Rows,
+    VoxelHash,
+    cell_keys,
+    find_around,
+    key_cells,
+    key_steps,
+)
 
 from .shapes import across_x
 
@@ -302,6 +312,20 @@ def test_equals_a_dictionary_after_any_insertions(batches, asked):
     assert sorted(oracle.values()) == list(range(len(oracle)))
     wanted = [*asked, *oracle]
     assert table.find(keys_of(wanted)).tolist() == [oracle.get(cell, ABSENT) for cell in wanted]
+
+
+@compiled
+def _around(key: int, table: tuple[int, NDArray[np.int64], Rows], around: Rows) -> None:
+    find_around(key, table[0], table[1], table[2], around)
+
+
+@given(cells_near, cells_near)
+def test_a_neighbourhood_is_that_of_single_cells(cells, asked):
+    table, around, steps = VoxelHash(), np.empty(27, dtype=np.int32), np.stack(np.mgrid[-1:2, -1:2, -1:2], axis=-1)
+    table.insert(keys_of(cells))
+    for key in keys_of(asked):
+        _around(key | OTHER_SIDE, table.slots, around)
+        np.testing.assert_array_equal(around, table.find(key + key_steps(steps.reshape(-1, 3))))
 
 
 @given(cells_anywhere)

@@ -160,3 +160,9 @@ def test_tiles_that_are_cut_off_are_refused(tmp_path, through_disk):
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(InputError, match=r"tiles.bin: is damaged"):
         GlobalMap(1.0, MOST, TileStore(file=file)).restore(saved)
+
+
+@pytest.mark.parametrize(("count", "reach"), [(0, 1), (1, 1), (5_000, 1), (5_000, 40), (5_000, 500_000)])
+def test_voxels_are_sorted_in_their_order(rng, count, reach):
+    keys = cell_keys(rng.integers(-reach, reach, (count, 3)))
+    np.testing.assert_array_equal(voxels.radix_order(keys), np.argsort(keys, kind="stable"))
