@@ -66,9 +66,10 @@ class MapBuilder(Stateful):
             logger.info(
                 "voxels of the map: %.3g m, 1/50 of the first scan's median range, from 5 to 25 cm", self.voxel_size_m
             )
-        thinned = scan.select(one_per_cell(scan.points, self.voxel_size_m))
-        squared = squared_ranges(thinned.points)
-        return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
+        kept = one_per_cell(scan.points, self.voxel_size_m)
+        squared = squared_ranges(scan.points.take(kept, axis=0))
+        is_within = (squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2)
+        return scan.select(kept[is_within])
 
     def add(self, thinned: Scan, estimate: ScanEstimate) -> None:
         """Take the next scan; it enters the map with `add_pending`, if its pose is good enough."""
