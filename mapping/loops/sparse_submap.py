@@ -1,5 +1,6 @@
 """A keyframe's submap as loop detection keeps it: a few thousand points with normals, and a range image."""
 
+import math
 import pickle
 from dataclasses import dataclass
 from functools import lru_cache
@@ -9,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray, levelling
 from lidarslam.core.state import BlockFile
 from lidarslam.core.thinning import evenly, one_per_cell
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 
 PLANE, LINE = 1, 2
 # Nearer points are mostly the carrier itself.
@@ -76,13 +79,16 @@ class SparseSubmap:
         return flat[_pixels(points, np.linalg.norm(points, axis=1))].astype(np.float64)
 
 
+@compiled
 def _pixels(points: FloatArray, ranges: FloatArray) -> NDArray[np.intp]:
     """(N,) flat indices into a range image."""
-    azimuth = (np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5) * PIXELS[0]
-    sine = np.clip(points[:, 2] / np.maximum(ranges, 1e-9), -1.0, 1.0)
-    elevation = (np.arcsin(sine) / np.pi + 0.5) * PIXELS[1]
-    rows = np.minimum(azimuth.astype(np.intp), PIXELS[0] - 1)
-    return rows * PIXELS[1] + np.minimum(elevation.astype(np.intp), PIXELS[1] - 1)
+    pixels = np.empty(len(points), dtype=np.intp)
+    for n in range(len(points)):
+        sine = min(max(points[n, 2] / max(ranges[n], 1e-9), -1.0), 1.0)
+        azimuth = (math.atan2(points[n, 1], points[n, 0]) / (2.0 * math.pi) + 0.5) * PIXELS[0]
+        elevation = (math.asin(sine) / math.pi + 0.5) * PIXELS[1]
+        pixels[n] = min(int(azimuth), PIXELS[0] - 1) * PIXELS[1] + min(int(elevation), PIXELS[1] - 1)
+    return pixels
 
 
 def principal_components(
@@ -90,10 +96,32 @@ def principal_components(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Centroids (N, 3), eigenvalues (N, 3) ascending and eigenvectors (N, 3, 3) of the cloud around points (N, 3)."""
     _, nearest = tree.query(points, k=neighbours, workers=1)
-    around = cloud[nearest]
-    centroids = around.mean(axis=1)
-    around -= centroids[:, None]
-    spread, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return _components(np.ascontiguousarray(cloud), nearest.reshape(len(points), -1))
+
+
+@compiled
+def _components(cloud: FloatArray, nearest: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    count = len(nearest)
+    centroids, spread, directions = np.zeros((count, 3)), np.empty((count, 3)), np.empty((count, 3, 3))
+    scatter, offset, least, largest = np.empty(6), np.empty(3), np.empty(3), np.empty(3)
+    for n in range(count):
+        for row in nearest[n]:
+            for i in range(3):
+                centroids[n, i] += cloud[row, i] / nearest.shape[1]
+        scatter[:] = 0.0
+        for row in nearest[n]:
+            for i in range(3):
+                offset[i] = cloud[row, i] - centroids[n, i]
+            for entry in range(6):
+                i, j = SYMMETRIC[entry]
+                scatter[entry] += offset[i] * offset[j]
+        write_eigenvalues(scatter, spread[n])
+        write_eigenvector(scatter, spread[n, 0], least)
+        write_eigenvector(scatter, spread[n, 2], largest)
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            directions[n, i, 0], directions[n, i, 2] = least[i], largest[i]
+            directions[n, i, 1] = largest[j] * least[k] - largest[k] * least[j]
     return centroids, spread, directions
 
 
