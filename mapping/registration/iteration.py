@@ -11,12 +11,11 @@ from lidarslam.core.compiled_motion import orthonormalize_nearly, write_exp, wri
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.registration.gauss_newton import open_directions
 from lidarslam.mapping.registration.local_map import Surfaces
-from lidarslam.mapping.registration.sampled_scan import MIN_POINTS
 
 # Standard deviation of a range measurement: no surface is known better.
 RANGE_NOISE_M = 0.02
 # Scale of the robust kernel: this many times the median residual, at least this share of a cell.
-SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
+_SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
 # Residuals beyond this, in cells, are outliers.
 _GATE = 6.0
 # Errors of neighbouring points are correlated: this many count as one. From true errors on simulated recordings.
@@ -27,7 +26,7 @@ _FREEDOM = 4.0
 _DEGENERATE_INFORMATION = 1e8
 # Rows of linearised residuals: Jacobian (6), residual, standard deviation of the surface, of the normal, seconds.
 _RESIDUAL, _THICKNESS, _TILT, _TIME = 6, 7, 8, 9
-ROWS = 10
+_ROWS = 10
 # Residuals that are added up together.
 _BLOCK = 256
 
@@ -35,7 +34,6 @@ _BLOCK = 256
 class Iteration(NamedTuple):
     """A Gauss-Newton step of pose and velocity, rotation first, and what it was computed from."""
 
-    residuals: int  # their number
     T_world_lidar: FloatArray  # (4, 4) after the step
     velocity: FloatArray  # (6,) after the step
     step: FloatArray  # (12,)
@@ -68,21 +66,15 @@ def iterate(
         LinAlgError: neither the correspondences nor the prediction constrain a direction.
     """
     count = surfaces.counts.sum()
-    linearised = np.empty((ROWS, count))
+    linearised = np.empty((_ROWS, count))
     squared_range = linearise(points, times, T_world_lidar, surfaces, inflation, linearised)
-    total, step, change, moved = np.zeros((13, 13)), np.zeros(12), np.empty((4, 4)), np.empty((4, 4))
-    error = np.empty(12)
+    total, error, change, moved = np.zeros((13, 13)), np.empty(12), np.empty((4, 4)), np.empty((4, 4))
     write_inverse(T_predicted, change)
     write_product(change, T_world_lidar, moved)
     write_log(moved, error[:6])
     error[6:] = velocity - velocity_predicted
     prior = heavy_tailed(information, error)
-    if count < MIN_POINTS:
-        none, nothing = np.zeros((12, 12)), np.zeros(12)
-        return Iteration(
-            count, T_world_lidar, velocity, step, 0.0, 0.0, error, none, nothing, prior, unknown, np.eye(6), 0.0
-        )
-    scale = max(SCALE_PER_MEDIAN * median_residual_m(linearised), _LEAST_SCALE * cell_m)
+    scale = max(_SCALE_PER_MEDIAN * median_residual_m(linearised), _LEAST_SCALE * cell_m)
     weight, tilt, squared_time = accumulate(linearised, scale * scale, _GATE * cell_m, unknown, total)
     lever_m = math.sqrt(squared_range / count)
     directions = open_directions(total[:6, :6], tilt, weight, lever_m)
@@ -95,14 +87,14 @@ def iterate(
         known[6:, 6:] += squared_time * held
         onto = onto_observed(directions, lever_m)
         observed = onto.T @ hessian @ onto
-    step[:] = np.linalg.solve(hessian + known, -(known @ error) - gradient)
+    step = np.asarray(np.linalg.solve(hessian + known, -(known @ error) - gradient), dtype=np.float64)
     write_exp(step[:6], change)
     write_product(T_world_lidar, change, moved)
     orthonormalize_nearly(moved)
     covariance = np.ascontiguousarray(np.linalg.inv(observed + prior))
     rotation, translation_m = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
     return Iteration(
-        count, moved, velocity + step[6:], step, rotation, translation_m, error, hessian, gradient, prior, covariance,
+        moved, velocity + step[6:], step, rotation, translation_m, error, hessian, gradient, prior, covariance,
         directions, lever_m,
     )  # fmt: skip
 
@@ -117,9 +109,9 @@ def step_by(
     """
     counts = np.minimum(surfaces.counts, 1) * chosen
     alone = Surfaces(counts, surfaces.points, surfaces.normals, surfaces.thickness_m, surfaces.tilt)
-    linearised, total, at_rest = np.empty((ROWS, counts.sum())), np.zeros((13, 13)), np.empty(0)
+    linearised, total, at_rest = np.empty((_ROWS, counts.sum())), np.zeros((13, 13)), np.empty(0)
     squared_range = linearise(points, at_rest, T_world_lidar, alone, np.ones(len(points)), linearised)
-    squared_scale = (SCALE_PER_MEDIAN * median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
+    squared_scale = (_SCALE_PER_MEDIAN * median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
     _, tilt, _ = accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
     lever_m = math.sqrt(squared_range / linearised.shape[1])
     total[:3] /= lever_m

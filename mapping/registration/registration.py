@@ -6,7 +6,6 @@ end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +51,7 @@ class Registration:
     # (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`: rotation first, in
     # the LiDAR frame, as GTSAM has it.
     covariance: FloatArray
-    solution: "_Solution"  # of the last iteration
+    last: Iteration
     velocity_error: FloatArray  # (6,) of the predicted velocity
     iterations: int  # of Gauss-Newton
     matcher: Matcher  # with the correspondences of the keypoints in the finest cells
@@ -61,17 +60,26 @@ class Registration:
     @property
     def degeneracy(self) -> Degeneracy:
         """The directions along which the prediction was kept."""
-        return self.solution.degeneracy
+        return Degeneracy(self.last.directions, self.last.lever_m)
 
     @property
     def observed(self) -> FloatArray:
         """(6, 6) projector onto the directions of motion that are not degenerate."""
-        return self.solution.observed[:6, :6]
+        return onto_observed(self.last.directions, self.last.lever_m)[:6, :6]
 
     @property
     def measured(self) -> MeasuredPose:
-        """The pose by the correspondences alone."""
-        measured = self.solution.measured(self.T_world_lidar, self.velocity_error)
+        """The pose by the correspondences alone.
+
+        The velocity during the sweep is marginalised, with the uncertainty of its prediction.
+        """
+        last, onto = self.last, onto_observed(self.last.directions, self.last.lever_m)
+        H, g = onto.T @ last.hessian @ onto, onto.T @ (last.gradient + last.hessian @ last.step)
+        known = np.linalg.inv(np.linalg.inv(last.prior)[6:, 6:])
+        H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ self.velocity_error
+        gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T
+        measured = MeasuredPose.minimum(self.T_world_lidar, H[:6, :6] - gain @ H[6:, :6], g[:6] - gain @ g[6:])
+        measured = replace(measured, information=_INFORMATION_SHARE * measured.information)
         return measured if self.held is None else measured.without(self.held)
 
     def without(self, direction: FloatArray, prediction: Prediction) -> "Registration":
@@ -108,18 +116,17 @@ def register(
             for _ in range(coarse if level else most - iterations):
                 points, world = sweep.placed(velocity, T_world_lidar)
                 matcher.match(world, T_world_lidar)
-                found = iterate(
-                    points, times, T_world_lidar, velocity, matcher.surfaces, inflation, cell_m, unknown,
-                    T_predicted, velocity_predicted, information,
-                )  # fmt: skip
-                if found.residuals < MIN_POINTS:
+                if matcher.surfaces.counts.sum() < MIN_POINTS:
                     if level > 0:  # of a thin map
                         break
                     return None
-                T_world_lidar, velocity, last = found.T_world_lidar, found.velocity, found
-                iterations += 1
-                unknown = _NARROWING**iterations * found.covariance
-                if _has_converged(found, level, cell_m):
+                last = iterate(
+                    points, times, T_world_lidar, velocity, matcher.surfaces, inflation, cell_m, unknown,
+                    T_predicted, velocity_predicted, information,
+                )  # fmt: skip
+                T_world_lidar, velocity, iterations = last.T_world_lidar, last.velocity, iterations + 1
+                unknown = _NARROWING**iterations * last.covariance
+                if _has_converged(last, level, cell_m):
                     if level > 0 or inflation is not uniform:
                         break
                     factors = inflation_of_small(points, T_world_lidar, matcher.surfaces, local_map)
@@ -128,12 +135,13 @@ def register(
                     # An odometry saw the same small surfaces.
                     inflation, unknown, information = factors, covariance, information / _INFLATION**2
         # Where no large surface observes a direction, the pose is still known by the prediction.
-        solution = _Solution.of(last)
-        covariance = replace(solution, prior=heavy_tailed(uninflated, last.error)).covariance(_INFORMATION_SHARE)
+        onto = onto_observed(last.directions, last.lever_m)
+        share, prior = _INFORMATION_SHARE * last.hessian, heavy_tailed(uninflated, last.error)
+        covariance = np.asarray(np.linalg.inv(onto.T @ share @ onto + prior), dtype=np.float64)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
     error = velocity - velocity_predicted
-    return Registration(T_world_lidar, velocity, covariance, solution, error, iterations, matcher)
+    return Registration(T_world_lidar, velocity, covariance, last, error, iterations, matcher)
 
 
 def with_mean_velocity(
@@ -194,45 +202,3 @@ def _has_converged(last: Iteration, level: int, cell_m: float) -> bool:
     if level > 0:
         return last.translation_m + last.lever_m * last.rotation < _COARSE_CONVERGED * cell_m
     return last.rotation < _CONVERGED_ROTATION and last.translation_m < _CONVERGED_TRANSLATION_M
-
-
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """The last Gauss-Newton step (12,), with the normal equations of the correspondences before it.
-
-    The Hessian (12, 12) and the gradient (12,) are those of pose and velocity; the prior's information is (12, 12).
-    """
-
-    step: FloatArray
-    hessian: FloatArray
-    gradient: FloatArray
-    prior: FloatArray
-    degeneracy: Degeneracy
-
-    @classmethod
-    def of(cls, last: Iteration) -> "_Solution":
-        degeneracy = Degeneracy(last.directions, last.lever_m)
-        return cls(last.step, last.hessian, last.gradient, last.prior, degeneracy)
-
-    def covariance(self, share: float) -> FloatArray:
-        """(12, 12) with a share of the correspondences' information, none of it along degenerate directions."""
-        observed = self.observed
-        return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
-
-    def measured(self, T_world_lidar: FloatArray, velocity_error: FloatArray) -> MeasuredPose:
-        """The pose by the correspondences alone, from the pose (4, 4) and the velocity's error (6,) after the step.
-
-        The velocity during the sweep is marginalised, with the uncertainty of its prediction.
-        """
-        observed, hessian = self.observed, self.hessian
-        H, g = observed.T @ hessian @ observed, observed.T @ (self.gradient + hessian @ self.step)
-        known = np.linalg.inv(np.linalg.inv(self.prior)[6:, 6:])
-        H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ velocity_error
-        gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T
-        pose = MeasuredPose.minimum(T_world_lidar, H[:6, :6] - gain @ H[6:, :6], g[:6] - gain @ g[6:])
-        return replace(pose, information=_INFORMATION_SHARE * pose.information)
-
-    @cached_property
-    def observed(self) -> FloatArray:
-        """(12, 12) projector onto the directions that are not degenerate."""
-        return onto_observed(self.degeneracy.directions, self.degeneracy.lever_m)
