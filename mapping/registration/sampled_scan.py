@@ -30,6 +30,7 @@ _LEVELS = (1, 2, 4)
 # Where rings are farther apart than this, there are larger cells, too: with walls close by, only floor and ceiling
 # constrain the height, and they are seen from 4 m on, where smaller cells have points of a single ring of a sweep.
 _SPARSE_RINGS_RAD, _LARGE_CELL_M = np.deg2rad(1.6), 0.4
+MOST_LEVELS = len(_LEVELS) + 1
 # Largest cells for planes through neighbours: in sparser maps, these are too far apart.
 MOST_SPACING_M = 0.4
 _CLOSE_M = 3.0

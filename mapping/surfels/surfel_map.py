@@ -23,7 +23,7 @@ from lidarslam.mapping.registration.local_map import (
     for_each_grid,
     vertical_of,
 )
-from lidarslam.mapping.registration.sampled_scan import CellSizes, SampledScan, sizes_of_cells
+from lidarslam.mapping.registration.sampled_scan import MOST_LEVELS, CellSizes, SampledScan, sizes_of_cells
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.surfel_kernels import Arrays, is_steep, look_up, refresh, turn_to_sensor, views_of
 from lidarslam.mapping.surfels.voxel_hash import key_at, require_reach
@@ -160,23 +160,23 @@ def _write(found: Surfaces, n: int, surfel: FloatArray, axis: int, u: float, v: 
 
 @compiled
 def match_surfels(
-    points: FloatArray, T_world_lidar: FloatArray, grids: tuple[Arrays, ...], keys: NDArray[np.int64],
+    points: FloatArray, T_world_lidar: FloatArray, grids: tuple[Arrays, ...], count: int, keys: NDArray[np.int64],
     spread_m: FloatArray, certain_tilt: float, found: Surfaces,
 ) -> None:  # fmt: skip
-    """Write the surfaces of those of the points (N, 3) that have left their cells in the first of some grids.
+    """Write the surfaces of those of the points (N, 3) that have left their cells in the first of `count` grids.
 
     `keys` (N,) of these cells are written. Planes as of `match_planes`, of the sides that face the sensor, from one
     grid after another; where none has one, the compact object in the first.
     """
-    sensor, unmatched, left, scale = T_world_lidar[:3, 3].copy(), np.empty(len(points), dtype=np.intp), 0, 1.0
-    scale /= grids[0][0].cell_m
+    sensor, unmatched, left = T_world_lidar[:3, 3].copy(), np.empty(len(points), dtype=np.intp), 0
+    scale = 1.0 / grids[0][0].cell_m
     for n in range(len(points)):
         key = key_at(points[n], scale)
         if key != keys[n]:
             keys[n], found.counts[n], unmatched[left] = key, 0, n
             left += 1
     rows, first = np.empty(len(points), dtype=np.int32), np.empty(len(points), dtype=np.int32)
-    for g in range(len(grids)):
+    for g in range(count):
         cells, surfels, counts = grids[g]
         looked_up, at = points[unmatched[:left]], np.empty(left, dtype=np.int32)
         look_up(looked_up, cells, at)
@@ -213,14 +213,16 @@ class SurfelMatcher(Matcher):
 
     def __init__(self, grids: Sequence[SurfelGrid], count: int, keeps_finest: bool = False) -> None:
         self._grids, self._certain_tilt = grids, np.inf if keeps_finest else _CERTAIN_TILT
+        arrays = [grid.arrays for grid in grids]
+        self._arrays = (*arrays, *arrays[-1:] * (MOST_LEVELS - len(grids)))  # of one type, to be compiled once
         self._keys = np.full(count, _NOWHERE, dtype=np.int64)  # of the points' cells
         self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
-        grids = tuple(grid.arrays for grid in self._grids)
-        match_surfels(points, T, grids, self._keys, self._spread_m, self._certain_tilt, self.surfaces)
+        found = self._keys, self._spread_m, self._certain_tilt, self.surfaces
+        match_surfels(points, T, self._arrays, len(self._grids), *found)
 
 
 class SurfelMap(LocalMap):
