@@ -87,7 +87,7 @@ def _surfels() -> None:
     from lidarslam.mapping.surfels.grid import SurfelGrid
 
     _register("surfels")
-    grid, points = SurfelGrid(0.5), made_up_scans()[0].points
+    grid, points = SurfelGrid(0.05), made_up_scans()[0].points
     grid.insert(points, np.zeros(len(points)), np.zeros_like(points))
     grid.drop_beyond(np.zeros(3), 5.0)
 
@@ -108,12 +108,14 @@ def _map() -> None:
 def _checks() -> None:
     from lidarslam.mapping.consistency import Surfels, shift_profile
     from lidarslam.mapping.global_map.moved_points import Views, seen_through
+    from lidarslam.mapping.loops.sparse_submap import SparseSubmap
 
     points, views = made_up_scans()[0].points, Views(every=1)
     views.add(points, 0)
     seen_through(points, views.placed(np.eye(4)[None]), 0.2)
     surfels = Surfels.of(points)
     shift_profile(surfels, surfels, np.eye(4), np.array([1.0, 0.0, 0.0]))
+    SparseSubmap.of(points, 100.0)
 
 
 class Part(NamedTuple):
@@ -124,7 +126,7 @@ class Part(NamedTuple):
 
 
 _REGISTRATION = tuple(
-    f"mapping.{name}" for name in ("registration.iteration", "registration.gauss_newton", "tracking.fit")
+    f"mapping.{name}" for name in ("registration.iteration", "registration.local_map", "tracking.fit")
 )
 
 # In the order in which they are compiled: the longest first.
@@ -148,7 +150,7 @@ PARTS = {
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.mounting")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.voxels")),
-    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.consistency")),
+    "checks": Part(_checks, ("mapping.global_map.moved_points", "mapping.consistency", "mapping.loops.sparse_submap")),
 }
 """The parts whose loops are compiled."""
 

@@ -67,22 +67,22 @@ def iterate(
     """
     count = surfaces.counts.sum()
     linearised = np.empty((_ROWS, count))
-    squared_range = linearise(points, times, T_world_lidar, surfaces, inflation, linearised)
+    squared_range = _linearise(points, times, T_world_lidar, surfaces, inflation, linearised)
     total, error, change, moved = np.zeros((13, 13)), np.empty(12), np.empty((4, 4)), np.empty((4, 4))
     write_inverse(T_predicted, change)
     write_product(change, T_world_lidar, moved)
     write_log(moved, error[:6])
     error[6:] = velocity - velocity_predicted
     prior = heavy_tailed(information, error)
-    scale = max(_SCALE_PER_MEDIAN * median_residual_m(linearised), _LEAST_SCALE * cell_m)
-    weight, tilt, squared_time = accumulate(linearised, scale * scale, _GATE * cell_m, unknown, total)
+    scale = max(_SCALE_PER_MEDIAN * _median_residual_m(linearised), _LEAST_SCALE * cell_m)
+    weight, tilt, squared_time = _accumulate(linearised, scale * scale, _GATE * cell_m, unknown, total)
     lever_m = math.sqrt(squared_range / count)
     directions = open_directions(total[:6, :6], tilt, weight, lever_m)
     hessian, gradient = total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION
     # Along directions that are not constrained, the prediction is held, and the correspondences do not count.
     known, observed = prior.copy(), hessian
     if len(directions):
-        held = _DEGENERATE_INFORMATION * projector(directions, lever_m)
+        held = _DEGENERATE_INFORMATION * _projector(directions, lever_m)
         known[:6, :6] += held
         known[6:, 6:] += squared_time * held
         onto = onto_observed(directions, lever_m)
@@ -110,9 +110,9 @@ def step_by(
     counts = np.minimum(surfaces.counts, 1) * chosen
     alone = Surfaces(counts, surfaces.points, surfaces.normals, surfaces.thickness_m, surfaces.tilt)
     linearised, total, at_rest = np.empty((_ROWS, counts.sum())), np.zeros((13, 13)), np.empty(0)
-    squared_range = linearise(points, at_rest, T_world_lidar, alone, np.ones(len(points)), linearised)
-    squared_scale = (_SCALE_PER_MEDIAN * median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
-    _, tilt, _ = accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
+    squared_range = _linearise(points, at_rest, T_world_lidar, alone, np.ones(len(points)), linearised)
+    squared_scale = (_SCALE_PER_MEDIAN * _median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
+    _, tilt, _ = _accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
     lever_m = math.sqrt(squared_range / linearised.shape[1])
     total[:3] /= lever_m
     total[:, :3] /= lever_m
@@ -129,8 +129,8 @@ def heavy_tailed(information: FloatArray, error: FloatArray) -> FloatArray:
     return min(1.0, share) * information
 
 
-@compiled
-def projector(directions: FloatArray, lever_m: float) -> FloatArray:
+@compiled_part
+def _projector(directions: FloatArray, lever_m: float) -> FloatArray:
     """(6, 6) quadratic form: the squared length, metres, of the part of a motion along directions (D, 6)."""
     rows = directions.copy()
     rows[:, :3] *= lever_m
@@ -147,15 +147,15 @@ def onto_observed(directions: FloatArray, lever_m: float) -> FloatArray:
     return onto
 
 
-@compiled
-def median_residual_m(linearised: FloatArray) -> float:
+@compiled_part
+def _median_residual_m(linearised: FloatArray) -> float:
     """The upper median of the absolute residuals of (10, M)."""
     middle = linearised.shape[1] // 2
     return float(np.partition(np.abs(linearised[_RESIDUAL]), middle)[middle])
 
 
-@compiled
-def linearise(
+@compiled_part
+def _linearise(
     points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, inflation: FloatArray,
     linearised: FloatArray,
 ) -> float:  # fmt: skip
@@ -189,8 +189,8 @@ def linearise(
     return squared
 
 
-@compiled
-def accumulate(
+@compiled_part
+def _accumulate(
     linearised: FloatArray, squared_scale: float, gate_m: float, unknown: FloatArray, total: FloatArray
 ) -> tuple[float, float, float]:
     """Add the weighted products of residuals (10, M) up, with Geman and McClure's weights over the variances.

@@ -95,7 +95,7 @@ def match_planes(
     return left
 
 
-@compiled
+@compiled_part
 def match_compact(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray,
     T_world_lidar: FloatArray, largest_m: float, found: Surfaces,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
@@ -176,7 +176,7 @@ def _measure(world: FloatArray, sensor: FloatArray, surfaces: Surfaces, cell_m: 
     return _Measures(matched, np.median(distances_m), ratio, support, evidence, weakest, unsupported)
 
 
-@compiled
+@compiled_part
 def directional_support(information: FloatArray, supported: FloatArray, share: float) -> tuple[float, FloatArray]:
     """The least inlier ratio over all directions (3,) of translation, points weighted by their constraint on it.
 

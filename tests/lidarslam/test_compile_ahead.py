@@ -18,6 +18,7 @@ REPOSITORY = Path(__file__).parents[2]
 LEFT_OUT = {
     "lidarslam.core.thinning",
     "lidarslam.mapping.surfels.symmetric",
+    "lidarslam.mapping.registration.gauss_newton",  # of loop closures; within a registration it is a part
     "lidarslam.mapping.global_map.occupancy_grid",  # of export-grid, which is no part of a run
 }
 # Rehearse everything, take a recording through the pipeline, and print the loops that are called with other types.
@@ -56,7 +57,7 @@ def test_a_rehearsal_compiles_all_that_a_run_calls(tmp_path, room, drive):
     command = [sys.executable, "-c", REHEARSE_AND_RUN, str(folder), str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
-    assert not done.stdout
+    assert not done.stdout, done.stdout
 
 
 def test_every_file_with_compiled_loops_belongs_to_a_part():
