@@ -79,7 +79,7 @@ def normals_rows(k: Keyframes) -> Rows:
         f"Open3D, 30 nearest in {radius} voxels": partial(theirs.normals, points, 30, radius * voxel_m)
         for radius in (2, 3, 4)
     }
-    calls["NumPy and SciPy, 20 nearest"] = lambda: principal_components(points, cKDTree(points), points, 20)[2][:, :, 0]
+    calls["ours, 20 nearest"] = lambda: principal_components(points, cKDTree(points), points, 20)[2][:, :, 0]
     for method, call in calls.items():
         found, ms = timed(call)
         cosines = np.abs(np.einsum("ij,ij->i", found[near], true.normals[nearest[near]]))

@@ -68,15 +68,16 @@ class Correspondences:
 
 
 @compiled
-def _gather(found: Surfaces, most: int) -> tuple[NDArray[np.intp], FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The residuals of surfaces, at most so many per point, in the order of the fields of `Correspondences`."""
-    count = np.minimum(found.counts, most).sum()
+def _gather(found: Surfaces) -> tuple[NDArray[np.intp], FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The residuals of surfaces, in the order of the fields of `Correspondences`."""
+    count, m = found.counts.sum(), 0
     index, points, normals = np.empty(count, dtype=np.intp), np.empty((count, 3)), np.empty((count, 3))
-    thickness_m, tilt, m = np.empty(count), np.empty(count), 0
+    thickness_m, tilt = np.empty(count), np.empty(count)
     for n in range(len(found.counts)):
-        for k in range(min(found.counts[n], most)):
+        for k in range(found.counts[n]):
             index[m], thickness_m[m], tilt[m] = n, found.thickness_m[n, k], found.tilt[n, k]
-            points[m], normals[m] = found.points[n], found.normals[n, k]
+            for i in range(3):
+                points[m, i], normals[m, i] = found.points[n, i], found.normals[n, k, i]
             m += 1
     return index, points, normals, thickness_m, tilt
 
@@ -90,9 +91,9 @@ class Matcher(ABC):
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
 
-    def correspondences(self, most: int = 3) -> Correspondences:
-        """A residual per row, in the order of the points; of each point at most so many, first the one across it."""
-        return Correspondences(*_gather(self.surfaces, most))
+    def correspondences(self) -> Correspondences:
+        """A residual per row, in the order of the points; of each point first the one across it."""
+        return Correspondences(*_gather(self.surfaces))
 
 
 class LocalMap(Stateful, ABC):

@@ -164,7 +164,8 @@ def move_blocks(from_keys: Keys, from_rows: Rows, bits: int, table_keys: Keys, t
         if from_keys[n] != EMPTY:
             slot = _find_block(from_keys[n], bits, table_keys)
             table_keys[slot] = from_keys[n]
-            table_rows[slot] = from_rows[n]
+            for place in range(_CELLS):
+                table_rows[slot, place] = from_rows[n, place]
 
 
 @compiled_part

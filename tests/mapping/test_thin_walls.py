@@ -42,7 +42,9 @@ def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float
 def first_matches(local_map: SurfelMap, points: FloatArray, side: int) -> Correspondences:
     matcher = local_map.matcher(Sweep(points))
     matcher.match(points, make_transform(np.eye(3), SENSORS[side]))
-    return matcher.correspondences(1)
+    found = matcher.correspondences()
+    _, first = np.unique(found.index, return_index=True)
+    return Correspondences(*(column[first] for column in vars(found).values()))
 
 
 def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int) -> tuple[float, FloatArray]:
