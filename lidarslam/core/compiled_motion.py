@@ -25,8 +25,18 @@ def write_product(T_a_b: FloatArray, T_b_c: FloatArray, T_a_c: FloatArray) -> No
 @compiled_part
 def orthonormalize_nearly(T: FloatArray) -> None:
     """Take rounding off the rotation of a nearly rigid transform: a Newton step towards the nearest rotation."""
-    R = np.ascontiguousarray(T[:3, :3])
-    T[:3, :3] = 1.5 * R - 0.5 * R @ R.T @ R
+    # Loops: each expression of arrays takes a second to compile.
+    products, rotation = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            products[i, j], rotation[i, j] = 0.0, T[i, j]
+            for k in range(3):
+                products[i, j] += T[k, i] * T[k, j]
+    for i in range(3):
+        for j in range(3):
+            T[i, j] = 1.5 * rotation[i, j]
+            for k in range(3):
+                T[i, j] -= 0.5 * rotation[i, k] * products[k, j]
 
 
 @compiled_part

@@ -87,9 +87,16 @@ def open_directions(constraint: FloatArray, tilt: float, weight: float, lever_m:
     """Directions (D, 6) as of `find_degeneracy`, from the weighted sums of `J^T J` (6, 6) and of the squared tilt."""
     if weight <= 0.0:
         return np.eye(6)
-    scaled = constraint / weight
-    scaled[:3] /= lever_m
-    scaled[:, :3] /= lever_m
+    scaled, count = np.empty((6, 6)), 0
+    for i in range(6):
+        for j in range(6):
+            levers = (lever_m if i < 3 else 1.0) * (lever_m if j < 3 else 1.0)
+            scaled[i, j] = constraint[i, j] / weight / levers
     shares, axes = np.linalg.eigh(scaled)
-    count = np.count_nonzero(shares < max(_LEAST_SHARE, _NOISE_FACTOR * (tilt / weight)))
-    return np.ascontiguousarray(axes[:, :count].T)
+    while count < 6 and shares[count] < max(_LEAST_SHARE, _NOISE_FACTOR * (tilt / weight)):
+        count += 1
+    directions = np.empty((count, 6))
+    for d in range(count):
+        for i in range(6):
+            directions[d, i] = axes[i, d]
+    return directions

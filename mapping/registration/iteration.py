@@ -72,19 +72,26 @@ def iterate(
     write_inverse(T_predicted, change)
     write_product(change, T_world_lidar, moved)
     write_log(moved, error[:6])
-    error[6:] = velocity - velocity_predicted
+    for i in range(6):
+        error[6 + i] = velocity[i] - velocity_predicted[i]
     prior = heavy_tailed(information, error)
     scale = max(_SCALE_PER_MEDIAN * _median_residual_m(linearised), _LEAST_SCALE * cell_m)
     weight, tilt, squared_time = _accumulate(linearised, scale * scale, _GATE * cell_m, unknown, total)
     lever_m = math.sqrt(squared_range / count)
     directions = open_directions(total[:6, :6], tilt, weight, lever_m)
-    hessian, gradient = total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION
+    hessian, gradient, known = np.empty((12, 12)), np.empty(12), prior.copy()
+    for i in range(12):
+        gradient[i] = total[i, 12] / _CORRELATION
+        for j in range(12):
+            hessian[i, j] = total[i, j] / _CORRELATION
     # Along directions that are not constrained, the prediction is held, and the correspondences do not count.
-    known, observed = prior.copy(), hessian
+    observed = hessian
     if len(directions):
-        held = _DEGENERATE_INFORMATION * _projector(directions, lever_m)
-        known[:6, :6] += held
-        known[6:, 6:] += squared_time * held
+        for i in range(6):
+            for j in range(6):
+                held = _DEGENERATE_INFORMATION * _along(directions, lever_m, i, j)
+                known[i, j] += held
+                known[6 + i, 6 + j] += squared_time * held
         onto = onto_observed(directions, lever_m)
         observed = onto.T @ hessian @ onto
     step = np.asarray(np.linalg.solve(hessian + known, -(known @ error) - gradient), dtype=np.float64)
@@ -92,7 +99,8 @@ def iterate(
     write_product(T_world_lidar, change, moved)
     orthonormalize_nearly(moved)
     covariance = np.ascontiguousarray(np.linalg.inv(observed + prior))
-    rotation, translation_m = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
+    rotation = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+    translation_m = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
     return Iteration(
         moved, velocity + step[6:], step, rotation, translation_m, error, hessian, gradient, prior, covariance,
         directions, lever_m,
@@ -114,12 +122,19 @@ def step_by(
     squared_scale = (_SCALE_PER_MEDIAN * _median_residual_m(linearised)) ** 2 + RANGE_NOISE_M**2
     _, tilt, _ = _accumulate(linearised, squared_scale, np.inf, np.zeros((12, 12)), total)
     lever_m = math.sqrt(squared_range / linearised.shape[1])
-    total[:3] /= lever_m
-    total[:, :3] /= lever_m
-    hessian = np.ascontiguousarray(total[:6, :6])
-    if np.linalg.eigvalsh(hessian)[0] < least * tilt:
+    hessian, gradient = np.empty((6, 6)), np.empty(6)
+    for i in range(6):
+        own = lever_m if i < 3 else 1.0
+        gradient[i] = total[i, 12] / own
+        for j in range(6):
+            hessian[i, j] = total[i, j] / own / (lever_m if j < 3 else 1.0)
+    values, _ = np.linalg.eigh(hessian)
+    if values[0] < least * tilt:
         return 0.0
-    return float(np.linalg.norm(np.linalg.solve(hessian, np.ascontiguousarray(total[:6, 12]))))
+    step, squared = np.linalg.solve(hessian, gradient), 0.0
+    for i in range(6):
+        squared += step[i] ** 2
+    return math.sqrt(squared)
 
 
 @compiled
@@ -130,20 +145,23 @@ def heavy_tailed(information: FloatArray, error: FloatArray) -> FloatArray:
 
 
 @compiled_part
-def _projector(directions: FloatArray, lever_m: float) -> FloatArray:
-    """(6, 6) quadratic form: the squared length, metres, of the part of a motion along directions (D, 6)."""
-    rows = directions.copy()
-    rows[:, :3] *= lever_m
-    return np.asarray(rows.T @ rows, dtype=np.float64)
+def _along(directions: FloatArray, lever_m: float, i: int, j: int) -> float:
+    """An entry of `Degeneracy.projector` of directions (D, 6)."""
+    total = 0.0
+    for d in range(len(directions)):
+        total += directions[d, i] * directions[d, j]
+    return total * (lever_m if i < 3 else 1.0) * (lever_m if j < 3 else 1.0)
 
 
 @compiled
 def onto_observed(directions: FloatArray, lever_m: float) -> FloatArray:
     """(12, 12) projector of pose and velocity onto the directions other than (D, 6)."""
-    onto, along, rows = np.zeros((12, 12)), directions.copy(), directions.copy()
-    along[:, :3] /= lever_m
-    rows[:, :3] *= lever_m
-    onto[:6, :6] = onto[6:, 6:] = np.eye(6) - along.T @ rows
+    onto = np.eye(12)
+    for i in range(6):
+        for j in range(6):
+            part = _along(directions, lever_m, i, j) / (lever_m * lever_m if i < 3 else 1.0)
+            onto[i, j] -= part
+            onto[6 + i, 6 + j] -= part
     return onto
 
 
@@ -231,7 +249,8 @@ def _accumulate(
 @compiled_part
 def _propagate(block: FloatArray, unknown: FloatArray, variance: FloatArray) -> None:
     """Write the variances (M,) of residuals (10, M) by the covariance (12, 12) of pose and velocity."""
-    variance[:] = 0.0
+    for m in range(block.shape[1]):
+        variance[m] = 0.0
     for i in range(6):
         for j in range(i, 6):
             # Entries off the diagonal come twice; a processor takes several residuals at once.
