@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarslam.core.compiled import compiled, compiled_part
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
@@ -109,39 +109,42 @@ def measure_fit(
     """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4), with the matcher of a pose nearby."""
     matcher, world = matcher or local_map.matcher(Sweep(points)), transform_points(T_world_lidar, points)
     matcher.match(world, T_world_lidar)
-    measures = _measure(world, np.ascontiguousarray(T_world_lidar[:3, 3]), matcher.surfaces, local_map.cell_m)
-    if not measures.matched:
+    sums = _sum_up(world, np.ascontiguousarray(T_world_lidar[:3, 3]), matcher.surfaces, local_map.cell_m)
+    matched = len(sums.distances_m)
+    if not matched:
         return NO_FIT
+    ratios = (sums.inliers / np.maximum(sums.facing, 1.0))[sums.facing >= _FEWEST_FACING]
+    values, axes = np.linalg.eigh(sums.supported)
+    support, least = directional_support(sums.information, sums.supported, sums.share)
     return Fit(
-        matched=measures.matched,
-        overlap=measures.matched / len(points),
-        residual_m=measures.residual_m,
-        inlier_ratio=measures.inlier_ratio,
-        support=measures.support,
-        evidence=measures.evidence,
-        weakest=tuple(measures.weakest.tolist()),
-        unsupported=tuple(measures.unsupported.tolist()) if measures.support < _DEGRADED_SUPPORT else None,
+        matched=matched,
+        overlap=matched / len(points),
+        residual_m=float(np.median(sums.distances_m)),
+        inlier_ratio=float(ratios.min() if len(ratios) else sums.inliers.sum() / matched),
+        support=support,
+        evidence=float(values[0]) / max(sums.noise, 1e-12),
+        weakest=tuple(axes[:, 0].tolist()),
+        unsupported=tuple(least.tolist()) if support < _DEGRADED_SUPPORT else None,
     )
 
 
-class _Measures(NamedTuple):
-    """Of the matched points of a scan, each with its first residual; named as those of `Fit`."""
+class _Sums(NamedTuple):
+    """Sums over the matched points of a scan, each with its first residual."""
 
-    matched: int
-    residual_m: float
-    inlier_ratio: float
-    support: float
-    evidence: float
-    weakest: FloatArray  # (3,)
-    unsupported: FloatArray  # (3,) however large the support is
+    distances_m: FloatArray  # (M,) from the surfaces
+    facing: FloatArray  # (3,) numbers of points whose surface faces each axis of the world
+    inliers: FloatArray  # (3,) and of those that are inliers
+    # information, supported, share: as of `translation_information`, thick surfaces counting less
+    information: FloatArray
+    supported: FloatArray
+    share: float
+    noise: float  # information that the noise of the inliers' normals feigns
 
 
 @compiled
-def _measure(world: FloatArray, sensor: FloatArray, surfaces: Surfaces, cell_m: float) -> _Measures:
-    """The fit of points (N, 3) of the world, seen from (3,)."""
+def _sum_up(world: FloatArray, sensor: FloatArray, surfaces: Surfaces, cell_m: float) -> _Sums:
+    """The sums for points (N, 3) of the world, seen from (3,)."""
     matched, m, noise = int(np.count_nonzero(surfaces.counts)), 0, 0.0
-    if matched == 0:
-        return _Measures(0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(3))
     distances_m, normals = np.empty(matched), np.empty((matched, 3))
     distances, weights = np.empty(matched), np.empty(matched)
     facing, inliers = np.zeros(3), np.zeros(3)
@@ -164,31 +167,21 @@ def _measure(world: FloatArray, sensor: FloatArray, surfaces: Surfaces, cell_m: 
         weights[m] = 1.0 / (1.0 + (thickness_m / RANGE_NOISE_M) ** 2)
         noise += weights[m] / (1.0 + distances[m] ** 2) * surfaces.tilt[n, 0] ** 2
         m += 1
-    ratio, worst = inliers.sum() / matched, np.inf
-    for axis in range(3):
-        if facing[axis] >= _FEWEST_FACING:
-            worst = min(worst, inliers[axis] / facing[axis])
-    information, supported, share = translation_information(normals, distances, weights)
-    values, axes = np.linalg.eigh(supported)
-    support, unsupported = directional_support(information, supported, share)
-    evidence, weakest = values[0] / max(noise, 1e-12), axes[:, 0].copy()
-    ratio = worst if worst < np.inf else ratio
-    return _Measures(matched, np.median(distances_m), ratio, support, evidence, weakest, unsupported)
+    return _Sums(distances_m, facing, inliers, *translation_information(normals, distances, weights), noise)
 
 
-@compiled_part
 def directional_support(information: FloatArray, supported: FloatArray, share: float) -> tuple[float, FloatArray]:
     """The least inlier ratio over all directions (3,) of translation, points weighted by their constraint on it.
 
     The smallest generalised eigenvalue of the sums (3, 3) of `translation_information`, whose mean weight is the share.
     """
-    ridge = _RIDGE * np.trace(information) * np.eye(3)
+    ridge = _RIDGE * float(np.trace(information)) * np.eye(3)
     # The ridge is supported as well as the whole.
     root = np.linalg.cholesky(information + ridge)
     half = np.linalg.solve(root, supported + share * ridge)
     values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
     direction = np.linalg.solve(root.T, vectors[:, 0])
-    return values[0], direction / np.linalg.norm(direction)
+    return float(values[0]), np.asarray(direction / np.linalg.norm(direction))
 
 
 @compiled

@@ -6,7 +6,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
@@ -122,7 +121,6 @@ def street_normals(rng: np.random.Generator, along: int) -> FloatArray:
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
-@compiled
 def support_of(normals: FloatArray, distances: FloatArray) -> tuple[float, FloatArray]:
     return directional_support(*translation_information(normals, distances, np.ones(len(distances))))
 
