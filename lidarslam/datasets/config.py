@@ -43,6 +43,11 @@ class ReaderConfig(Settings):
         description="where the recorded z axis points: upright, upside-down, left, right, forward, backward, camera, or"
         " roll, pitch, yaw of the recorded axes in degrees; auto: seen from the ground",
     )
+    carrier: Literal["remove", "keep"] = Field(
+        "remove",
+        description="surfaces that stay at one place in the sensor's frame while the scene passes by: remove them where"
+        " they are certain, or keep them",
+    )
     elevation_correction_deg: Annotated[float, Field(ge=-5.0, le=5.0)] | Literal["auto"] | None = Field(
         None,
         description="by how much all points are raised; null: 0.205 for KITTI, else 0; auto: that, and what `run` finds"

@@ -16,6 +16,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import fibonacci_lattice, image_axes
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.carrier import Carrier, carrier_in, sampled
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording, RecordingInfo
@@ -143,16 +144,23 @@ UPRIGHT = Guess()
 class MountedRecording:
     """A recording whose LiDAR frame is turned to x forward, z up: scans, corrected too, ground truth and extrinsics.
 
-    A mounting `auto` is guessed from the first scans, when it is needed.
+    A mounting `auto` is guessed from the first scans, and the carrier found, when they are needed.
     """
 
     def __init__(
-        self, recorded: Recording, mounting: Mounting, raised_deg: float = 0.0, time_scale: float = 1.0
+        self,
+        recorded: Recording,
+        mounting: Mounting,
+        raised_deg: float = 0.0,
+        time_scale: float = 1.0,
+        *,
+        remove_carrier: bool = False,
     ) -> None:
         self.recorded = recorded
         self.raised_deg = raised_deg
         self._time_scale = time_scale
         self._mounting = mounting
+        self._remove_carrier = remove_carrier
 
     @cached_property
     def _guess(self) -> Guess:
@@ -162,6 +170,15 @@ class MountedRecording:
             return guess_mounting(scan.points for scan in self.recorded.scans(step=_STEP, faults=Faults()))
         except InputError:  # raised again when the scans are read
             return UPRIGHT
+
+    @cached_property
+    def _carrier(self) -> Carrier | None:
+        if not self._remove_carrier:
+            return None
+        try:
+            return carrier_in(self._upright(scan).points for scan in sampled(self.recorded))
+        except InputError:  # raised again when the scans are read
+            return None
 
     @cached_property
     def T_upright_recorded(self) -> FloatArray:
@@ -200,16 +217,17 @@ class MountedRecording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Of the recording, and of a guess."""
-        warning = self._guess.warning
-        return (*self.recorded.warnings, *(() if warning is None else (warning,)))
+        """Of the recording, of a guess, and of a carrier."""
+        found = self._guess.warning, None if self._carrier is None else self._carrier.warning
+        return (*self.recorded.warnings, *(warning for warning in found if warning is not None))
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
     ) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)`, in upright axes."""
-        _ = self.T_upright_recorded  # guessed before the first scan: two passes over one file may not alternate
-        return map(self._upright, self.recorded.scans(start, stop, step, faults))
+        """The scans with the indices of `range(start, stop, step)`, in upright axes, without the carrier."""
+        carrier = self._carrier  # found before the first scan: two passes over one file may not alternate
+        scans = map(self._upright, self.recorded.scans(start, stop, step, faults))
+        return scans if carrier is None else map(carrier.remove, scans)
 
     def _upright(self, scan: Scan) -> Scan:
         return corrected(scan, self.T_upright_recorded, self.raised_deg, self._time_scale)
@@ -225,6 +243,8 @@ class MountedRecording:
             notes.append(
                 f"Every point is raised by {self.raised_deg:g} degrees of elevation, before every method alike."
             )
+        if self._carrier is not None:
+            notes.append(f"{self._carrier.warning[0].upper()}{self._carrier.warning[1:]}.")
         return replace(info, first=self._upright(info.first), notes=(*info.notes, *notes))
 
 

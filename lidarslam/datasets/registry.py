@@ -184,7 +184,7 @@ def _reader(name: str) -> Reader:
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
-    """Open a recording of whole sweeps, in upright axes, elevations corrected; they are read later, one at a time."""
+    """Open a recording of whole sweeps, in upright axes, elevations corrected, without the carrier; read one at a time."""
     config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
     reader = _reader(name)
@@ -196,9 +196,10 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     recording = cast(Recording, opens(source, config))
     time_scale = 1.0 if isinstance(recording, CloudRecording) else config.time_scale
     raised_deg = config.raised_deg(reader.elevation_deg)
-    if config.mounting == "upright" and not raised_deg and time_scale == 1.0:
+    remove_carrier = config.carrier == "remove"
+    if config.mounting == "upright" and not raised_deg and time_scale == 1.0 and not remove_carrier:
         return recording
-    return MountedRecording(recording, config.mounting, raised_deg, time_scale)
+    return MountedRecording(recording, config.mounting, raised_deg, time_scale, remove_carrier=remove_carrier)
 
 
 def absent(source: Path) -> str:
