@@ -1,9 +1,10 @@
 """Smoothing of the first scans: their motions by registration backwards in time, to the map of the scans after them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import reduce
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -42,36 +43,45 @@ _VELOCITIES = [np.zeros(3)] + [
 ]
 # Factor by which scans must fit better when they are tracked from rest.
 _BETTER = 1.05
+# Places this far apart, cells, are different ones.
+_APART_CELLS = 2.0
 # Standard deviations of a smoothed motion, rotation first.
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
+
+
+class SmoothedStart(NamedTuple):
+    """What the first scans show beforehand."""
+
+    motions: dict[float, Prior] = {}  # noqa: RUF012 - each since the scan before, by stamp; where needed
+    velocity: FloatArray | None = None  # (6,) after the first scan, rotation first; None where it is not certain
 
 
 class _Tracking:
     """A mapper, with an IMU where there is one."""
 
     def __init__(self, config: MappingConfig, inertial: "Inertial | None") -> None:
-        self._mapper, self._inertial = Mapper(config), inertial
+        self._mapper, self.inertial = Mapper(config), inertial
         self._sampled: list[SampledScan] = []  # the first two
         self.results: list[MappedScan] = []
         self.has_rings = True
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan."""
-        if self._inertial is not None:
-            prior = self._inertial.prior(scan, prior)
+        if self.inertial is not None:
+            prior = self.inertial.prior(scan, prior)
         sampled = self._mapper.sample(scan)
         self.has_rings &= sampled.has_rings
         self._sampled = [*self._sampled, sampled][:2]
         mapped = self._mapper.process(sampled, prior)
-        if self._inertial is not None:
-            self._inertial.update(scan, mapped)
+        if self.inertial is not None:
+            self.inertial.update(scan, mapped)
         self.results.append(mapped)
         return mapped
 
     @property
     def is_sparse(self) -> bool:
         """Whether sparse strokes alone measure the motion: they fit facades at any speed."""
-        return self._inertial is None and not self.has_rings
+        return self.inertial is None and not self.has_rings
 
     @property
     def is_bent(self) -> bool:
@@ -84,10 +94,8 @@ class _Tracking:
         return bool(np.linalg.norm(turned) * first.range_m > _LEAST_BEND_CELLS * first.cell_m)
 
 
-def smoothed_start(
-    scans: Iterable[Scan], config: MappingConfig, inertial: "Inertial | None" = None
-) -> dict[float, Prior]:
-    """Motions of the first scans, each since the previous one, by stamp; empty where registration in order suffices.
+def smoothed_start(scans: Iterable[Scan], config: MappingConfig, inertial: "Inertial | None" = None) -> SmoothedStart:
+    """Motions of the first scans, each since the previous one; none where registration in order suffices.
 
     The map of a single sweep is thin, and errors along directions that it leaves open stay in the map. So the first
     scans are registered in order; from the last of them back, with the motions of the latest known, to a new map;
@@ -95,28 +103,40 @@ def smoothed_start(
     to the second would bend it. None is known where that loses track, or fits worse than in order, as on stairs, unless
     the motions in order are hardly constrained; nor where the sensor rests by its IMU. The IMU's samples are used in
     both directions of time; where scans refute the rest, its attribute `may_rest` ends.
+
+    A row of houses fits at a displacement of one house as well as at rest. Where the second scan fits at several
+    velocities, the first scans are tracked from each, and the later ones decide.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
-    own = None if inertial is None else inertial.anew()
-    ordered, taken, needed, least = _Tracking(unlimited, own), list[Scan](), False, np.inf
+    ordered = _Tracking(unlimited, None if inertial is None else inertial.anew())
+    taken, needed, least = list[Scan](), False, np.inf
+    velocity: FloatArray | None = None
     for scan in scans:
         mapped = ordered.process(scan, Prior())
         taken.append(scan)
         needed |= not ordered.has_rings or mapped.status is not Status.OK
-        if inertial is not None and own is not None and len(taken) == TRIED:
-            if own.is_at_rest:
-                return {}
-            inertial.may_rest, is_long = own.may_rest, taken[1].stamp - taken[0].stamp > _LONG_S
-            are_constrained = all(one.fit is None or one.fit.is_constrained for one in ordered.results)
-            if is_long or not (own.may_rest and are_constrained):
-                ordered = _likeliest(taken, unlimited, inertial, _quality if is_long else _constraint)
-                needed, least = True, _LEAST_CONSTRAINT
+        if len(taken) == TRIED:
+            chosen = _likeliest(taken, ordered, unlimited, inertial)
+            if chosen is not ordered:
+                ordered, needed, least = chosen, True, np.inf if inertial is None else _LEAST_CONSTRAINT
+            if all(one.status is Status.OK for one in ordered.results[1:]):
+                velocity = body_velocity(_motions(ordered.results[1:3])[0], taken[2].stamp - taken[1].stamp)
+            if ordered.inertial is not None and ordered.inertial.is_at_rest:
+                return SmoothedStart(velocity=velocity)
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not (needed or ordered.is_bent)):
             break
     if len(taken) < SHOWING or not (needed or ordered.is_bent):
-        return {}
+        return SmoothedStart(velocity=velocity)
+    return SmoothedStart(_smoothed(taken, ordered, unlimited, inertial, needed, least), velocity)
+
+
+def _smoothed(
+    taken: list[Scan], ordered: _Tracking, config: MappingConfig, inertial: "Inertial | None", needed: bool,
+    least: float,
+) -> dict[float, Prior]:  # fmt: skip
+    """The motions backwards in time, or the first turn rate alone unless they are needed; empty where no better."""
     if ordered.is_sparse:
-        slow = _tracked_from(np.zeros(3), taken, unlimited, None)
+        slow = _tracked_from(np.zeros(3), taken, config, None)
         ordered = slow if _quality(slow.results[1:]) > _BETTER * _quality(ordered.results[1:]) else ordered
     forwards = ordered.results
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
@@ -124,7 +144,7 @@ def smoothed_start(
     if len(known) < _FEWEST_KNOWN or not is_plausible:
         return {}
     end_s = taken[-1].stamp
-    reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))
+    reverse = _Tracking(config, None if inertial is None else inertial.reversed(end_s))
     backwards = _backwards(taken, _motions(known), reverse)
     earlier = len(taken) - len(known)  # scans; the first of them has nothing to fit
     again = backwards[len(known) : -1]
@@ -158,15 +178,54 @@ def _constrains_better(again: list[MappedScan], in_order: list[MappedScan]) -> b
     return constraint < 1.0 and _constraint(again) > _MORE_CONSTRAINED * constraint
 
 
-def _likeliest(
-    scans: list[Scan], config: MappingConfig, inertial: "Inertial", score: Callable[[list[MappedScan]], float]
-) -> _Tracking:
-    """The first scans, tracked from the velocity that scores best.
-
-    The IMU's measurements relate it to the motion between all scans, and so the later ones decide.
-    """
+def _likeliest(scans: list[Scan], ordered: _Tracking, config: MappingConfig, inertial: "Inertial | None") -> _Tracking:
+    """The first scans, tracked in order, or from another velocity where that is likelier."""
+    best = reduce(_better, _from_elsewhere(scans, ordered, config, inertial), ordered)
+    if inertial is None or ordered.inertial is None:
+        return best
+    if best is not ordered:
+        inertial.may_rest = False
+        return best
+    if ordered.inertial.is_at_rest:
+        return ordered
+    inertial.may_rest, is_long = ordered.inertial.may_rest, scans[1].stamp - scans[0].stamp > _LONG_S
+    are_constrained = all(one.fit is None or one.fit.is_constrained for one in ordered.results)
+    if not is_long and inertial.may_rest and are_constrained:
+        return ordered
+    # The IMU's measurements relate the velocity to the motion between all scans, and so the later ones decide.
+    score = _quality if is_long else _constraint
     tracked = (_tracked_from(velocity, scans, config, inertial.anew()) for velocity in _VELOCITIES)
     return max(tracked, key=lambda tracking: score(tracking.results))
+
+
+def _from_elsewhere(
+    scans: list[Scan], ordered: _Tracking, config: MappingConfig, inertial: "Inertial | None"
+) -> Iterator[_Tracking]:
+    """The first scans, tracked from the other velocities at which the second one fits."""
+    first_two = ordered
+    if inertial is not None:  # which may take the sensor to be at rest
+        first_two = _Tracking(config, None)
+        for scan in scans[:2]:
+            first_two.process(scan, Prior())
+    first, second = first_two.results[:2]
+    interval_s, tried = scans[1].stamp - scans[0].stamp, [ordered.results[1].state.T_world_lidar[:3, 3]]
+    apart_m = _APART_CELLS * second.cells_m[0] if second.cells_m else np.inf
+    for T_world_lidar in second.elsewhere:
+        if min(np.linalg.norm(T_world_lidar[:3, 3] - position) for position in tried) > apart_m:
+            tried.append(T_world_lidar[:3, 3])
+            own = None if inertial is None else inertial.anew()
+            if own is not None:
+                own.may_rest = False
+            moved = inverse(first.state.T_world_lidar) @ T_world_lidar
+            yield _tracked_from(moved[:3, 3] / interval_s, scans, config, own)
+
+
+def _better(one: _Tracking, other: _Tracking) -> _Tracking:
+    """The other where its scans fit clearly better, or better and with more constraint."""
+    results, others = one.results[1:], other.results[1:]
+    ratio = _quality(others) / max(_quality(results), 1e-9)
+    is_better = ratio > _BETTER or (ratio > 1.0 and _constraint(others) > _MORE_CONSTRAINED * _constraint(results))
+    return other if is_better else one
 
 
 def _tracked_from(

@@ -62,6 +62,14 @@ class SkippingOdometry(Odometry, Protocol):
         """Take a scan with points whose motion is not asked for; the next motion is relative to this scan."""
 
 
+@runtime_checkable
+class ExpectingOdometry(Protocol):
+    """An odometry that chooses among motions, of which one may be known otherwise."""
+
+    def expect(self, velocity: FloatArray) -> None:
+        """Take the velocity (6,) of the first motion, rotation first, as another candidate, before the first scan."""
+
+
 class StatefulOdometry(Stateful):
     """The part of an `Odometry` that saves its state and holds no resources."""
 

@@ -4,7 +4,7 @@ A vehicle's side, a robot's body or a mast takes part of the view. Where that pa
 finds the sensor at rest, and all scans fit.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Self
@@ -52,8 +52,8 @@ class Carrier:
     def warning(self) -> str:
         """What is left out."""
         return (
-            f"{100.0 * self.share:.0f} % of the surfaces in view stay at one place in the sensor's frame while the scene"
-            " passes by: taken as those of its carrier, and left out (reader.carrier=keep keeps them)"
+            f"{100.0 * self.share:.0f} % of the surfaces in view stay at one place in the sensor's frame while the"
+            " scene passes by: taken as those of its carrier, and left out (reader.carrier=keep keeps them)"
         )
 
     def remove(self, scan: Scan) -> Scan:
@@ -132,16 +132,18 @@ class Patches:
 
     def recur_in(self, points: FloatArray) -> NDArray[np.bool_]:
         """Which patches (M,) are at the same place in another scan (N, 3)."""
-        if len(points) < _IN_PATCH:
+        if len(points) < 3 * _IN_PATCH:
             return np.zeros(len(self.centres), dtype=bool)
         near_plane, near_point, around = (a + b * self._ranges for a, b in (_NEAR_PLANE, _NEAR_POINT, _AROUND))
-        distances, found = cKDTree(points).query(self.centres, k=3 * _IN_PATCH)
-        is_near = np.asarray(distances) < around[:, None]
-        found = np.where(is_near, found, 0)
-        off = np.einsum("nki,ni->nk", points[found] - self.centres[:, None], self.normals)
-        middle = np.abs(np.ma.median(np.ma.array(off, mask=~is_near), axis=1).filled(np.inf))
-        in_plane = (is_near.sum(axis=1) >= _IN_PATCH) & (middle < near_plane)
-        return np.asarray(np.where(self.is_flat, in_plane, distances[:, 0] < near_point), dtype=bool)
+        distances, found = (np.asarray(part) for part in cKDTree(points).query(self.centres, k=3 * _IN_PATCH))
+        is_near = distances < around[:, None]
+        off = np.einsum("nki,ni->nk", points[np.where(is_near, found, 0)] - self.centres[:, None], self.normals)
+        in_patch = is_near.sum(axis=1)
+        # Those that are not near come last; the lower of the two in the middle of an even number.
+        ordered = np.sort(np.where(is_near, off, np.inf), axis=1)
+        middle = np.abs(ordered[np.arange(len(off)), np.maximum(in_patch - 1, 0) // 2])
+        in_plane = (in_patch >= _IN_PATCH) & (middle < near_plane)
+        return np.asarray(np.where(self.is_flat, in_plane, distances[:, 0] < near_point))
 
     def pass_by(self, seen: NDArray[np.bool_], fixed: NDArray[np.bool_]) -> bool:
         """Whether most of the others recur in few of the later half of the scans (S, M), as the sensor moves."""
@@ -163,17 +165,16 @@ class Patches:
         return np.asarray(self._is_level[flat[cKDTree(self.centres[flat]).query(points)[1]]])
 
 
-def _taken(patches: Patches, scans: Iterable[FloatArray]) -> NDArray[np.bool_]:
+def _taken(patches: Patches, scans: Sequence[FloatArray]) -> NDArray[np.bool_]:
     """The voxels, with their neighbours, in which nearly all scans have points, but for those of level surfaces."""
     counts = np.zeros((_GRID,) * 3, dtype=np.uint8)
-    number = 0
-    for number, points in enumerate(scans, 1):
+    for points in scans:
         near = points[np.abs(points).max(axis=1) < _REACH_M]
         occupied = np.zeros_like(counts, dtype=bool)
         occupied[tuple(((near + _REACH_M) / _VOXEL_M).astype(np.intp).T)] = True
         counts += occupied
-    index = np.argwhere(counts >= _ALWAYS * number)
-    index = index[~patches.is_level_at((index + 0.5) * _VOXEL_M - _REACH_M)]
+    index = np.argwhere(counts >= _ALWAYS * len(scans))
+    index = index[~patches.is_level_at((index + 0.5).astype(np.float64) * _VOXEL_M - _REACH_M)]
     taken = np.zeros_like(counts, dtype=bool)
     taken[tuple(index.T)] = True
     return np.asarray(binary_dilation(taken, np.ones((3, 3, 3), dtype=bool)))

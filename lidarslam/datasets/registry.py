@@ -184,7 +184,7 @@ def _reader(name: str) -> Reader:
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
-    """Open a recording of whole sweeps, in upright axes, elevations corrected, without the carrier; read one at a time."""
+    """Open a recording of whole sweeps, in upright axes, corrected, without the carrier; it is read later."""
     config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
     reader = _reader(name)

@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, lo
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import TRANSFORM, Shape, State, Stateful
 from lidarslam.core.tracking import Status
-from lidarslam.odometry.interface import Motion, Odometry, SkippingOdometry
+from lidarslam.odometry.interface import ExpectingOdometry, Motion, Odometry, SkippingOdometry
 from lidarslam.pipeline.estimates import ScanEstimate
 
 # Scans in a row that have to be ok before one does without the odometry.
@@ -65,6 +65,11 @@ class OdometryGate(Stateful):
             return self._odometry.estimate(scan)
         self._odometry.skip(scan)
         return Motion(np.eye(4), 0, "not needed", is_asked=False)
+
+    def expect(self, velocity: FloatArray) -> None:
+        """See `ExpectingOdometry`."""
+        if isinstance(self._odometry, ExpectingOdometry):
+            self._odometry.expect(velocity)
 
     def wait(self) -> None:
         """Wait for the results that decide about the next scan, so that `estimate` is timed without the wait."""

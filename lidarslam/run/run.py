@@ -25,10 +25,9 @@ from lidarslam.mapping.elevation import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import DrawnMap
 from lidarslam.mapping.global_map.voxels import TileStore
 from lidarslam.mapping.loops.closure import GivenLoops
-from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
-from lidarslam.mapping.smoothed_start import SHOWING, smoothed_start
-from lidarslam.odometry.interface import Odometry
+from lidarslam.mapping.smoothed_start import SHOWING, SmoothedStart, smoothed_start
+from lidarslam.odometry.interface import ExpectingOdometry, Odometry
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
@@ -300,7 +299,10 @@ def track(
     if mapper is not None:
         localiser = ScanToMap(mapper, inertial)
     else:
-        localiser = make_localiser(config, inertial, estimator, _start(config, recording, chosen, inertial))
+        start = _start(config, recording, chosen, inertial)
+        if start.velocity is not None and isinstance(odometry, ExpectingOdometry):
+            odometry.expect(start.velocity)
+        localiser = make_localiser(config, inertial, estimator, start.motions)
     store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
@@ -328,17 +330,17 @@ def track(
     return Tracked(tracked, pipeline.map.global_map, recording, truth, elevation)
 
 
-def _start(config: Config, recording: Recording, chosen: range, inertial: "Inertial | None") -> dict[float, Prior]:
+def _start(config: Config, recording: Recording, chosen: range, inertial: "Inertial | None") -> SmoothedStart:
     """The motions of the first scans, where they have to be smoothed."""
     if config.mapping.method not in ("surfels", "loam") or len(chosen) < SHOWING:
-        return {}
+        return SmoothedStart()
     logger.info("the first scans are registered beforehand")
     with suppress(InputError):  # raised again when the scans are read
         scans = take_in(recording, chosen, Faults())
         if inertial is None:
             return smoothed_start(scans, config.mapping)
         return smoothed_start(map(inertial.gyroscope.evened, scans), config.mapping, inertial)
-    return {}
+    return SmoothedStart()
 
 
 def _process(

@@ -53,6 +53,7 @@ class Attempt:
     status: Status  # by the fit
     relocalised: bool = False  # whether it began elsewhere than at the prediction
     rival: FloatArray | None = None  # (3,) from here to another place that fits nearly as well, in the world, metres
+    elsewhere: tuple[FloatArray, ...] = ()  # other poses (4, 4) at which a scan of unknown velocity fits
 
     @property
     def is_reliable(self) -> bool:
@@ -201,6 +202,7 @@ class MappedScan:
     cells_m: CellSizes | None = None  # of a local map
     has_surfels: bool = False  # whether that map is one of surfels
     measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU
+    elsewhere: tuple[FloatArray, ...] = ()  # other poses (4, 4) at which a scan of unknown velocity fits
 
     @property
     def quality(self) -> float:

@@ -177,7 +177,9 @@ class NearSearch:
             is_better = counts and other.quality > _CLEARLY_BETTER * best.quality
             if is_better and not self._is_similar(other, near):
                 best = other
-        return replace(best, rival=best.rival_of(others)) if is_open and best.registration is not None else best
+        if not is_open or best.registration is None:
+            return best
+        return replace(best, rival=best.rival_of(others), elsewhere=tuple(other.T_world_lidar for other in others))
 
     def _displaced(self) -> Steps[list[Attempt]]:
         """Attempts that fit, from displacements since the last scan in every horizontal direction.

@@ -271,6 +271,7 @@ class Tracker(Stateful):
             iterations=registration.iterations,
             added=fits and not jumped and not unconfirmed,
             is_connected=not relocalised,
+            elsewhere=attempt.elsewhere,
             turn_rate=registration.velocity[:3] if is_timed and prior.inertial is None else None,
         )
 

@@ -16,6 +16,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape
 from lidarslam.odometry.alignment.alignment import (
     INFORMATION_PER_M2,
+    Alignment,
     InitialEstimate,
     align,
     align_best,
@@ -23,7 +24,7 @@ from lidarslam.odometry.alignment.alignment import (
     joined_information,
     replaced_along,
 )
-from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepPair
+from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepMotion, SweepPair
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.sweep_images import Imager, ScanImages
 from lidarslam.odometry.interface import Motion, StatefulOdometry
@@ -42,6 +43,9 @@ _HELD_BACK = 0.004
 _UNEVEN_SHARE = 0.05
 # By how many standard deviations a continued motion is less likely than the network's best candidate.
 _SIGMAS_OF_GOING_ON = 1.0
+# By how much more the expected first motion has to explain than the network's. A row of houses fits when it is
+# displaced by one of them, too.
+_CLEARLY_MORE = 0.03
 # Acceleration along degenerate directions, standard deviation: rad/s^2 and m/s^2.
 _ACCELERATION = np.array([2.0] * 3 + [2.0] * 3)
 # Information, of radians or metres, that keeps a motion where it is.
@@ -79,8 +83,10 @@ class LearnedOdometry(StatefulOdometry):
         self._interpolator = StampInterpolator()
         self._last_covariance = None
         self._skipped = None
+        self._expected: FloatArray | None = None  # velocity (6,) before the first motion, in the LiDAR's axes
 
     def _after_restore(self) -> None:
+        self._expected = None
         if self._last is not None:
             shown = self._last.images.network
             self._described = self._search.describe(shown.points, shown.normals, self._last.heading)
@@ -97,6 +103,10 @@ class LearnedOdometry(StatefulOdometry):
         motion = self._estimate(scan, images)
         has_own_axes = np.array_equal(images.R_image_lidar, np.eye(3))
         return motion if has_own_axes else motion.in_axes(images.R_image_lidar.T)
+
+    def expect(self, velocity: FloatArray) -> None:
+        """Take a velocity before the first scan; see `ExpectingOdometry`."""
+        self._expected = velocity
 
     def skip(self, scan: Scan) -> None:
         """Take a scan with points whose motion is not asked for; see `SkippingOdometry`."""
@@ -140,7 +150,7 @@ class LearnedOdometry(StatefulOdometry):
         if previous is not None:
             expected = exp(previous.velocity * interval_s)
             starts.append(InitialEstimate(expected, sigmas=_SIGMAS_OF_GOING_ON))
-        best = align_best(starts, sweeps)
+        best = self._or_expected(align_best(starts, sweeps), sweeps, sweep.images.R_image_lidar)
         degeneracy = find_degeneracy(best.information, best.inliers, sweep.images.alignment)
         if len(degeneracy):
             covariance = candidates[0].covariance
@@ -160,6 +170,16 @@ class LearnedOdometry(StatefulOdometry):
         covariance = np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)), dtype=np.float64)
         motion = self._motion(best.T_prev_curr, covariance, best.velocity_change, last, sweep, best.inliers)
         return replace(motion, degenerate=degeneracy.names)
+
+    def _or_expected(self, best: Alignment, sweeps: SweepPair, R_image_lidar: FloatArray) -> Alignment:
+        """The alignment from the motion that is expected of the first pair, where that explains clearly more."""
+        expected, self._expected = self._expected, None
+        if expected is None or sweeps.last is not None:
+            return best
+        motion = SweepMotion(np.kron(np.eye(2), R_image_lidar) @ expected, np.zeros(6), sweeps.interval_s)
+        start = InitialEstimate(motion.pose_after(sweeps.interval_s), sigmas=_SIGMAS_OF_GOING_ON)
+        other = align(start, replace(sweeps, last=motion))
+        return other if other.explained > best.explained + _CLEARLY_MORE else best
 
     def _motion(
         self, T_prev_curr: FloatArray, covariance: FloatArray, change: FloatArray, last: _Sweep, sweep: _Sweep,
