@@ -78,6 +78,8 @@ def carrier_in(scans: Iterable[FloatArray]) -> Carrier | None:
     """
     few = (points[:: max(1, len(points) // _MOST_READ)] for points in scans)
     patches = Patches.of(next(few, np.empty((0, 3))))
+    if not patches.is_flat.any():
+        return None
     recur: list[NDArray[np.bool_]] = []
     read: list[FloatArray] = []
     for points in islice(few, _MOST_SCANS):

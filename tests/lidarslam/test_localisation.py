@@ -111,7 +111,7 @@ def test_a_robot_that_begins_to_turn_on_the_spot_does_not_bend_its_map(room):
 
     stamps = 0.2 * np.arange(SMOOTHED)
     scans, truth = [room.ring_sweep(turning, stamp) for stamp in stamps], turning(stamps)
-    start = smoothed_start(scans, MappingConfig())
+    start = smoothed_start(scans, MappingConfig()).motions
     assert list(start) == [0.0]
     assert np.rad2deg(start[0.0].turn_rate) == pytest.approx([0.0, 0.0, 100.0], abs=10.0)
     distances_m, angles_deg = errors_of(localise_all(scans, true_motions(truth, 1e-6), 0.2, start), truth)

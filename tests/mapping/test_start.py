@@ -9,7 +9,7 @@ from lidarslam.core.tracking import AXES, Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
+from lidarslam.mapping.smoothed_start import SMOOTHED, SmoothedStart, smoothed_start
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.recorder import Simulation
@@ -40,7 +40,7 @@ def strokes() -> tuple[list[Scan], FloatArray]:
 @pytest.mark.long
 def test_motions_of_a_sensor_without_rings_are_true(strokes):
     scans, truth = strokes
-    smoothed = smoothed_start(scans, MappingConfig())
+    smoothed = smoothed_start(scans, MappingConfig()).motions
     assert list(smoothed) == [scan.stamp for scan in scans[1:SMOOTHED]]
     for motion, T_true in zip(smoothed.values(), truth, strict=False):
         error = inverse(T_true) @ motion.T_prev_curr
@@ -51,20 +51,20 @@ def test_motions_of_a_sensor_without_rings_are_true(strokes):
 @pytest.mark.long
 def test_registration_in_order_suffices_where_a_sweep_makes_a_map():
     scans, _ = walk("os0-64", 40, 10)
-    assert smoothed_start(iter(scans), MappingConfig()) == {}
+    assert smoothed_start(iter(scans), MappingConfig()).motions == {}
 
 
 @pytest.mark.slow  # registers forty scans of a Mid-360
 def test_nothing_is_smoothed_across_another_place(strokes):
     scans, _ = strokes
     elsewhere, _ = walk("mid-360", 40, name="tunnel")
-    assert smoothed_start(scans[:12] + elsewhere[12:], MappingConfig()) == {}
+    assert smoothed_start(scans[:12] + elsewhere[12:], MappingConfig()).motions == {}
 
 
 def test_too_few_scans_are_left_as_they_are(strokes):
     scans, _ = strokes
-    assert smoothed_start(scans[:5], MappingConfig()) == {}
-    assert smoothed_start([], MappingConfig()) == {}
+    assert smoothed_start(scans[:5], MappingConfig()).motions == {}
+    assert smoothed_start([], MappingConfig()) == SmoothedStart()
 
 
 @pytest.mark.long
@@ -111,7 +111,7 @@ def test_a_map_of_planes_through_voxels_grows_for_two_seconds_where_nothing_fits
 def test_a_drone_takes_off(seed):
     simulation = simulated("street", "drone-agile", find_sensor("mid-360"), 30, seed)
     scans = list(simulation.scans())
-    smoothed = smoothed_start(scans, MappingConfig())
+    smoothed = smoothed_start(scans, MappingConfig()).motions
     motions = [smoothed.get(scan.stamp) for scan in scans]
     priors = [NOTHING if one is None else Prior(one.T_prev_curr, one.velocity, one.covariance) for one in motions]
     results = process(Mapper(MappingConfig()), scans, priors)
@@ -127,11 +127,19 @@ def test_between_facades_a_sensor_without_rings_is_not_at_speed():
     """The strokes of its first sweeps fit one another along the houses at 30 m/s, too; it is at rest, then tracked."""
     simulation = simulated("terrace", "tracked", find_sensor("mid-360"), 24, seed=36)
     scans = list(simulation.scans())
-    smoothed = smoothed_start(scans, MappingConfig())
+    smoothed = smoothed_start(scans, MappingConfig()).motions
     results = process(Mapper(MappingConfig()), scans, [smoothed.get(scan.stamp, NOTHING) for scan in scans])
     truth = true_poses(simulation, scans)
     assert errors(poses_of(results), inverse(truth[0]) @ truth)[0].max() < 0.3
     assert Status.LOST not in {result.status for result in results}
+
+
+@pytest.mark.long
+def test_along_equal_houses_the_later_scans_show_the_speed():
+    """At 14 m/s and 5 Hz, in order: each scan fits 2.8 m ahead as well as 0.2 m back, with houses every 3 m."""
+    simulation = simulated("terrace", "car-fast", find_sensor("vlp-16"), 60, seed=235)
+    velocity = smoothed_start(simulation.scans(6, None, 2), MappingConfig()).velocity
+    assert velocity[3:] == pytest.approx([14.1, 0.0, 0.0], abs=0.5)
 
 
 # What an odometry states of itself: a tenth of a degree and a centimetre.

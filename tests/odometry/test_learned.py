@@ -105,6 +105,26 @@ def test_a_bad_guess_gives_way_to_the_last_motion_over_the_time_that_went_by(box
     assert alone[1].failure is not None or errors(alone[1].T_prev_curr, truth)[0] > 10.0
 
 
+def test_the_expected_first_motion_counts_where_it_explains_clearly_more(box_room, monkeypatch):
+    monkeypatch.setattr(search, "STEPS_M", ())
+    scans, far_off, velocity = box_room.scans(3, TWIST), exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0)), np.array(TWIST)
+
+    def expecting(velocity: FloatArray, guess: FloatArray) -> list[Motion]:
+        odometry = LearnedOdometry(Told(guess, moved()), IMAGES)
+        odometry.expect(velocity)
+        return [odometry.estimate(scan) for scan in scans]
+
+    for motion in expecting(velocity, far_off)[1:]:
+        assert_close(motion, moved())
+    wrong = np.array([0.0, 0.0, 15.0, 20.0, 0.0, 0.0])
+    told = estimates(scans, Told(moved()))
+    assert all(
+        np.array_equal(one.T_prev_curr, other.T_prev_curr)
+        for given in (wrong, velocity)
+        for one, other in zip(expecting(given, moved()), told, strict=True)
+    ), "otherwise nothing changes"
+
+
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_motions_are_those_between_stamps(box_room, stamp_at):
     """A turn that grows by 2.3 degrees a sweep, so that half a sweep makes more than a degree."""
