@@ -26,8 +26,9 @@ _FEWEST_SCANS, _MOST_SCANS = 8, 40
 # A patch is the surface around one of these directions, its plane fitted to this many neighbouring directions.
 _APART_RAD, _MOST_PATCHES, _NEIGHBOURS = 0.03, 2000, 20
 _MOST_READ = 40_000
-# A patch is flat when the least variance is this share of the next; level when its normal is within 37 degrees of z.
-_FLAT, _LEVEL = 0.12, 0.8
+# A patch is flat when the least variance is this share of the next, or no more than the noise of ranges, metres; level
+# when its normal is within 37 degrees of z.
+_FLAT, _NOISE_M, _LEVEL = 0.12, 0.02, 0.8
 # A flat patch recurs where the median of the points around it is this near its plane, another one where a point is
 # this near; metres, and share of the range.
 _NEAR_PLANE, _NEAR_POINT, _AROUND, _IN_PATCH = (0.015, 0.002), (0.05, 0.01), (0.1, 0.06), 4
@@ -114,8 +115,8 @@ class Patches:
         neighbours = points[cKDTree(points).query(asked, k=min(_NEIGHBOURS, len(points)))[1]]
         means = neighbours.mean(axis=1)
         offsets = neighbours - means[:, None]
-        variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
-        is_flat = variances[:, 0] < _FLAT * variances[:, 1]
+        variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets) / neighbours.shape[1])
+        is_flat = variances[:, 0] < np.maximum(_FLAT * variances[:, 1], _NOISE_M**2)
         return cls(np.where(is_flat[:, None], means, asked), axes[:, :, 0], is_flat)
 
     @property
@@ -129,7 +130,7 @@ class Patches:
 
     @property
     def may_be_fixed(self) -> NDArray[np.bool_]:
-        """(M,)"""
+        """(M,) which are near, upright surfaces."""
         return np.asarray(self.is_flat & ~self._is_level & (self._ranges < _REACH_M))
 
     def recur_in(self, points: FloatArray) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import fibonacci_lattice, image_axes
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.datasets.carrier import Carrier, carrier_in, sampled
 from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording, RecordingInfo
+
+if TYPE_CHECKING:
+    from lidarslam.datasets.carrier import Carrier
 
 # Roll, pitch, yaw in degrees of the recorded axes: the direction of the recorded z axis, as seen along x.
 _ANGLES_DEG: dict[MountingName, RollPitchYaw] = {
@@ -172,9 +175,11 @@ class MountedRecording:
             return UPRIGHT
 
     @cached_property
-    def _carrier(self) -> Carrier | None:
+    def _carrier(self) -> "Carrier | None":
         if not self._remove_carrier:
             return None
+        from lidarslam.datasets.carrier import carrier_in, sampled  # takes a while to load
+
         try:
             return carrier_in(self._upright(scan).points for scan in sampled(self.recorded))
         except InputError:  # raised again when the scans are read
