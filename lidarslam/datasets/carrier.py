@@ -110,14 +110,14 @@ class Patches:
         """The patches of a scan (N, 3)."""
         ranges = np.linalg.norm(points, axis=1)
         points, ranges = points[ranges > 0.0], ranges[ranges > 0.0]
+        points = points[one_per_cell(np.ascontiguousarray(points / ranges[:, None]), _APART_RAD)]
         if len(points) < _NEIGHBOURS:
             return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, dtype=bool))
-        points = points[one_per_cell(np.ascontiguousarray(points / ranges[:, None]), _APART_RAD)]
         asked = points[:: -(-len(points) // _MOST_PATCHES)]
-        neighbours = points[cKDTree(points).query(asked, k=min(_NEIGHBOURS, len(points)))[1]]
+        neighbours = points[cKDTree(points).query(asked, k=_NEIGHBOURS)[1]]
         means = neighbours.mean(axis=1)
         offsets = neighbours - means[:, None]
-        variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets) / neighbours.shape[1])
+        variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets) / _NEIGHBOURS)
         is_flat = variances[:, 0] < np.maximum(_FLAT * variances[:, 1], _NOISE_M**2)
         return cls(np.where(is_flat[:, None], means, asked), axes[:, :, 0], is_flat)
 
