@@ -1,10 +1,10 @@
 """Smoothing of the first scans: their motions by registration backwards in time, to the map of the scans after them."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,10 +49,11 @@ _APART_CELLS = 2.0
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
 
 
-class SmoothedStart(NamedTuple):
+@dataclass(frozen=True)
+class SmoothedStart:
     """What the first scans show beforehand."""
 
-    motions: dict[float, Prior] = {}  # noqa: RUF012 - each since the scan before, by stamp; where needed
+    motions: dict[float, Prior] = field(default_factory=dict)  # each since the scan before, by stamp; where needed
     velocity: FloatArray | None = None  # (6,) after the first scan, rotation first; None where it is not certain
 
 
@@ -77,6 +78,11 @@ class _Tracking:
             self.inertial.update(scan, mapped)
         self.results.append(mapped)
         return mapped
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether an IMU and the scans show the sensor at rest."""
+        return self.inertial is not None and self.inertial.is_at_rest
 
     @property
     def is_sparse(self) -> bool:
@@ -121,7 +127,7 @@ def smoothed_start(scans: Iterable[Scan], config: MappingConfig, inertial: "Iner
                 ordered, needed, least = chosen, True, np.inf if inertial is None else _LEAST_CONSTRAINT
             if all(one.status is Status.OK for one in ordered.results[1:]):
                 velocity = body_velocity(_motions(ordered.results[1:3])[0], taken[2].stamp - taken[1].stamp)
-            if ordered.inertial is not None and ordered.inertial.is_at_rest:
+            if ordered.is_at_rest:
                 return SmoothedStart(velocity=velocity)
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not (needed or ordered.is_bent)):
             break
@@ -186,7 +192,7 @@ def _likeliest(scans: list[Scan], ordered: _Tracking, config: MappingConfig, ine
     if best is not ordered:
         inertial.may_rest = False
         return best
-    if ordered.inertial.is_at_rest:
+    if ordered.is_at_rest:
         return ordered
     inertial.may_rest, is_long = ordered.inertial.may_rest, scans[1].stamp - scans[0].stamp > _LONG_S
     are_constrained = all(one.fit is None or one.fit.is_constrained for one in ordered.results)

@@ -211,6 +211,13 @@ def interpolate(T_w_a: FloatArray, T_w_b: FloatArray, fraction: ArrayLike) -> Fl
     return T_w_a @ exp(fraction[..., None] * log(inverse(T_w_a) @ T_w_b))
 
 
+def principal_axes(neighbourhoods: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Means (N, 3), eigenvalues (N, 3) of the scatter, ascending, and eigenvectors (N, 3, 3) of points (N, K, 3)."""
+    means = neighbourhoods.mean(axis=1)
+    offsets = neighbourhoods - means[:, None]
+    return means, *np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+
+
 def adjoint(T_a_b: FloatArray) -> FloatArray:
     """(6, 6): takes tangent vectors, rotation first, from frame b to frame a."""
     R, t = T_a_b[:3, :3], T_a_b[:3, 3]

@@ -6,6 +6,7 @@ finds the sensor at rest, and all scans fit.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from typing import Self
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, principal_axes
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
@@ -114,23 +115,20 @@ class Patches:
         if len(points) < _NEIGHBOURS:
             return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, dtype=bool))
         asked = points[:: -(-len(points) // _MOST_PATCHES)]
-        neighbours = points[cKDTree(points).query(asked, k=_NEIGHBOURS)[1]]
-        means = neighbours.mean(axis=1)
-        offsets = neighbours - means[:, None]
-        variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets) / _NEIGHBOURS)
-        is_flat = variances[:, 0] < np.maximum(_FLAT * variances[:, 1], _NOISE_M**2)
+        means, scatter, axes = principal_axes(points[cKDTree(points).query(asked, k=_NEIGHBOURS)[1]])
+        is_flat = scatter[:, 0] < np.maximum(_FLAT * scatter[:, 1], _NEIGHBOURS * _NOISE_M**2)
         return cls(np.where(is_flat[:, None], means, asked), axes[:, :, 0], is_flat)
 
-    @property
+    @cached_property
     def _ranges(self) -> FloatArray:
         return np.asarray(np.linalg.norm(self.centres, axis=1))
 
-    @property
+    @cached_property
     def _is_level(self) -> NDArray[np.bool_]:
         """(M,) such as the ground, which recurs wherever it is level."""
         return np.asarray(self.is_flat & (np.abs(self.normals[:, 2]) > _LEVEL))
 
-    @property
+    @cached_property
     def may_be_fixed(self) -> NDArray[np.bool_]:
         """(M,) which are near, upright surfaces."""
         return np.asarray(self.is_flat & ~self._is_level & (self._ranges < _REACH_M))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, principal_axes
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.spin_axis import fibonacci_lattice, image_axes
@@ -241,7 +241,7 @@ class MountedRecording:
         """The contents of the recording, and its mounting unless it is upright."""
         info, guess, notes = self.recorded.describe(), self._guess, []
         if guess.warning is not None:
-            notes.append(f"{guess.warning[0].upper()}{guess.warning[1:]}.")
+            notes.append(_sentence(guess.warning))
         elif not np.array_equal(self.T_upright_recorded, np.eye(4)):
             notes.append(f"The scans are turned upright, as reader.mounting={written(guess.mounting)}.")
         if self.raised_deg:
@@ -249,8 +249,12 @@ class MountedRecording:
                 f"Every point is raised by {self.raised_deg:g} degrees of elevation, before every method alike."
             )
         if self._carrier is not None:
-            notes.append(f"{self._carrier.warning[0].upper()}{self._carrier.warning[1:]}.")
+            notes.append(_sentence(self._carrier.warning))
         return replace(info, first=self._upright(info.first), notes=(*info.notes, *notes))
+
+
+def _sentence(warning: str) -> str:
+    return f"{warning[0].upper()}{warning[1:]}."
 
 
 def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
@@ -337,10 +341,7 @@ def _normals(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     found = cKDTree(thinned).query(asked, k=_NEIGHBOURS)
     distances, index = np.asarray(found[0]), np.asarray(found[1])
     index = index[distances[:, -1] < 6.0 * cell_m]
-    neighbours = thinned[index]
-    means = neighbours.mean(axis=1)
-    offsets = neighbours - means[:, None]
-    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+    means, variances, axes = principal_axes(thinned[index])
     flat = variances[:, 0] < _FLAT * variances[:, 1]
     on, normals = means[flat], axes[flat, :, 0]
     return thinned, on, normals * -np.sign(np.einsum("ni,ni->n", normals, on))[:, None]

@@ -177,8 +177,7 @@ class LearnedOdometry(StatefulOdometry):
         if expected is None or sweeps.last is not None:
             return best
         motion = SweepMotion(np.kron(np.eye(2), R_image_lidar) @ expected, np.zeros(6), sweeps.interval_s)
-        start = InitialEstimate(motion.pose_after(sweeps.interval_s), sigmas=_SIGMAS_OF_GOING_ON)
-        other = align(start, replace(sweeps, last=motion))
+        other = align(InitialEstimate(motion.pose_after(sweeps.interval_s)), replace(sweeps, last=motion))
         return other if other.explained > best.explained + _CLEARLY_MORE else best
 
     def _motion(
