@@ -15,8 +15,8 @@ from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape
 from lidarslam.odometry.alignment.alignment import (
+    DOUBTFUL,
     INFORMATION_PER_M2,
-    Alignment,
     InitialEstimate,
     align,
     align_best,
@@ -43,9 +43,9 @@ _HELD_BACK = 0.004
 _UNEVEN_SHARE = 0.05
 # By how many standard deviations a continued motion is less likely than the network's best candidate.
 _SIGMAS_OF_GOING_ON = 1.0
-# By how much more the expected first motion has to explain than the network's. A row of houses fits when it is
-# displaced by one of them, too.
-_CLEARLY_MORE = 0.03
+# Standard deviation of accelerations, m/s^2, and by how many of them a candidate is less likely at most: where a scene
+# repeats itself, as a row of houses does, motions continue; where only the candidate fits, the motion before was wrong.
+_ACCELERATING_M_S2, _MOST_SIGMAS = 4.0, 6.0
 # Acceleration along degenerate directions, standard deviation: rad/s^2 and m/s^2.
 _ACCELERATION = np.array([2.0] * 3 + [2.0] * 3)
 # Information, of radians or metres, that keeps a motion where it is.
@@ -144,13 +144,17 @@ class LearnedOdometry(StatefulOdometry):
     def _refined(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep) -> Motion:
         """The candidates, or the motion before, refined by alignment."""
         interval_s = sweep.middle - last.middle
-        previous = self._interpolator.last
+        previous, expected = self._interpolator.last, self._expected
+        self._expected = None
         sweeps = SweepPair(sweep.images.alignment, last.images.alignment, interval_s, previous)
-        starts = [_initial_estimate(candidate, candidates[0]) for candidate in candidates]
-        if previous is not None:
-            expected = exp(previous.velocity * interval_s)
-            starts.append(InitialEstimate(expected, sigmas=_SIGMAS_OF_GOING_ON))
-        best = self._or_expected(align_best(starts, sweeps), sweeps, sweep.images.R_image_lidar)
+        if previous is None and expected is not None:
+            before = np.kron(np.eye(2), sweep.images.R_image_lidar) @ expected
+            sweeps = replace(sweeps, last=SweepMotion(before, np.zeros(6), interval_s))
+        best = align_best(_initial_estimates(candidates, sweeps), sweeps)
+        if previous is None and expected is not None and best.explained < DOUBTFUL:
+            without = replace(sweeps, last=None)
+            other = align_best(_initial_estimates(candidates, without), without)
+            best, sweeps = (best, sweeps) if best.explained > other.explained else (other, without)
         degeneracy = find_degeneracy(best.information, best.inliers, sweep.images.alignment)
         if len(degeneracy):
             covariance = candidates[0].covariance
@@ -158,7 +162,8 @@ class LearnedOdometry(StatefulOdometry):
                 scale = (interval_s / previous.interval_s) ** 2
                 covariance = scale * self._last_covariance + np.diag((_ACCELERATION * interval_s**2) ** 2)
                 held = _HELD * degeneracy.projector()
-                start = replaced_along(best.T_prev_curr, expected, degeneracy)
+                continued = exp(previous.velocity * interval_s)
+                start = replaced_along(best.T_prev_curr, continued, degeneracy)
                 best = align(InitialEstimate(start, held, held), sweeps)
             information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
         else:
@@ -170,15 +175,6 @@ class LearnedOdometry(StatefulOdometry):
         covariance = np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)), dtype=np.float64)
         motion = self._motion(best.T_prev_curr, covariance, best.velocity_change, last, sweep, best.inliers)
         return replace(motion, degenerate=degeneracy.names)
-
-    def _or_expected(self, best: Alignment, sweeps: SweepPair, R_image_lidar: FloatArray) -> Alignment:
-        """The alignment from the motion that is expected of the first pair, where that explains clearly more."""
-        expected, self._expected = self._expected, None
-        if expected is None or sweeps.last is not None:
-            return best
-        motion = SweepMotion(np.kron(np.eye(2), R_image_lidar) @ expected, np.zeros(6), sweeps.interval_s)
-        other = align(InitialEstimate(motion.pose_after(sweeps.interval_s)), replace(sweeps, last=motion))
-        return other if other.explained > best.explained + _CLEARLY_MORE else best
 
     def _motion(
         self, T_prev_curr: FloatArray, covariance: FloatArray, change: FloatArray, last: _Sweep, sweep: _Sweep,
@@ -197,10 +193,22 @@ class LearnedOdometry(StatefulOdometry):
         self._last_covariance = None
 
 
-def _initial_estimate(candidate: Candidate, best: Candidate) -> InitialEstimate:
-    sigmas = float(np.sqrt(max(0.0, 2.0 * (best.log_probability - candidate.log_probability))))
-    information = np.asarray(np.linalg.inv(candidate.covariance), dtype=np.float64)
-    return InitialEstimate(candidate.T_prev_curr, information, sigmas=sigmas)
+def _initial_estimates(candidates: Sequence[Candidate], sweeps: SweepPair) -> list[InitialEstimate]:
+    """The candidates, less likely by their scores and by the change of a known motion before, and that continued."""
+    squared = [2.0 * max(0.0, candidates[0].log_probability - one.log_probability) for one in candidates]
+    continued: list[InitialEstimate] = []
+    if sweeps.last is not None:
+        expected, apart_s = exp(sweeps.last.velocity * sweeps.interval_s), sweeps.interval_s + sweeps.last.interval_s
+        least_m = 0.5 * _ACCELERATING_M_S2 * sweeps.interval_s * apart_s
+        for n, candidate in enumerate(candidates):
+            change_m = float(np.linalg.norm(candidate.T_prev_curr[:3, 3] - expected[:3, 3]))
+            squared[n] += min(change_m / least_m, _MOST_SIGMAS) ** 2
+        continued = [InitialEstimate(expected, sigmas=_SIGMAS_OF_GOING_ON)]
+    starts = []
+    for candidate, square in zip(candidates, squared, strict=True):
+        information = np.asarray(np.linalg.inv(candidate.covariance), dtype=np.float64)
+        starts.append(InitialEstimate(candidate.T_prev_curr, information, sigmas=float(np.sqrt(square))))
+    return [*starts, *continued]
 
 
 def _right_covariance(T_prev_curr: FloatArray, left: FloatArray, change: FloatArray) -> FloatArray:
